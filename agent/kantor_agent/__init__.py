@@ -1,0 +1,1 @@
+"""A robot: belief, planners, vehicles, and the state machine that joins them."""

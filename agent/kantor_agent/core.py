@@ -1,0 +1,121 @@
+"""A robot: one pure state machine."""
+
+import numpy as np
+import numpy.typing as npt
+
+from kantor_agent.belief import Belief
+from kantor_agent.planners import PLANNERS, Goal
+from kantor_agent.vehicles import VEHICLES
+from kantor_protocol.keyed import Purpose
+from kantor_protocol.machine import (
+    EVERYBODY,
+    SUPERVISOR,
+    Inputs,
+    Observation,
+    Outputs,
+    ParticipantId,
+    Pose,
+    State,
+)
+
+from kantor_protocol.radio import Radio, replica_of
+from kantor_protocol.replica import NOBODY
+from kantor_protocol.scenario import Scenario
+from kantor_protocol.walk import Walk
+from kantor_protocol.weights import Units, WeightsPublisher
+
+
+class Agent:
+    """A robot of a scenario. `step` is its only entrance.
+
+    A step: take in the inbox and the observation, update the belief, choose a goal, move, spend
+    weight at the new pose, publish.
+    """
+
+    def __init__(
+        self,
+        me: ParticipantId,
+        scenario: Scenario,
+        seed: int,
+        start_m: tuple[float, float],
+        samples_m: npt.NDArray[np.float64],
+    ) -> None:
+        """start_m, samples_m (N, 2): world frame, at time 0."""
+        units = Units.of(scenario.energy.points, samples_m.shape[0])
+        replica = replica_of(me, scenario, units, samples_m.shape[0])
+        walk = Walk(
+            samples_m,
+            scenario.samples.diffusion_m,
+            scenario.period_ns,
+            seed,
+            Purpose.SAMPLE_WALK,
+        )
+        self._me = me
+        self._belief = Belief(walk, units, replica)
+        self._radio = Radio(me, scenario.roster)
+        self._planner = PLANNERS[scenario.planner.name](scenario)
+        self._vehicle = VEHICLES[scenario.vehicle.name](scenario.vehicle)
+        self._publisher = WeightsPublisher(
+            replica.weights, scenario.publish.weights_every, scenario.publish.keyframe_every
+        )
+        self._target = SUPERVISOR if scenario.centralized else EVERYBODY
+        self._budget = scenario.steps_per_robot
+        self._period_ns = scenario.period_ns
+        self._now_ns = 0
+        self._step = 0
+        self._energy_spent = 0
+        self._pose = Pose(*start_m)
+        self._goal: Goal | None = None
+
+    def step(self, inputs: Inputs, /) -> Outputs:
+        """One step; see the class."""
+        self._radio.hear(inputs.inbox, self._belief.learn)
+        self._locate(inputs.observation)
+        self._belief.advance(inputs.now_ns)
+        elapsed_ns = min(inputs.now_ns - self._now_ns, self._period_ns)
+        self._now_ns, self._step = inputs.now_ns, self._step + 1
+        spent = self._explore(elapsed_ns * 1e-9) if self._state is State.EXPLORING else b""
+        return self._publish(spent)
+
+    @property
+    def _state(self) -> State:
+        if self._belief.empty:
+            return State.FINISHED
+        return State.EXHAUSTED if self._energy_spent >= self._budget else State.EXPLORING
+
+    def _locate(self, observation: Observation) -> None:
+        """Take the pose that the world accepted. A late word on an older step changes nothing."""
+        if observation.step == self._step:
+            self._pose = observation.pose
+
+    def _explore(self, dt_s: float) -> bytes:
+        """Choose a goal, move towards it, ship one point from where the robot then is."""
+        self._goal = self._planner.choose(self._belief, self._pose, self._now_ns)
+        if self._goal is not None:
+            self._pose = self._vehicle.drive(self._pose, self._goal.x_m, self._goal.y_m, dt_s)
+        self._energy_spent += 1
+        return self._belief.spend(self._pose.x_m, self._pose.y_m)
+
+    def _publish(self, spent: bytes) -> Outputs:
+        state = self._state
+        if state is not State.EXPLORING:
+            self._goal = None
+            self._belief.replica.claim(NOBODY, self._now_ns)
+        lowered = self._belief.lowered()
+        weights = self._publisher.step(
+            self._belief.replica.lowered(), last=state is not State.EXPLORING
+        )
+        envelope = self._radio.say(self._belief.replica, self._target, self._step, self._pose)
+        self._belief.replica.end_step()
+        return Outputs(
+            step=self._step,
+            pose=self._pose,
+            goal=None if self._goal is None else (self._goal.x_m, self._goal.y_m),
+            spent=spent,
+            lowered=lowered,
+            weights=weights,
+            outbox=(envelope,),
+            energy_spent=self._energy_spent,
+            state=state,
+            refused=self._radio.refused,
+        )

@@ -1,0 +1,153 @@
+"""Vehicles: how a pose moves towards a goal in one step. The planner never knows which one drives.
+
+Every vehicle keeps its end point within speed * dt of where it began, which world-sim checks. Plain
+floats throughout: a step costs about a microsecond.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+from kantor_protocol.machine import Pose
+from kantor_protocol.scenario import Vehicle as Parameters
+
+
+class Vehicle(Protocol):
+    """Motion under a goal."""
+
+    def drive(self, pose: Pose, x_m: float, y_m: float, dt_s: float, /) -> Pose:
+        """The pose after dt_s when heading for (x_m, y_m), world frame."""
+        ...
+
+
+def _wrapped(angle_rad: float) -> float:
+    return math.remainder(angle_rad, math.tau)
+
+
+def _clamped(value: float, bound: float) -> float:
+    return max(-bound, min(bound, value))
+
+
+class FirstOrder:
+    """x <- x + u_max dt (g - x) / |g - x| (Kabir & Lee, eq. 16), and no further than the goal."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._speed_m_s = parameters.speed_m_s
+
+    def drive(self, pose: Pose, x_m: float, y_m: float, dt_s: float, /) -> Pose:
+        """A straight step."""
+        dx, dy = x_m - pose.x_m, y_m - pose.y_m
+        distance, step = math.sqrt(dx * dx + dy * dy), self._speed_m_s * dt_s
+        if distance == 0.0:
+            return Pose(pose.x_m, pose.y_m, pose.heading_rad, 0.0)
+        heading = math.atan2(dy, dx)
+        if distance <= step:
+            return Pose(x_m, y_m, heading, distance / dt_s if dt_s > 0.0 else 0.0)
+        share = step / distance
+        return Pose(pose.x_m + share * dx, pose.y_m + share * dy, heading, self._speed_m_s)
+
+
+class SecondOrder:
+    """A double integrator: bounded acceleration and speed, in any direction.
+
+    It steers its velocity to the one that would just stop at the goal under the bound. Its heading
+    is the direction of its velocity.
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._speed_m_s = parameters.speed_m_s
+        self._acceleration_m_s2 = parameters.acceleration_m_s2
+
+    def drive(self, pose: Pose, x_m: float, y_m: float, dt_s: float, /) -> Pose:
+        """Semi-implicit Euler: velocity first, then position."""
+        if dt_s <= 0.0:
+            return pose
+        dx, dy = x_m - pose.x_m, y_m - pose.y_m
+        distance = math.hypot(dx, dy)
+        # Braking with a over steps of dt stops within v^2 / 2a + v dt / 2, solved for v.
+        half = self._acceleration_m_s2 * dt_s / 2.0
+        braking = math.sqrt(half * half + 2.0 * self._acceleration_m_s2 * distance) - half
+        wanted = min(self._speed_m_s, braking, distance / dt_s)
+        share = wanted / distance if distance > 0.0 else 0.0
+        vx = pose.speed_m_s * math.cos(pose.heading_rad)
+        vy = pose.speed_m_s * math.sin(pose.heading_rad)
+        ax, ay = share * dx - vx, share * dy - vy
+        change, bound = math.hypot(ax, ay), self._acceleration_m_s2 * dt_s
+        if change > bound:
+            ax, ay = ax * bound / change, ay * bound / change
+        vx, vy = vx + ax, vy + ay
+        speed = math.hypot(vx, vy)
+        if speed > self._speed_m_s:
+            vx, vy = vx * self._speed_m_s / speed, vy * self._speed_m_s / speed
+            speed = self._speed_m_s
+        heading = math.atan2(vy, vx) if speed > 0.0 else pose.heading_rad
+        return Pose(pose.x_m + vx * dt_s, pose.y_m + vy * dt_s, heading, speed)
+
+
+class Unicycle:
+    """Drives along its heading, turns on the spot or on the way; bounded turn rate and acceleration."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._speed_m_s = parameters.speed_m_s
+        self._acceleration_m_s2 = parameters.acceleration_m_s2
+        self._turn_rate_rad_s = parameters.turn_rate_rad_s
+
+    def drive(self, pose: Pose, x_m: float, y_m: float, dt_s: float, /) -> Pose:
+        """Turn towards the goal, then roll; slower the further the goal is off the nose."""
+        if dt_s <= 0.0:
+            return pose
+        dx, dy = x_m - pose.x_m, y_m - pose.y_m
+        distance = math.hypot(dx, dy)
+        error = _wrapped(math.atan2(dy, dx) - pose.heading_rad) if distance > 0.0 else 0.0
+        turn = _clamped(error, self._turn_rate_rad_s * dt_s)
+        heading = _wrapped(pose.heading_rad + turn)
+        wanted = min(self._speed_m_s, distance / dt_s) * max(0.0, math.cos(error - turn))
+        bound = self._acceleration_m_s2 * dt_s
+        speed = pose.speed_m_s + _clamped(wanted - pose.speed_m_s, bound)
+        speed = max(0.0, min(speed, self._speed_m_s))
+        return Pose(
+            pose.x_m + speed * dt_s * math.cos(heading),
+            pose.y_m + speed * dt_s * math.sin(heading),
+            heading,
+            speed,
+        )
+
+
+class Dubins:
+    """Always at full speed, never tighter than its turn radius, as a fixed-wing aircraft.
+
+    A goal within either turning circle cannot be reached by turning to it, so the vehicle first goes
+    straight until it lies outside (the first leg of the shortest path has the same effect).
+    """
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._speed_m_s = parameters.speed_m_s
+        self._radius_m = parameters.turn_radius_m
+
+    def drive(self, pose: Pose, x_m: float, y_m: float, dt_s: float, /) -> Pose:
+        """One arc or line of length speed * dt."""
+        dx, dy = x_m - pose.x_m, y_m - pose.y_m
+        distance, length = math.hypot(dx, dy), self._speed_m_s * dt_s
+        ahead = math.cos(pose.heading_rad) * dx + math.sin(pose.heading_rad) * dy
+        left = -math.sin(pose.heading_rad) * dx + math.cos(pose.heading_rad) * dy
+        turn = 0.0
+        # Outside both circles: |goal - centre| >= radius, the centre a radius to the side.
+        if distance * distance >= 2.0 * self._radius_m * abs(left) and distance > 0.0:
+            turn = _clamped(math.atan2(left, ahead), length / self._radius_m)
+        heading = _wrapped(pose.heading_rad + turn)
+        chord = length if turn == 0.0 else 2.0 * (length / turn) * math.sin(turn / 2.0)
+        middle = pose.heading_rad + turn / 2.0
+        return Pose(
+            pose.x_m + chord * math.cos(middle),
+            pose.y_m + chord * math.sin(middle),
+            heading,
+            self._speed_m_s,
+        )
+
+
+VEHICLES: dict[str, Callable[[Parameters], Vehicle]] = {
+    "first-order": FirstOrder,
+    "second-order": SecondOrder,
+    "unicycle": Unicycle,
+    "dubins": Dubins,
+}

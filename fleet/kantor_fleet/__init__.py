@@ -1,0 +1,1 @@
+"""The kantor command: fleets, runs, reports."""

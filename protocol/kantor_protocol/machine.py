@@ -1,0 +1,103 @@
+"""The state machine that every participant is, and what crosses its border.
+
+Input is a value, output is a value, and the same machine with the same inputs gives the same
+outputs. Time is an argument (simulated integer nanoseconds); nothing else reaches a machine.
+"""
+
+import enum
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import msgspec
+
+ParticipantId = str
+"""`r1`, `r2`, … for robots, `supervisor` for the supervisor."""
+
+EVERYBODY: ParticipantId = ""
+"""The target of an envelope for whoever is in range."""
+
+SUPERVISOR: ParticipantId = "supervisor"
+
+
+class State(enum.IntEnum):
+    """What a participant is doing. The last two are final."""
+
+    EXPLORING = 0
+    FINISHED = 1
+    """No sample has weight left in its own view; it stands and keeps relaying."""
+    EXHAUSTED = 2
+    """Its energy is spent; it stands and keeps relaying."""
+
+
+class Pose(msgspec.Struct, frozen=True, array_like=True):
+    """Where a body is, in the world frame (x right, y up, heading counter-clockwise from x)."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float = 0.0
+    speed_m_s: float = 0.0
+
+
+class Envelope(msgspec.Struct, frozen=True, array_like=True):
+    """One radio transmission. (source, sequence) is unique in a run."""
+
+    source: ParticipantId
+    sequence: int
+    target: ParticipantId
+    """A participant, or EVERYBODY in range."""
+    body: bytes
+    """An encoded message; the radio does not look inside."""
+
+
+class Observation(msgspec.Struct, frozen=True, array_like=True):
+    """What the world tells a participant about itself."""
+
+    step: int
+    """The participant's last step that the world has accepted; 0 before the first."""
+    pose: Pose
+    """Its true pose after that step."""
+    detected: tuple[int, ...] = ()
+    """Targets that its sensor found since the last observation."""
+
+
+class Inputs(msgspec.Struct, frozen=True, array_like=True):
+    """What reached a participant since its last step."""
+
+    now_ns: int
+    observation: Observation
+    inbox: tuple[Envelope, ...] = ()
+    """In order of arrival."""
+
+
+class Outputs(msgspec.Struct, frozen=True, array_like=True):
+    """What a participant did in one step."""
+
+    step: int
+    """Counts from 1."""
+    pose: Pose
+    goal: tuple[float, float] | None = None
+    """World frame, metres; None when it heads nowhere."""
+    spent: bytes = b""
+    """Packed pairs (sample, units) that it consumed in this step, nearest first (Prop. 1)."""
+    lowered: bytes = b""
+    """Packed pairs (sample, units left): the entries of its weight vector that fell in this step."""
+    weights: bytes = b""
+    """What it puts on its weights key in this step, if anything (`weights.py`)."""
+    outbox: tuple[Envelope, ...] = ()
+    energy_spent: int = 0
+    """Robot points shipped since the start."""
+    state: State = State.EXPLORING
+    refused: int = 0
+    """Messages it has refused since the start: malformed, too old, not from the roster."""
+
+
+class StateMachine(Protocol):
+    """A participant: robot or supervisor."""
+
+    def step(self, inputs: Inputs, /) -> Outputs:
+        """Take in what arrived, decide, act."""
+        ...
+
+
+Exchange = Callable[[Mapping[ParticipantId, Inputs]], Mapping[ParticipantId, Outputs]]
+"""Steps all participants of a batch. A missing output is a value: late, crashed or cut off."""

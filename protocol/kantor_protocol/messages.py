@@ -1,0 +1,244 @@
+"""Every message on the bus and on the radio: frozen records in msgpack, versioned, add-only.
+
+A record travels as a msgpack array: tag, version, fields in order. New fields go to the end with a
+default; unknown further fields are ignored; a change of meaning takes a new version. What does not
+decode, has another version or is not finite is refused at the door and changes nothing.
+"""
+
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from kantor_protocol.machine import Inputs, Outputs, ParticipantId, Pose
+from kantor_protocol.scenario import Scenario
+
+VERSION = 1
+BODY_BYTES_MAX = 262_144
+"""The longest body of an envelope."""
+MESSAGE_BYTES_MAX = 4 * 1024 * 1024
+"""The longest message from a participant to world-sim."""
+
+
+class RefusedError(ValueError):
+    """A message that must not be taken in; the text says why."""
+
+
+class _Message(msgspec.Struct, frozen=True, array_like=True):
+    version: int
+
+
+class Array(msgspec.Struct, frozen=True, array_like=True):
+    """A numpy array as dtype, shape and bytes. Object arrays do not exist here."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    content: bytes
+
+    @classmethod
+    def of(cls, array: npt.NDArray[Any]) -> "Array":
+        """Pack an array of numbers."""
+        ordered = np.ascontiguousarray(array)
+        return cls(ordered.dtype.newbyteorder("<").str, ordered.shape, ordered.tobytes())
+
+    def open(self, dtype: str, dimensions: int) -> npt.NDArray[Any]:
+        """The array, if it is of this dtype and number of dimensions; raises RefusedError."""
+        kind = np.dtype(dtype)
+        if self.dtype != kind.newbyteorder("<").str or len(self.shape) != dimensions:
+            raise RefusedError(f"array {self.dtype}{self.shape}: expected {dtype}, {dimensions}-d")
+        if min(self.shape, default=1) < 0 or math.prod(self.shape) * kind.itemsize != len(
+            self.content
+        ):
+            raise RefusedError(f"array {self.dtype}{self.shape}: {len(self.content)} bytes")
+        return np.frombuffer(self.content, dtype=kind).reshape(self.shape)
+
+
+class News(_Message, frozen=True, array_like=True, tag=1):
+    """Radio, participant to participant: the sender's registers and the log suffixes others lack."""
+
+    step: int
+    """The sender's step."""
+    x_m: float
+    y_m: float
+    """Where the sender says it is, world frame."""
+    have: bytes
+    """Version vector: for every origin of the roster, how many log entries the sender holds; then,
+    with claims, the newest claim stamp it holds. LEB128."""
+    logs: bytes
+    """Suffixes: origin, start, span, count, then count packed pairs. LEB128."""
+    claims: bytes
+    """Registers: origin, stamp, sample + 1 (0: none), since_ns. LEB128."""
+
+
+class Mission(_Message, frozen=True, array_like=True, tag=2):
+    """World-sim to a participant that has joined: all that it needs to know."""
+
+    nonce: str
+    """The joining process that is meant."""
+    scenario: Scenario
+    seed: int
+    starts: Array
+    """(n, 2) float64, world frame, metres, in the order of the roster's robots."""
+    samples: Array
+    """(N, 2) float64 at time 0."""
+    exchange: str
+    """`lockstep` or `wall`."""
+
+
+class Refusal(_Message, frozen=True, array_like=True, tag=3):
+    """World-sim to a participant that may not join."""
+
+    nonce: str
+    reason: str
+
+
+class Go(_Message, frozen=True, array_like=True, tag=4):
+    """World-sim to a participant, wall exchange: simulated time runs from here."""
+
+    nonce: str
+    now_ns: int
+    speed: float
+    """Simulated seconds in a real one."""
+
+
+class Turn(_Message, frozen=True, array_like=True, tag=5):
+    """World-sim to a participant: lockstep, step now; wall, news since the last one."""
+
+    inputs: Inputs
+
+
+class Report(_Message, frozen=True, array_like=True, tag=6):
+    """Participant to world-sim: what it did."""
+
+    nonce: str
+    outputs: Outputs
+    now_ns: int = 0
+    """Wall: the time on the participant's clock at which it stepped."""
+    heard: tuple[tuple[ParticipantId, int], ...] = ()
+    """Wall: source and sequence of each envelope in the inbox of this step, in order."""
+    observed: int = 0
+    """Wall: the step in the observation that it used."""
+
+
+class Ready(_Message, frozen=True, array_like=True, tag=7):
+    """Participant to world-sim: mission received, prepared to step."""
+
+    nonce: str
+
+
+class Stop(_Message, frozen=True, array_like=True, tag=8):
+    """World-sim to a participant: the mission is over."""
+
+    reason: str
+
+
+class PoseMessage(_Message, frozen=True, array_like=True, tag=21):
+    """On `<id>/pose`, for observers."""
+
+    step: int
+    now_ns: int
+    pose: Pose
+
+
+class Progress(_Message, frozen=True, array_like=True, tag=22):
+    """On `world/progress`, for observers: how the mission goes."""
+
+    now_ns: int
+    phase: str
+    """`waiting`, `running` or `over`."""
+    detail: str
+    """waiting: who is missing; over: why."""
+    energy_spent: int
+    energy_total: int
+    detected: int
+    targets: int
+    w_ub: float
+    links: int
+    messages_per_s: float
+    """Deliveries a second of simulated time."""
+    robots_done: int
+    robots: int
+
+
+FromParticipant = Report | Ready
+ToParticipant = Mission | Refusal | Go | Turn | Stop
+
+_ENCODER = msgspec.msgpack.Encoder()
+_NEWS = msgspec.msgpack.Decoder(News)
+_FROM_PARTICIPANT = msgspec.msgpack.Decoder(FromParticipant)
+_TO_PARTICIPANT = msgspec.msgpack.Decoder(ToParticipant)
+_INPUTS = msgspec.msgpack.Decoder(Inputs)
+_OUTPUTS = msgspec.msgpack.Decoder(Outputs)
+_PROGRESS = msgspec.msgpack.Decoder(Progress)
+
+encode = _ENCODER.encode
+
+
+def decode_news(body: bytes) -> News:
+    """The body of an envelope. Raises RefusedError."""
+    if len(body) > BODY_BYTES_MAX:
+        raise RefusedError(f"body of {len(body)} bytes")
+    news: News = _checked(_NEWS, body)
+    if not (math.isfinite(news.x_m) and math.isfinite(news.y_m)) or news.step < 0:
+        raise RefusedError("news without a finite place")
+    return news
+
+
+def decode_from_participant(payload: bytes) -> FromParticipant:
+    """A message on `<id>/tx`. Raises RefusedError."""
+    if len(payload) > MESSAGE_BYTES_MAX:
+        raise RefusedError(f"message of {len(payload)} bytes")
+    message: FromParticipant = _checked(_FROM_PARTICIPANT, payload)
+    if isinstance(message, Report):
+        check_outputs(message.outputs)
+    return message
+
+
+def decode_to_participant(payload: bytes) -> ToParticipant:
+    """A message on `<id>/rx`. Raises RefusedError."""
+    message: ToParticipant = _checked(_TO_PARTICIPANT, payload)
+    return message
+
+
+def decode_progress(payload: bytes) -> Progress:
+    """A message on `world/progress`. Raises RefusedError."""
+    message: Progress = _checked(_PROGRESS, payload)
+    return message
+
+
+def decode_inputs(payload: bytes) -> Inputs:
+    """Inputs as they passed the codec. Raises RefusedError."""
+    return _decoded(_INPUTS, payload)  # type: ignore[no-any-return]
+
+
+def decode_outputs(payload: bytes) -> Outputs:
+    """Outputs as they passed the codec. Raises RefusedError."""
+    outputs: Outputs = _decoded(_OUTPUTS, payload)
+    check_outputs(outputs)
+    return outputs
+
+
+def check_outputs(outputs: Outputs) -> None:
+    """Raise RefusedError for numbers that no participant may send."""
+    pose, goal = outputs.pose, outputs.goal
+    numbers = (pose.x_m, pose.y_m, pose.heading_rad, pose.speed_m_s, *(goal or ()))
+    if not all(map(math.isfinite, numbers)):
+        raise RefusedError("outputs with a number that is not finite")
+    if any(len(envelope.body) > BODY_BYTES_MAX for envelope in outputs.outbox):
+        raise RefusedError("outputs with an oversized body")
+
+
+def _decoded(decoder: msgspec.msgpack.Decoder[Any], payload: bytes) -> Any:
+    try:
+        return decoder.decode(payload)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise RefusedError(str(error)) from None
+
+
+def _checked(decoder: msgspec.msgpack.Decoder[Any], payload: bytes) -> Any:
+    message = _decoded(decoder, payload)
+    if message.version != VERSION:
+        raise RefusedError(f"version {message.version}, this is {VERSION}")
+    return message

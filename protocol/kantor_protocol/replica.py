@@ -1,0 +1,497 @@
+"""Replication by anti-entropy: everybody's single-writer state, held by everybody (design, part 4).
+
+Theory of operation
+-------------------
+1. Every participant (origin) writes one *log* (append-only entries) and one *register* (its claim,
+   the newest value wins by the origin's stamp). Nobody else writes them.
+2. A version vector says how much of every log, and which stamp of every register, somebody holds.
+   Everybody sends its own with every message, which is at once its acknowledgement.
+3. A sender puts in the suffixes that somebody it hears lacks. New entries go out once, at once; they
+   go out again only when the acknowledgement has not come within `patience` steps.
+4. Entries of others are forwarded, so news travels over several hops. A robot holds foreign entries
+   back for `patience` steps, since a neighbour most likely heard them itself; a relay does not.
+5. Receiving is idempotent: a suffix that starts beyond what is held is left (it will come again), what
+   is held already is skipped. Loss, duplication, delay and reordering cost time, never truth.
+
+Two meanings of the log, by `merge`:
+
+ledger
+    An entry is (sample, units spent by the origin). The weight of a sample is its first weight minus
+    everybody's spending, never below 0. Nothing is lost and nothing is counted twice.
+min
+    An entry is (sample, units left in the origin's vector) and is merged by the minimum (Kabir & Lee,
+    eq. 8-10). An origin's log holds all that ever fell in its vector, what it learned included, so
+    that nothing needs forwarding. Spending of two origins on one sample is counted once: the paper's
+    rule, with the paper's weakness.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from kantor_protocol.packing import put_int, put_uint, take_int, take_uint
+from kantor_protocol.weights import Units, Weights
+
+NOBODY = -1
+_ENTRIES_MAX = 4096
+"""Log entries in one message; the rest follows with the next."""
+_CLAIM_LEASE_STEPS = 12
+"""A claim that has not been renewed for so many of the holder's steps is void."""
+_CLAIM_RENEWAL_STEPS = 6
+"""How stale a neighbour's knowledge of a foreign claim may be before a robot forwards it."""
+_FRESH_STEPS = 4
+"""A participant heard within so many steps beyond `patience` counts as a neighbour."""
+
+_LENGTH_MAX = 1 << 40
+"""No log is longer; it keeps sums of positions within 64 bits."""
+
+# Rows of Store.claims.
+_SAMPLE, _SINCE, _STAMP, _HEARD = 0, 1, 2, 3
+# Slots of Store.counters.
+_LOWERED, _STEP = 0, 1
+
+
+class Store(NamedTuple):
+    """All that a participant holds, for the kernels. n origins, N samples."""
+
+    weights: npt.NDArray[np.int64]
+    """(N,) units left in this participant's view; never rises."""
+    spent: npt.NDArray[np.int64]
+    """(N,) ledger: units spent by all origins, as far as held. min: (0,)."""
+    log_index: npt.NDArray[np.int32]
+    """ledger: (n, capacity). min: (1, capacity), the own log only."""
+    log_value: npt.NDArray[np.int32]
+    length: npt.NDArray[np.int64]
+    """(n,) entries held of each log; min: of the others, how much has been merged."""
+    known: npt.NDArray[np.int64]
+    """(n, 2n) what each participant is known to hold: log lengths, then claim stamps."""
+    sending: npt.NDArray[np.int64]
+    """(3 + patience, n): entries sent; step of the last repetition; step last heard; then a ring of
+    the lengths at the last `patience` steps."""
+    claims: npt.NDArray[np.int64]
+    """(4, n): sample or NOBODY; since_ns; stamp; own step at which the stamp was heard."""
+    lowered: npt.NDArray[np.int64]
+    """(N,) indices of the weights that fell since the last `take_lowered`, each once."""
+    mark: npt.NDArray[np.int32]
+    """(N,) the step at which an index was put into `lowered`."""
+    counters: npt.NDArray[np.int64]
+    """(2,): how many in `lowered`; step."""
+
+
+class Manner(NamedTuple):
+    """How a participant merges and talks; it never changes."""
+
+    me: int
+    ledger: bool
+    claims: bool
+    relay: bool
+    """It forwards at once."""
+    beacon: bool
+    """It sends all that it knows while it hears nobody."""
+    patience: int
+    """Own steps within which an acknowledgement is due."""
+    sample_units: int
+    value_max: int
+    """The largest value of a log entry."""
+
+
+@njit(cache=True)
+def _lower(store: Store, index: int, value: int) -> None:
+    store.weights[index] = value
+    if store.mark[index] != store.counters[_STEP]:
+        store.mark[index] = np.int32(store.counters[_STEP])
+        store.lowered[store.counters[_LOWERED]] = index
+        store.counters[_LOWERED] += 1
+
+
+@njit(cache=True)
+def _append(store: Store, row: int, origin: int, index: int, value: int) -> None:
+    store.log_index[row, store.length[origin]] = index
+    store.log_value[row, store.length[origin]] = value
+    store.length[origin] += 1
+
+
+@njit(cache=True)
+def spend(store: Store, manner: Manner, index: int, units: int) -> None:
+    """Ship `units` to a sample and log it. The log must have room for one more entry."""
+    _lower(store, index, store.weights[index] - units)
+    if manner.ledger:
+        store.spent[index] += units
+        _append(store, manner.me, manner.me, index, units)
+    else:
+        _append(store, 0, manner.me, index, store.weights[index])
+
+
+@njit(cache=True)
+def _merge_entry(store: Store, manner: Manner, origin: int, index: int, value: int) -> None:
+    if manner.ledger:
+        store.spent[index] += value
+        _append(store, origin, origin, index, value)
+        left = max(0, manner.sample_units - store.spent[index])
+        if left < store.weights[index]:
+            _lower(store, index, left)
+    elif value < store.weights[index]:
+        _lower(store, index, value)
+        _append(store, 0, manner.me, index, value)
+
+
+@njit(cache=True)
+def _walk_logs(
+    store: Store, manner: Manner, logs: np.ndarray, source: int, apply: bool
+) -> int:
+    """Read all suffixes; apply what is new, or only check. The position at the end or negative."""
+    ledger = manner.ledger
+    at = 0
+    while at < logs.shape[0]:
+        origin, at = take_uint(logs, at)
+        start, at = take_uint(logs, at)
+        span, at = take_uint(logs, at)
+        count, at = take_uint(logs, at)
+        if at < 0 or origin >= store.length.shape[0] or count > span or count > logs.shape[0]:
+            return -1
+        if start > _LENGTH_MAX or span > _LENGTH_MAX:
+            return -1
+        if (ledger and count != span) or (not ledger and origin != source):
+            return -1
+        held = store.length[origin]
+        fresh = apply and origin != manner.me and (not ledger or start <= held)
+        index = 0
+        for i in range(count):
+            step, at = take_int(logs, at)
+            value, at = take_uint(logs, at)
+            index += step
+            if at < 0 or index < 0 or index >= store.weights.shape[0] or value > manner.value_max:
+                return -1
+            if fresh and (not ledger or start + i >= held):
+                _merge_entry(store, manner, origin, index, value)
+        if fresh and not ledger and start <= held:
+            store.length[origin] = max(held, start + span)
+    return at
+
+
+@njit(cache=True)
+def _walk_claims(store: Store, manner: Manner, claims: np.ndarray, apply: bool) -> int:
+    at = 0
+    while at < claims.shape[0]:
+        origin, at = take_uint(claims, at)
+        stamp, at = take_uint(claims, at)
+        sample, at = take_uint(claims, at)
+        since, at = take_uint(claims, at)
+        if at < 0 or origin >= store.length.shape[0] or sample > store.weights.shape[0]:
+            return -1
+        if apply and origin != manner.me and stamp > store.claims[_STAMP, origin]:
+            store.claims[_SAMPLE, origin] = sample - 1
+            store.claims[_SINCE, origin] = since
+            store.claims[_STAMP, origin] = stamp
+            store.claims[_HEARD, origin] = store.counters[_STEP]
+    return at
+
+
+@njit(cache=True)
+def _walk_have(
+    store: Store, manner: Manner, have: np.ndarray, source: int, apply: bool
+) -> int:
+    origins = store.length.shape[0]
+    at = 0
+    for slot in range(2 * origins if manner.claims else origins):
+        held, at = take_uint(have, at)
+        if at < 0:
+            return -1
+        if apply:
+            store.known[source, slot] = max(store.known[source, slot], held)
+    return at if at == have.shape[0] else -1
+
+
+@njit(cache=True)
+def _learn(
+    store: Store,
+    manner: Manner,
+    have: np.ndarray,
+    logs: np.ndarray,
+    claims: np.ndarray,
+    source: int,
+) -> bool:
+    """Check a message whole, then apply it whole; False and no change when it is malformed."""
+    if (
+        _walk_have(store, manner, have, source, False) < 0
+        or _walk_logs(store, manner, logs, source, False) < 0
+        or _walk_claims(store, manner, claims, False) < 0
+    ):
+        return False
+    _walk_have(store, manner, have, source, True)
+    _walk_logs(store, manner, logs, source, True)
+    if manner.claims:
+        _walk_claims(store, manner, claims, True)
+    store.sending[2, source] = store.counters[_STEP]
+    return True
+
+
+@njit(cache=True)
+def _neighbours_lack(store: Store, me: int, target: int, slot: int, patience: int) -> int:
+    """The least that anybody heard lately is known to hold in a slot of `known`; -1 if nobody is.
+
+    The origin of the slot itself does not count: it holds its own state.
+    """
+    origins = store.length.shape[0]
+    least = -1
+    for other in range(origins):
+        if other == me or other == slot % origins or (target >= 0 and other != target):
+            continue
+        heard = store.sending[2, other]
+        if heard >= 0 and heard + patience + _FRESH_STEPS >= store.counters[_STEP]:
+            held = store.known[other, slot]
+            least = held if least < 0 else min(least, held)
+    return least
+
+
+@njit(cache=True)
+def _start_of_suffix(
+    store: Store, manner: Manner, target: int, origin: int, aged: int
+) -> int:
+    """First entry to send of an origin's log; its length when nothing is to be sent."""
+    me, relay, patience = manner.me, manner.relay, manner.patience
+    length = store.length[origin]
+    least = _neighbours_lack(store, me, target, origin, patience)
+    if least < 0 and target < 0 and manner.beacon:
+        return 0
+    if least < 0:
+        return store.sending[0, origin] if target >= 0 and origin == me else length
+    step = store.counters[_STEP]
+    if least < aged and step - store.sending[1, origin] >= patience:
+        store.sending[1, origin] = step
+        return least
+    if origin == me or relay:
+        return min(length, max(least, store.sending[0, origin]))
+    return length
+
+
+@njit(cache=True)
+def _put_suffix(
+    store: Store, out: np.ndarray, at: int, origin: int, ledger: bool, start: int, room: int
+) -> tuple[int, int]:
+    """Write one suffix: (position after it, entries written)."""
+    row = origin if ledger else 0
+    count = 0
+    end = start
+    while end < store.length[origin] and count < room:
+        # In a log of minima only the newest entry of a sample matters: the one the vector holds.
+        if ledger or store.log_value[row, end] == store.weights[store.log_index[row, end]]:
+            count += 1
+        end += 1
+    at = put_uint(out, at, origin)
+    at = put_uint(out, at, start)
+    at = put_uint(out, at, end - start)
+    at = put_uint(out, at, count)
+    before = 0
+    for entry in range(start, end):
+        index = np.int64(store.log_index[row, entry])
+        value = np.int64(store.log_value[row, entry])
+        if ledger or value == store.weights[index]:
+            at = put_int(out, at, index - before)
+            at = put_uint(out, at, value)
+            before = index
+    store.sending[0, origin] = max(store.sending[0, origin], end)
+    return at, count
+
+
+@njit(cache=True)
+def _put_claims(store: Store, manner: Manner, out: np.ndarray, at: int, target: int) -> int:
+    me, relay, patience = manner.me, manner.relay, manner.patience
+    origins = store.length.shape[0]
+    step = store.counters[_STEP]
+    for origin in range(origins):
+        stamp = store.claims[_STAMP, origin]
+        if stamp <= 0 or (
+            origin != me and step - store.claims[_HEARD, origin] > _CLAIM_LEASE_STEPS
+        ):
+            continue
+        if origin != me:
+            least = _neighbours_lack(store, me, target, origins + origin, patience)
+            slack = 0 if relay else _CLAIM_RENEWAL_STEPS
+            if least < 0 or least + slack >= stamp:
+                continue
+        at = put_uint(out, at, origin)
+        at = put_uint(out, at, stamp)
+        at = put_uint(out, at, store.claims[_SAMPLE, origin] + 1)
+        at = put_uint(out, at, store.claims[_SINCE, origin])
+    return at
+
+
+@njit(cache=True)
+def _compose(
+    store: Store, manner: Manner, out: np.ndarray, target: int
+) -> tuple[int, int, int]:
+    """Write have, logs and claims one after the other; the position at the end of each."""
+    me, ledger = manner.me, manner.ledger
+    origins = store.length.shape[0]
+    at = 0
+    for origin in range(origins):
+        at = put_uint(out, at, store.length[origin])
+    if manner.claims:
+        for origin in range(origins):
+            at = put_uint(out, at, store.claims[_STAMP, origin])
+    end_of_have = at
+    slot = 3 + store.counters[_STEP] % manner.patience
+    room = _ENTRIES_MAX
+    for turn in range(origins):
+        origin = (me + turn) % origins
+        if ledger or origin == me:
+            aged = store.sending[slot, origin]
+            start = _start_of_suffix(store, manner, target, origin, aged)
+            if start < store.length[origin] and room > 0:
+                at, written = _put_suffix(store, out, at, origin, ledger, start, room)
+                room -= written
+    for origin in range(origins):
+        store.sending[slot, origin] = store.length[origin]
+    end_of_logs = at
+    if manner.claims:
+        at = _put_claims(store, manner, out, at, target)
+    return end_of_have, end_of_logs, at
+
+
+@njit(cache=True)
+def _taken(store: Store, me: int, out: np.ndarray) -> int:
+    """Samples claimed by others that outrank this participant's claim; their number."""
+    count = 0
+    step = store.counters[_STEP]
+    for origin in range(store.length.shape[0]):
+        sample = store.claims[_SAMPLE, origin]
+        if (
+            origin == me
+            or sample < 0
+            or step - store.claims[_HEARD, origin] > _CLAIM_LEASE_STEPS
+        ):
+            continue
+        if sample == store.claims[_SAMPLE, me]:
+            mine = store.claims[_SINCE, me]
+            theirs = store.claims[_SINCE, origin]
+            if mine < theirs or (mine == theirs and me < origin):
+                continue
+        out[count] = sample
+        count += 1
+    return count
+
+
+class Replica:
+    """What one participant holds of everybody's state, and what it tells others.
+
+    `weights` never rises; `weights[j]` is the first weight minus spending (ledger), or the least
+    value seen (min).
+    """
+
+    def __init__(
+        self,
+        me: int,
+        origins: int,
+        samples: int,
+        units: Units,
+        *,
+        ledger: bool,
+        claims: bool,
+        relay: bool = False,
+        beacon: bool = False,
+        patience_steps: int = 2,
+    ) -> None:
+        """me: this participant's place in the roster of `origins` participants. The rest: Manner."""
+        self.manner = Manner(
+            me=me,
+            ledger=ledger,
+            claims=claims,
+            relay=relay,
+            beacon=beacon,
+            patience=max(1, patience_steps),
+            sample_units=units.sample,
+            value_max=units.point if ledger else units.sample,
+        )
+        rows = origins if ledger else 1
+        self.store = Store(
+            weights=np.full(samples, units.sample, dtype=np.int64),
+            spent=np.zeros(samples if ledger else 0, dtype=np.int64),
+            log_index=np.zeros((rows, 256), dtype=np.int32),
+            log_value=np.zeros((rows, 256), dtype=np.int32),
+            length=np.zeros(origins, dtype=np.int64),
+            known=np.zeros((origins, 2 * origins), dtype=np.int64),
+            sending=np.zeros((3 + self.manner.patience, origins), dtype=np.int64),
+            claims=np.zeros((4, origins), dtype=np.int64),
+            lowered=np.zeros(samples, dtype=np.int64),
+            mark=np.zeros(samples, dtype=np.int32),
+            counters=np.array([0, 1], dtype=np.int64),
+        )
+        self.store.sending[1:3] = -1 - self.manner.patience
+        self.store.claims[_SAMPLE] = NOBODY
+        self._out = np.zeros(20 * _ENTRIES_MAX + 120 * origins + 64, dtype=np.uint8)
+        self._taken = np.zeros(origins, dtype=np.int64)
+
+    @property
+    def weights(self) -> Weights:
+        """(N,) units left in this participant's view."""
+        return self.store.weights
+
+    def entries(self, origin: int) -> list[tuple[int, int]]:
+        """The held log of an origin, as (sample, value); with min only the own log is held."""
+        row, length = (origin if self.manner.ledger else 0), int(self.store.length[origin])
+        index, value = self.store.log_index[row, :length], self.store.log_value[row, :length]
+        return list(zip(index.tolist(), value.tolist(), strict=True))
+
+    def learn(self, source: int, have: bytes, logs: bytes, claims: bytes) -> bool:
+        """Take in a message; False, and nothing changed, when it is malformed."""
+        self.reserve(len(logs) // 2)
+        return bool(
+            _learn(
+                self.store,
+                self.manner,
+                np.frombuffer(have, dtype=np.uint8),
+                np.frombuffer(logs, dtype=np.uint8),
+                np.frombuffer(claims, dtype=np.uint8),
+                source,
+            )
+        )
+
+    def reserve(self, entries: int) -> None:
+        """Make room for this many more entries in every log."""
+        written = self.store.length if self.manner.ledger else self.store.length[self.manner.me]
+        needed = int(written.max()) + entries
+        capacity = self.store.log_index.shape[1]
+        if needed <= capacity:
+            return
+        while capacity < needed:
+            capacity *= 2
+        rows = self.store.log_index.shape[0]
+        grown = [np.zeros((rows, capacity), dtype=np.int32) for _ in range(2)]
+        for new, old in zip(grown, (self.store.log_index, self.store.log_value), strict=True):
+            new[:, : old.shape[1]] = old
+        self.store = self.store._replace(log_index=grown[0], log_value=grown[1])
+
+    def claim(self, sample: int, now_ns: int) -> None:
+        """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
+        claims = self.store.claims
+        if claims[_SAMPLE, self.manner.me] != sample:
+            claims[_SAMPLE, self.manner.me] = sample
+            claims[_SINCE, self.manner.me] = now_ns
+        claims[_STAMP, self.manner.me] = self.store.counters[_STEP]
+
+    def taken(self) -> npt.NDArray[np.int64]:
+        """Samples that others have claimed and this participant must leave; a view."""
+        count = _taken(self.store, self.manner.me, self._taken) if self.manner.claims else 0
+        return self._taken[:count]
+
+    def compose(self, target: int = NOBODY) -> tuple[bytes, bytes, bytes]:
+        """(have, logs, claims) for one message to everybody, or to one participant."""
+        end_of_have, end_of_logs, end = _compose(self.store, self.manner, self._out, target)
+        out = self._out
+        return (
+            out[:end_of_have].tobytes(),
+            out[end_of_have:end_of_logs].tobytes(),
+            out[end_of_logs:end].tobytes(),
+        )
+
+    def lowered(self) -> npt.NDArray[np.int64]:
+        """Samples whose weight fell in this step, each once; a view valid until `end_step`."""
+        return self.store.lowered[: self.store.counters[_LOWERED]]
+
+    def end_step(self) -> None:
+        """Begin the next step."""
+        self.store.counters[_LOWERED] = 0
+        self.store.counters[_STEP] += 1

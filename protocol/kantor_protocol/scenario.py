@@ -1,0 +1,468 @@
+"""A scenario: everything that defines a run but its seed, read from TOML and checked once, here.
+
+Units are in the names. Positions are in the world frame: metres, x right, y up. A key that does
+not exist, a value of the wrong type or out of bounds is refused with one line that names it.
+"""
+
+import difflib
+import math
+import re
+import tomllib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from kantor_protocol.machine import SUPERVISOR, ParticipantId
+
+Positive = Annotated[float, Meta(gt=0.0)]
+NotNegative = Annotated[float, Meta(ge=0.0)]
+Probability = Annotated[float, Meta(ge=0.0, lt=1.0)]
+Point = tuple[float, float]
+
+PlannerName = Literal["transport"]
+VehicleName = Literal["first-order", "second-order", "unicycle", "dubins"]
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be run; the message is one line with the place and the remedy."""
+
+
+class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A TOML table in which every key is known."""
+
+
+class Domain(_Table, frozen=True, kw_only=True):
+    """The rectangle that random starts are drawn from and that plots show. It is no wall."""
+
+    min_m: Point
+    max_m: Point
+
+
+class Robots(_Table, frozen=True, kw_only=True):
+    """The team: `r1` … `rN`."""
+
+    count: Annotated[int, Meta(ge=1, le=1000)]
+
+
+class Starts(_Table, frozen=True, kw_only=True):
+    """Where robots stand at time 0."""
+
+    random: bool = False
+    """Drawn uniformly in the domain, by the seed."""
+    poses_m: tuple[Point, ...] = ()
+    """One for each robot, unless random."""
+
+
+class Vehicle(_Table, frozen=True, kw_only=True):
+    """How a robot moves. A planner never knows."""
+
+    name: VehicleName = "first-order"
+    speed_m_s: Positive = 100.0
+    """u_max."""
+    acceleration_m_s2: Positive = 400.0
+    """second-order: bound on the acceleration vector; unicycle: on the speed's change."""
+    turn_rate_rad_s: Positive = 6.0
+    """unicycle: bound on the turn rate."""
+    turn_radius_m: Positive = 15.0
+    """dubins: the tightest circle."""
+
+
+class Clock(_Table, frozen=True, kw_only=True):
+    """When robots step."""
+
+    period_s: Annotated[float, Meta(ge=1e-6, le=1e6)] = 0.1
+    """Nominal time between two steps; also the step of walking samples and targets."""
+    order: Literal["concurrent", "turn"] = "concurrent"
+    """concurrent: all phases equal. turn: phases spread over the period, one robot after another."""
+    spread: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
+    """Each robot's period is drawn from [1 - spread, 1 + spread] times the nominal one."""
+    drift_ppm: Annotated[float, Meta(ge=0.0, le=100_000.0)] = 0.0
+    """Each robot's clock runs wrong by a rate drawn from plus or minus this."""
+    jitter_s: NotNegative = 0.0
+    """Each step is late by a time drawn from [0, jitter_s]; below the period."""
+
+
+class Energy(_Table, frozen=True, kw_only=True):
+    """The budget, eq. 7."""
+
+    points: Annotated[int, Meta(ge=1, le=2_000_000_000)]
+    """M: robot points of the whole team; each ships 1/M of the mass."""
+    steps: Annotated[int, Meta(ge=1, le=2_000_000_000)] | None = None
+    """Points that one robot may ship; by default t_e = M / n_a."""
+
+
+class Gaussian(_Table, frozen=True, kw_only=True):
+    """One component of the density."""
+
+    mean_m: Point
+    variance_m2: tuple[Positive, Positive]
+    """Diagonal of the covariance."""
+    weight: Positive = 1.0
+
+
+class Samples(_Table, frozen=True, kw_only=True):
+    """The points y_j that stand for the density."""
+
+    count: Annotated[int, Meta(ge=1, le=50_000_000)] | None = None
+    """N. Needed for a mixture or an image; for a file of points, a seeded subset if it has more."""
+    file: str | None = None
+    """CSV or NPY: points. PNG, JPEG, PGM, TIFF: a grey-scale density over the domain, white is dense."""
+    diffusion_m: NotNegative = 0.0
+    """v of eq. 14: samples walk by up to this in x and y each period."""
+
+
+class Targets(_Table, frozen=True, kw_only=True):
+    """What is to be found."""
+
+    count: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
+    """Drawn from the same density as the samples."""
+    file: str | None = None
+    """CSV or NPY of points (all are used, or a seeded subset of `count`), or an image."""
+    diffusion_m: NotNegative = 0.0
+    """v of eq. 13: undetected targets walk by up to this each period."""
+
+
+class Sensor(_Table, frozen=True, kw_only=True):
+    """A disc in which a robot detects targets."""
+
+    range_m: Positive = 15.0
+
+
+class Radio(_Table, frozen=True, kw_only=True):
+    """The channel, played by world-sim."""
+
+    range_m: NotNegative = math.inf
+    """Between true poses at the time of sending; the bound itself is in range."""
+    drop: Probability = 0.0
+    """Per receiver."""
+    delay_s: NotNegative = 0.0
+    jitter_s: NotNegative = 0.0
+    """Each delivery takes delay_s plus up to this."""
+    duplicate: Probability = 0.0
+    """A second copy arrives, with its own delay."""
+    reorder: Probability = 0.0
+    """A delivery is held back by up to reorder_s, so that later ones overtake it."""
+    reorder_s: NotNegative = 0.3
+    beacon: Literal["versions", "state"] = "versions"
+    """What a robot sends while it hears nobody: which versions it holds, or all that it knows.
+    With state one message is enough to inform whoever comes into range, as Algorithm 3 presupposes."""
+
+
+class Supervisor(_Table, frozen=True, kw_only=True):
+    """The supervisor of the centralized variant."""
+
+    pose_m: Point | None = None
+    """Its place; the middle of the domain by default."""
+    range_m: NotNegative = math.inf
+    """Radio range between it and any robot."""
+
+
+class Planner(_Table, frozen=True, kw_only=True):
+    """How goals are chosen."""
+
+    name: PlannerName = "transport"
+    horizon: Annotated[int, Meta(ge=1, le=12)] = 3
+    """h: samples in one plan."""
+
+
+class Publish(_Table, frozen=True, kw_only=True):
+    """What robots tell observers on their weights key."""
+
+    weights_every: Annotated[int, Meta(ge=1)] = 10
+    """Steps that one weights message gathers."""
+    keyframe_every: Annotated[int, Meta(ge=1)] = 20
+    """Weights messages from one whole vector to the next."""
+
+
+class Metrics(_Table, frozen=True, kw_only=True):
+    """What the record measures."""
+
+    every: Annotated[int, Meta(ge=0)] = 0
+    """Periods from one row to the next; 0 chooses by size, 1 for the paper's scenarios."""
+
+
+class Scenario(_Table, frozen=True, kw_only=True):
+    """A mission as data."""
+
+    name: Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]
+    summary: str = ""
+    coordination: Literal["centralized", "decentralized"] = "decentralized"
+    """centralized: robots talk to the supervisor only. decentralized: to whoever is in range."""
+    merge: Literal["min", "ledger"] = "ledger"
+    """min: elementwise minimum, as in the paper. ledger: everybody's spending, counted once."""
+    claims: bool = True
+    """Robots claim the sample they head for."""
+    limit_s: Positive | None = None
+    """Simulated time after which the mission is cut; by default 1.5 times the energy's."""
+    domain: Domain
+    robots: Robots
+    energy: Energy
+    samples: Samples
+    density: tuple[Gaussian, ...] = ()
+    starts: Starts = Starts()
+    targets: Targets = Targets()
+    vehicle: Vehicle = Vehicle()
+    clock: Clock = Clock()
+    sensor: Sensor = Sensor()
+    radio: Radio = Radio()
+    supervisor: Supervisor = Supervisor()
+    planner: Planner = Planner()
+    publish: Publish = Publish()
+    metrics: Metrics = Metrics()
+
+    @property
+    def robot_ids(self) -> tuple[ParticipantId, ...]:
+        """`r1` … `rN`."""
+        return tuple(f"r{i}" for i in range(1, self.robots.count + 1))
+
+    @property
+    def roster(self) -> tuple[ParticipantId, ...]:
+        """All participants: the robots, then the supervisor if there is one."""
+        return (*self.robot_ids, SUPERVISOR) if self.centralized else self.robot_ids
+
+    @property
+    def centralized(self) -> bool:
+        """Whether there is a supervisor."""
+        return self.coordination == "centralized"
+
+    @property
+    def period_ns(self) -> int:
+        """The nominal period."""
+        return round(self.clock.period_s * 1e9)
+
+    @property
+    def steps_per_robot(self) -> int:
+        """The energy budget of one robot in points, t_e of eq. 7 unless given."""
+        return self.energy.steps or max(1, self.energy.points // self.robots.count)
+
+    @property
+    def limit_ns(self) -> int:
+        """Simulated time at which the mission is cut."""
+        if self.limit_s is not None:
+            return round(self.limit_s * 1e9)
+        slowest = 1.0 + self.clock.spread + self.clock.drift_ppm * 1e-6
+        return round(1.5 * (self.steps_per_robot + 100) * self.period_ns * slowest)
+
+    @property
+    def supervisor_m(self) -> Point:
+        """Where the supervisor stands."""
+        if self.supervisor.pose_m is not None:
+            return self.supervisor.pose_m
+        (x_min, y_min), (x_max, y_max) = self.domain.min_m, self.domain.max_m
+        return (x_min + x_max) / 2.0, (y_min + y_max) / 2.0
+
+
+def parse(text: str, origin: str, overrides: Iterable[str] = ()) -> Scenario:
+    """A checked scenario from TOML text and `key.sub=value` overrides.
+
+    `origin` names the text in messages. Raises ScenarioError.
+    """
+    try:
+        tree = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{origin}: not valid TOML: {error}") from None
+    for override in overrides:
+        _override(tree, override)
+    return from_tree(tree, origin)
+
+
+def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
+    """A checked scenario from a TOML file; relative files in it are relative to its folder."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ScenarioError(
+            f"{path}: no such scenario file; `kantor scenarios` lists the packaged ones"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path}: cannot be read: {error}") from None
+    return rooted(parse(text, str(path), overrides), path.parent)
+
+
+def rooted(scenario: Scenario, folder: Path) -> Scenario:
+    """The scenario with its relative file names turned into absolute ones below `folder`.
+
+    A name that exists from the current folder is taken as it is, so that `--set samples.file=…`
+    means what a shell user expects.
+    """
+
+    def place(name: str | None) -> str | None:
+        if name is None or Path(name).is_absolute():
+            return name
+        return str(Path(name).resolve() if Path(name).exists() else (folder / name).resolve())
+
+    return msgspec.structs.replace(
+        scenario,
+        samples=msgspec.structs.replace(scenario.samples, file=place(scenario.samples.file)),
+        targets=msgspec.structs.replace(scenario.targets, file=place(scenario.targets.file)),
+    )
+
+
+def from_tree(tree: dict[str, Any], origin: str) -> Scenario:
+    """A checked scenario from parsed TOML. Raises ScenarioError."""
+    try:
+        scenario = msgspec.convert(tree, Scenario)
+    except msgspec.ValidationError as error:
+        raise ScenarioError(f"{origin}: {_readable(str(error))}") from None
+    for complaint in _complaints(scenario):
+        raise ScenarioError(f"{origin}: {complaint}")
+    return scenario
+
+
+def to_tree(scenario: Scenario) -> dict[str, Any]:
+    """The scenario as plain tables, without what is not set."""
+
+    def without_none(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {k: without_none(v) for k, v in value.items() if v is not None}
+        if isinstance(value, list | tuple):
+            return [without_none(v) for v in value]
+        return value
+
+    tree: dict[str, Any] = without_none(msgspec.to_builtins(scenario))
+    return tree
+
+
+def to_toml(scenario: Scenario) -> str:
+    """The scenario as TOML text that `parse` reads back as an equal one."""
+
+    def literal(value: Any) -> str:
+        if isinstance(value, bool):
+            return str(value).lower()
+        if isinstance(value, str):
+            return msgspec.json.encode(value).decode()
+        if isinstance(value, list):
+            return "[" + ", ".join(literal(v) for v in value) + "]"
+        return repr(value)
+
+    def body(table: dict[str, Any]) -> list[str]:
+        return [f"{key} = {literal(value)}" for key, value in table.items()]
+
+    tree = to_tree(scenario)
+    flat = {k: v for k, v in tree.items() if not isinstance(v, dict) and k != "density"}
+    lines = body(flat)
+    for key, table in tree.items():
+        if isinstance(table, dict) and table:
+            lines += ["", f"[{key}]", *body(table)]
+    for component in tree.get("density", []):
+        lines += ["", "[[density]]", *body(component)]
+    return "\n".join(lines) + "\n"
+
+
+def _override(tree: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition("=")
+    path = key.strip().split(".")
+    if not separator or not all(path):
+        raise ScenarioError(f"--set {override}: write it as key.sub=value")
+    table = tree
+    for i, part in enumerate(path[:-1]):
+        table = table.setdefault(part, {})
+        if not isinstance(table, dict):
+            raise ScenarioError(f"--set {override}: {'.'.join(path[: i + 1])} is not a table")
+    try:
+        table[path[-1]] = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        table[path[-1]] = text.strip()
+
+
+_KNOWN: dict[str, tuple[str, ...]] = {
+    "": Scenario.__struct_fields__,
+    "domain": Domain.__struct_fields__,
+    "robots": Robots.__struct_fields__,
+    "starts": Starts.__struct_fields__,
+    "vehicle": Vehicle.__struct_fields__,
+    "clock": Clock.__struct_fields__,
+    "energy": Energy.__struct_fields__,
+    "density": Gaussian.__struct_fields__,
+    "samples": Samples.__struct_fields__,
+    "targets": Targets.__struct_fields__,
+    "sensor": Sensor.__struct_fields__,
+    "radio": Radio.__struct_fields__,
+    "supervisor": Supervisor.__struct_fields__,
+    "planner": Planner.__struct_fields__,
+    "publish": Publish.__struct_fields__,
+    "metrics": Metrics.__struct_fields__,
+}
+
+
+def _readable(message: str) -> str:
+    """msgspec's complaint with the key first and, for an unknown key, the nearest known one."""
+    problem, _, place = message.partition(" - at ")
+    place = place.strip("`").removeprefix("$").removeprefix(".")
+    table = re.sub(r"\[.*?\]", "", place)
+    for kind in ("unknown", "missing required"):
+        if found := re.match(rf"Object (?:contains|{kind}) (?:unknown )?field `(.+)`", problem):
+            key = f"{place}.{found[1]}".lstrip(".")
+            if "missing" in problem:
+                return f"{key}: missing; set it"
+            near = difflib.get_close_matches(found[1], _KNOWN.get(table, ()), 1)
+            known = f"did you mean {near[0]}?" if near else f"known: {', '.join(_KNOWN[table])}"
+            return f"{key}: no such key; {known}"
+    return f"{place}: {problem[0].lower()}{problem[1:]}" if place else problem
+
+
+def _complaints(scenario: Scenario) -> Iterable[str]:
+    """What types alone cannot say. The first one is reported."""
+    yield from _not_finite(to_tree(scenario))
+    (x_min, y_min), (x_max, y_max) = scenario.domain.min_m, scenario.domain.max_m
+    if x_min >= x_max or y_min >= y_max:
+        yield "domain: min_m must lie below max_m in x and in y"
+    yield from _complaints_of_starts(scenario)
+    image_or_mixture = scenario.samples.file is None or is_image(scenario.samples.file)
+    if scenario.samples.file is None and not scenario.density:
+        yield "samples: no source; add [[density]] tables or set samples.file"
+    if image_or_mixture and scenario.samples.count is None:
+        yield "samples.count: missing; set the number of samples N"
+    for key, name in (("samples", scenario.samples.file), ("targets", scenario.targets.file)):
+        if name is not None and Path(name).suffix.lower() not in POINT_FILES | IMAGE_FILES:
+            known = ", ".join(sorted(POINT_FILES | IMAGE_FILES))
+            yield f"{key}.file: {name} has an unknown kind; use one of {known}"
+    if scenario.energy.points < scenario.robots.count:
+        yield "energy.points: fewer than robots; set at least one point for each"
+    if round(scenario.clock.jitter_s * 1e9) >= scenario.period_ns:
+        yield "clock.jitter_s: must be below clock.period_s"
+    if scenario.claims and scenario.planner.name != "transport":
+        yield "claims: only the transport planner has them; set claims=false"
+
+
+def _not_finite(tree: Any, path: str = "") -> Iterable[str]:
+    """Numbers that are no numbers. Only a radio range may be infinite."""
+    if isinstance(tree, dict):
+        for key, value in tree.items():
+            yield from _not_finite(value, f"{path}.{key}".lstrip("."))
+    elif isinstance(tree, list):
+        for i, value in enumerate(tree):
+            yield from _not_finite(value, f"{path}[{i}]")
+    elif isinstance(tree, float) and not math.isfinite(tree):
+        if not (tree == math.inf and path in {"radio.range_m", "supervisor.range_m"}):
+            yield f"{path}: {tree} is no usable number; set a finite one"
+
+
+def _complaints_of_starts(scenario: Scenario) -> Iterable[str]:
+    starts, count = scenario.starts, scenario.robots.count
+    if starts.random:
+        return
+    if len(starts.poses_m) != count:
+        yield (
+            f"starts.poses_m: {len(starts.poses_m)} given for {count} robots; "
+            f"give one for each or set starts.random=true"
+        )
+    (x_min, y_min), (x_max, y_max) = scenario.domain.min_m, scenario.domain.max_m
+    for i, (x, y) in enumerate(starts.poses_m):
+        if not (x_min <= x <= x_max and y_min <= y <= y_max):
+            yield (
+                f"starts.poses_m[{i}]: ({x:g}, {y:g}) is outside the domain; move it inside "
+                f"[{x_min:g}, {x_max:g}] x [{y_min:g}, {y_max:g}]"
+            )
+
+
+POINT_FILES = frozenset({".csv", ".npy"})
+IMAGE_FILES = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".tif", ".tiff", ".bmp"})
+
+
+def is_image(name: str) -> bool:
+    """Whether a file name stands for a grey-scale density."""
+    return Path(name).suffix.lower() in IMAGE_FILES

@@ -1,0 +1,158 @@
+"""Integer weights, and how a robot publishes its weight vector (design: a keyframe or what changed).
+
+One unit is 1/L of the whole mass, L = lcm(M, N): every sample starts with L/N units and every robot
+point ships L/M, so that conservation is an equality and no residue keeps a sample alive.
+"""
+
+import math
+import zlib
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from kantor_protocol.packing import Pairs
+
+Weights = npt.NDArray[np.int64]
+
+_SIZES = (np.dtype("<u1"), np.dtype("<u2"), np.dtype("<u4"))
+
+
+class Units(msgspec.Struct, frozen=True):
+    """The mass of a run in exact integers (Kabir & Lee, section III: n_0 = 1/N, m = 1/M)."""
+
+    whole: int
+    """L = lcm(M, N): all mass."""
+    sample: int
+    """L / N: what each sample starts with."""
+    point: int
+    """L / M: what one robot point ships."""
+
+    @classmethod
+    def of(cls, points: int, samples: int) -> "Units":
+        """For M robot points and N samples."""
+        whole = math.lcm(points, samples)
+        return cls(whole=whole, sample=whole // samples, point=whole // points)
+
+
+class WeightsMessage(msgspec.Struct, frozen=True, array_like=True, tag=20):
+    """On `<id>/weights`: a whole vector, or the entries that fell since the message before."""
+
+    version: int
+    sequence: int
+    """Counts from 1 in a run."""
+    base: int
+    """0: a keyframe. Otherwise the sequence that the changes apply to."""
+    size: int
+    """N."""
+    content: bytes
+    """Keyframe: zlib of little-endian unsigned integers. Changes: gaps between rising indices,
+    each with its new value, as LEB128 pairs."""
+
+
+class WeightsPublisher:
+    """Gathers what fell in a weight vector and turns it into messages."""
+
+    def __init__(self, weights: Weights, every: int, keyframe_every: int) -> None:
+        """weights: (N,) the live vector in units; it is read, never written.
+
+        every: steps in one message; keyframe_every: messages from one keyframe to the next.
+        """
+        self._weights = weights
+        self._every = every
+        self._keyframe_every = keyframe_every
+        self._steps = 0
+        self._sequence = 0
+        self._changed: list[npt.NDArray[np.int64]] = []
+
+    def step(self, lowered: npt.NDArray[np.int64], last: bool) -> bytes:
+        """Note the indices that fell; the encoded message when one is due, else nothing.
+
+        last: nothing will fall any more, so a message is due now.
+        """
+        if lowered.size:
+            self._changed.append(lowered.copy())
+        due = self._steps % self._every == 0 or (last and bool(self._changed))
+        self._steps += 1
+        if not due:
+            return b""
+        keyframe = self._sequence % self._keyframe_every == 0
+        self._sequence += 1
+        content = None if keyframe else _changes(self._weights, self._changed)
+        self._changed = []
+        return msgspec.msgpack.encode(
+            WeightsMessage(
+                version=1,
+                sequence=self._sequence,
+                base=0 if content is None else self._sequence - 1,
+                size=self._weights.shape[0],
+                content=_keyframe(self._weights) if content is None else content,
+            )
+        )
+
+
+class WeightsSubscriber:
+    """Rebuilds a robot's exact weight vector from the messages on its weights key."""
+
+    def __init__(self) -> None:
+        self.weights: Weights | None = None
+        """None until the first keyframe, and again after a gap until the next one."""
+        self._sequence = 0
+        self._decoder = msgspec.msgpack.Decoder(WeightsMessage)
+
+    def take(self, payload: bytes) -> bool:
+        """Apply a message; False when it is malformed or does not follow what was received."""
+        try:
+            message = self._decoder.decode(payload)
+        except (msgspec.MsgspecError, RecursionError):
+            return False
+        if message.version != 1 or not 0 < message.size <= 50_000_000:
+            return False
+        if message.base == 0:
+            weights = _from_keyframe(message.content, message.size)
+            if weights is None:
+                return False
+            self.weights = weights
+        elif self.weights is None or message.base != self._sequence:
+            self.weights = None
+            return False
+        elif not _apply(self.weights, message.content):
+            self.weights = None
+            return False
+        self._sequence = message.sequence
+        return True
+
+
+def _keyframe(weights: Weights) -> bytes:
+    top = int(weights.max(initial=0))
+    kind = next(kind for kind in _SIZES if top < 256**kind.itemsize)
+    return zlib.compress(weights.astype(kind).tobytes(), 6)
+
+
+def _from_keyframe(content: bytes, size: int) -> Weights | None:
+    inflate = zlib.decompressobj()
+    try:
+        raw = inflate.decompress(content, 4 * size + 1)
+    except zlib.error:
+        return None
+    for kind in _SIZES:
+        if len(raw) == size * kind.itemsize:
+            return np.frombuffer(raw, dtype=kind).astype(np.int64)
+    return None
+
+
+def _changes(weights: Weights, changed: list[npt.NDArray[np.int64]]) -> bytes:
+    if not changed:
+        return b""
+    index = np.unique(np.concatenate(changed))
+    return Pairs(index.shape[0]).encode(index, weights[index], index.shape[0])
+
+
+def _apply(weights: Weights, content: bytes) -> bool:
+    pairs = Pairs().decode(content, weights.shape[0])
+    if pairs is None or bool(np.any(pairs[1] > weights[pairs[0]])):
+        return False
+    weights[pairs[0]] = pairs[1]
+    return True
+
+

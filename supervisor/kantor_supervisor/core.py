@@ -1,0 +1,58 @@
+"""The supervisor of the centralized variant (Kabir & Lee, Algorithm 2): one more participant.
+
+It hears every robot, merges what they know by the mission's rule (eq. 8), and tells all of them
+(eq. 9). It is a relay with a place of its own; a robot cannot tell its word from a neighbour's.
+"""
+
+from kantor_protocol.machine import (
+    EVERYBODY,
+    Inputs,
+    Outputs,
+    ParticipantId,
+    Pose,
+    State,
+)
+from kantor_protocol.messages import News
+from kantor_protocol.packing import Pairs
+from kantor_protocol.radio import Radio, replica_of
+from kantor_protocol.scenario import Scenario
+from kantor_protocol.weights import Units, WeightsPublisher
+
+
+class Supervisor:
+    """The supervisor of a scenario. `step` is its only entrance."""
+
+    def __init__(self, me: ParticipantId, scenario: Scenario, samples: int) -> None:
+        """samples: N."""
+        units = Units.of(scenario.energy.points, samples)
+        self._replica = replica_of(me, scenario, units, samples)
+        self._radio = Radio(me, scenario.roster)
+        self._publisher = WeightsPublisher(
+            self._replica.weights,
+            scenario.publish.weights_every,
+            scenario.publish.keyframe_every,
+        )
+        self._pairs = Pairs()
+        self._pose = Pose(*scenario.supervisor_m)
+        self._step = 0
+
+    def step(self, inputs: Inputs, /) -> Outputs:
+        """Take in what the robots sent, tell everybody what they lack."""
+        self._step += 1
+        self._radio.hear(inputs.inbox, self._learn)
+        fallen = self._replica.lowered()
+        finished = not self._replica.weights.any()
+        outputs = Outputs(
+            step=self._step,
+            pose=self._pose,
+            lowered=self._pairs.encode(fallen, self._replica.weights[fallen], fallen.shape[0]),
+            weights=self._publisher.step(fallen, last=finished),
+            outbox=(self._radio.say(self._replica, EVERYBODY, self._step, self._pose),),
+            state=State.FINISHED if finished else State.EXPLORING,
+            refused=self._radio.refused,
+        )
+        self._replica.end_step()
+        return outputs
+
+    def _learn(self, source: int, news: News) -> bool:
+        return self._replica.learn(source, news.have, news.logs, news.claims)

@@ -1,0 +1,1 @@
+"""The world: truth, sensors, the radio channel, the record and its referees."""

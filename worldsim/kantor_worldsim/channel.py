@@ -1,0 +1,226 @@
+"""The radio: who hears an envelope, when, and what gets lost. The only place that knows range.
+
+Range is between true poses at the time of sending. Every draw is keyed by (seed, purpose, link,
+sequence, copy): it depends on nothing that happened before, so one more message or one more robot
+changes no other draw.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numba import njit
+
+from kantor_protocol.keyed import Purpose, uniform
+from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
+from kantor_protocol.scenario import Scenario
+
+_LINK_WIDTH = 4096
+"""Links are numbered source * width + target; the roster is smaller."""
+DROPPED = -1
+
+
+class Verdict(msgspec.Struct, frozen=True, array_like=True):
+    """What the channel decided on one copy of an envelope for one receiver within range."""
+
+    source: ParticipantId
+    sequence: int
+    target: ParticipantId
+    due_ns: int
+    """When it arrives, or DROPPED."""
+
+
+class Sent(NamedTuple):
+    """An envelope on the air."""
+
+    now_ns: int
+    envelope: Envelope
+
+
+class _Law(NamedTuple):
+    """The radio's parameters, for the kernel."""
+
+    seed: int
+    range_m: float
+    supervisor_range_m: float
+    drop: float
+    delay_ns: int
+    jitter_ns: int
+    duplicate: float
+    reorder: float
+    reorder_ns: int
+
+
+@njit(cache=True)
+def _delay(law: _Law, link: int, sequence: int, copy: int) -> int:
+    delay = law.delay_ns
+    if law.jitter_ns > 0:
+        draw = uniform(law.seed, Purpose.DELAY.value, link, sequence, copy)
+        delay += int(draw * law.jitter_ns)
+    if law.reorder > 0.0:
+        draw = uniform(law.seed, Purpose.REORDER.value, link, sequence, copy)
+        if draw < law.reorder:
+            delay += int(draw / law.reorder * law.reorder_ns)
+    return delay
+
+
+@njit(cache=True)
+def _transmit(
+    law: _Law,
+    xy_m: np.ndarray,
+    sent: np.ndarray,
+    supervisor: int,
+    receiver: np.ndarray,
+    which: np.ndarray,
+    due_ns: np.ndarray,
+) -> tuple[int, int]:
+    """Rule on every envelope for every possible receiver.
+
+    sent: (m, 4) now_ns, source, sequence, target or -1. Returns how many verdicts there are, in
+    receiver, which (row of sent) and due_ns; and how many receivers were out of range.
+    """
+    count = 0
+    out_of_range = 0
+    for i in range(sent.shape[0]):
+        source, sequence, target = sent[i, 1], sent[i, 2], sent[i, 3]
+        for other in range(xy_m.shape[0]):
+            if other == source or (target >= 0 and other != target):
+                continue
+            by_supervisor = other == supervisor or source == supervisor
+            range_m = law.supervisor_range_m if by_supervisor else law.range_m
+            dx = xy_m[other, 0] - xy_m[source, 0]
+            dy = xy_m[other, 1] - xy_m[source, 1]
+            if dx * dx + dy * dy > range_m * range_m:
+                out_of_range += 1
+                continue
+            link = source * _LINK_WIDTH + other
+            copies = 1
+            if law.duplicate > 0.0:
+                draw = uniform(law.seed, Purpose.DUPLICATE.value, link, sequence, 0)
+                copies += draw < law.duplicate
+            for copy in range(copies):
+                receiver[count] = other
+                which[count] = i
+                draw = 1.0
+                if law.drop > 0.0:
+                    draw = uniform(law.seed, Purpose.DROP.value, link, sequence, copy)
+                if draw < law.drop:
+                    due_ns[count] = DROPPED
+                else:
+                    due_ns[count] = sent[i, 0] + _delay(law, link, sequence, copy)
+                count += 1
+    return count, out_of_range
+
+
+class Channel:
+    """Rules on transmissions and holds what is under way."""
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        radio = scenario.radio
+        self._roster = scenario.roster
+        self._places = {name: i for i, name in enumerate(scenario.roster)}
+        self._supervisor = self._places.get(SUPERVISOR, -1)
+        self._law = _Law(
+            seed,
+            radio.range_m,
+            scenario.supervisor.range_m,
+            radio.drop,
+            round(radio.delay_s * 1e9),
+            round(radio.jitter_s * 1e9),
+            radio.duplicate,
+            radio.reorder,
+            round(radio.reorder_s * 1e9),
+        )
+        self._xy_m = np.full((len(scenario.roster), 2), np.inf)
+        self._under_way: dict[ParticipantId, list[tuple[int, int, int, Envelope]]] = {
+            name: [] for name in scenario.roster
+        }
+        self._room: tuple[np.ndarray, np.ndarray, np.ndarray] = self._make_room(1)
+
+    @property
+    def lookahead_ns(self) -> int:
+        """Nothing sent arrives sooner."""
+        return self._law.delay_ns
+
+    def place(self, name: ParticipantId, pose: Pose) -> None:
+        """Note where a participant truly is."""
+        row = self._places[name]
+        self._xy_m[row, 0] = pose.x_m
+        self._xy_m[row, 1] = pose.y_m
+
+    def transmit(self, sent: Sequence[Sent]) -> tuple[list[Verdict], int]:
+        """Rule on envelopes by the poses as they are now; also how many receivers were too far.
+
+        Deliveries wait in the channel until `take`.
+        """
+        if not sent:
+            return [], 0
+        if self._room[0].shape[0] < 2 * len(sent) * len(self._roster):
+            self._room = self._make_room(len(sent))
+        rows = np.array(
+            [
+                (
+                    now_ns,
+                    self._places[envelope.source],
+                    envelope.sequence,
+                    -1
+                    if envelope.target == EVERYBODY
+                    else self._places.get(envelope.target, len(self._roster)),
+                )
+                for now_ns, envelope in sent
+            ],
+            dtype=np.int64,
+        )
+        receiver, which, due_ns = self._room
+        count, out_of_range = _transmit(
+            self._law, self._xy_m, rows, self._supervisor, receiver, which, due_ns
+        )
+        verdicts = []
+        for to, row, due in zip(
+            receiver[:count].tolist(), which[:count].tolist(), due_ns[:count].tolist(), strict=True
+        ):
+            envelope, target = sent[row].envelope, self._roster[to]
+            verdicts.append(Verdict(envelope.source, envelope.sequence, target, due))
+            if due != DROPPED:
+                key = (due, self._places[envelope.source], envelope.sequence, envelope)
+                self._under_way[target].append(key)
+        return verdicts, out_of_range
+
+    def take(self, name: ParticipantId, now_ns: int) -> tuple[Envelope, ...]:
+        """What has arrived at a participant by now, in order of (arrival, source, sequence)."""
+        waiting = self._under_way[name]
+        ready = [item for item in waiting if item[0] <= now_ns]
+        if not ready:
+            return ()
+        self._under_way[name] = [item for item in waiting if item[0] > now_ns]
+        ready.sort(key=lambda item: item[:3])
+        return tuple(item[3] for item in ready)
+
+    def next_due_ns(self) -> int | None:
+        """When the next delivery is due at anybody."""
+        return min((item[0] for box in self._under_way.values() for item in box), default=None)
+
+    def _make_room(self, envelopes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        size = 2 * envelopes * len(self._roster)
+        return (
+            np.zeros(size, dtype=np.int64),
+            np.zeros(size, dtype=np.int64),
+            np.zeros(size, dtype=np.int64),
+        )
+
+
+def links(xy_m: np.ndarray, range_m: float) -> int:
+    """Pairs of robots within range of each other. xy_m: (n, 2)."""
+    return int(_links(xy_m, range_m))
+
+
+@njit(cache=True)
+def _links(xy_m: np.ndarray, range_m: float) -> int:
+    count = 0
+    for i in range(xy_m.shape[0]):
+        for j in range(i):
+            dx = xy_m[i, 0] - xy_m[j, 0]
+            dy = xy_m[i, 1] - xy_m[j, 1]
+            count += dx * dx + dy * dy <= range_m * range_m
+    return count

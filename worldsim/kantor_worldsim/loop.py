@@ -1,0 +1,77 @@
+"""The virtual loop: discrete events in simulated time, the same for every exchange."""
+
+import heapq
+from collections.abc import Callable, Mapping
+
+from kantor_protocol.clock import Clock, clocks
+from kantor_protocol.machine import Exchange, Inputs, Outputs, ParticipantId, StateMachine
+from kantor_protocol.messages import decode_inputs, decode_outputs, encode
+from kantor_worldsim.stage import Stage, Step
+
+
+def in_process(machines: Mapping[ParticipantId, StateMachine]) -> Exchange:
+    """The exchange without processes. Everything passes the codec, so nothing is shared."""
+
+    def exchange(inputs: Mapping[ParticipantId, Inputs]) -> Mapping[ParticipantId, Outputs]:
+        return {
+            name: decode_outputs(encode(machines[name].step(decode_inputs(encode(given)))))
+            for name, given in inputs.items()
+        }
+
+    return exchange
+
+
+class Agenda:
+    """Who is due when: the next step of every clock."""
+
+    def __init__(self, owned: Mapping[ParticipantId, Clock]) -> None:
+        self._clocks = owned
+        self._due = [(clock.due_ns(1), i, 1, name) for i, (name, clock) in enumerate(owned.items())]
+        heapq.heapify(self._due)
+
+    @property
+    def next_ns(self) -> int:
+        """When the next participant is due."""
+        return self._due[0][0]
+
+    def batch(self, lookahead_ns: int) -> list[tuple[int, ParticipantId]]:
+        """Everybody due before a message sent at the earliest of them could arrive, by (time, roster).
+
+        A participant appears once, however short its period.
+        """
+        until_ns = self._due[0][0] + lookahead_ns
+        batch: list[tuple[int, ParticipantId]] = []
+        again = []
+        while self._due and (self._due[0][0] < until_ns or not batch or self._due[0][0] == batch[0][0]):
+            due_ns, order, step, name = heapq.heappop(self._due)
+            batch.append((due_ns, name))
+            again.append((self._clocks[name].due_ns(step + 1), order, step + 1, name))
+        for item in again:
+            heapq.heappush(self._due, item)
+        return batch
+
+
+def simulate(stage: Stage, exchange: Exchange, seed: int, stopped: Callable[[], bool]) -> str:
+    """Run until every robot rests, the limit is reached or `stopped()`; the reason, also recorded."""
+    agenda = Agenda(clocks(stage.scenario, seed))
+    limit_ns = stage.scenario.limit_ns
+    reason = "done"
+    while not stage.over:
+        if stopped():
+            reason = "interrupted"
+            break
+        if agenda.next_ns > limit_ns:
+            reason = "limit"
+            break
+        batch = agenda.batch(stage.channel.lookahead_ns)
+        inputs = {name: stage.inputs(name, due_ns) for due_ns, name in batch}
+        outputs = exchange(inputs)
+        for moment_ns in sorted({due_ns for due_ns, _ in batch}):
+            steps = [
+                Step(name, inputs[name], outputs.get(name))
+                for due_ns, name in batch
+                if due_ns == moment_ns
+            ]
+            stage.settle(moment_ns, steps)
+    stage.end(reason)
+    return reason

@@ -1,0 +1,125 @@
+"""The record of a run: one opening, a batch for each moment at which somebody acted, one ending.
+
+Everything that judges or measures a run (checkers, metrics, reports, replay) reads these records and
+nothing else. They hold no trace of the exchange that ran the robots, so that the same scenario and
+seed give the same bytes in process and over the bus.
+"""
+
+import msgspec
+
+from kantor_protocol.machine import Envelope, Inputs, Observation, Outputs, ParticipantId
+from kantor_protocol.messages import Array
+from kantor_protocol.scenario import Scenario
+from kantor_protocol.weights import Units
+from kantor_worldsim.channel import Verdict
+from kantor_worldsim.world import Found, Ruling, Site
+
+VERSION = 1
+
+
+class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
+    """What the run starts from."""
+
+    version: int
+    scenario: Scenario
+    seed: int
+    samples_m: Array
+    targets_m: Array
+    starts_m: Array
+    first_look: dict[ParticipantId, tuple[Found, ...]]
+    """Targets seen at time 0."""
+
+    @property
+    def site(self) -> Site:
+        """The arrays of the opening."""
+        return Site(
+            self.samples_m.open("<f8", 2),
+            self.targets_m.open("<f8", 2),
+            self.starts_m.open("<f8", 2),
+        )
+
+    @property
+    def units(self) -> Units:
+        """The mass of the run."""
+        return Units.of(self.scenario.energy.points, self.samples_m.shape[0])
+
+
+class Act(msgspec.Struct, frozen=True, array_like=True):
+    """One participant's step: what it was given, what it did, what the world made of it."""
+
+    name: ParticipantId
+    now_ns: int
+    observation: Observation
+    heard: tuple[tuple[ParticipantId, int], ...]
+    """The inbox by reference: source and sequence of each envelope, in order."""
+    outputs: Outputs | None
+    """None: late, crashed or cut off."""
+    ruling: Ruling | None
+
+
+class Batch(msgspec.Struct, frozen=True, array_like=True, tag="batch"):
+    """Everybody who acted at one moment, and what became of what they sent."""
+
+    now_ns: int
+    acts: tuple[Act, ...]
+    verdicts: tuple[Verdict, ...]
+    out_of_range: int
+    """Receivers that an envelope did not reach for range."""
+    absent: tuple[ParticipantId, ...] = ()
+    """Participants that were due and gave no outputs."""
+
+
+class Ending(msgspec.Struct, frozen=True, array_like=True, tag="ending"):
+    """Why and when the run ended."""
+
+    now_ns: int
+    reason: str
+    """`done`, `limit`, `interrupted` or `deserted` (nobody left)."""
+
+
+Record = Opening | Batch | Ending
+
+_ENCODER = msgspec.msgpack.Encoder()
+_DECODER = msgspec.msgpack.Decoder(Record)
+
+encode_record = _ENCODER.encode
+
+
+def decode_record(payload: bytes) -> Record:
+    """A record from its bytes. Raises msgspec.MsgspecError."""
+    record: Record = _DECODER.decode(payload)
+    return record
+
+
+def opening_of(
+    scenario: Scenario, seed: int, site: Site, first_look: dict[ParticipantId, tuple[Found, ...]]
+) -> Opening:
+    """The first record of a run."""
+    return Opening(
+        VERSION,
+        scenario,
+        seed,
+        Array.of(site.samples_m),
+        Array.of(site.targets_m),
+        Array.of(site.starts_m),
+        first_look,
+    )
+
+
+class Mailbag:
+    """Envelopes of a run by (source, sequence), to turn references back into inboxes."""
+
+    def __init__(self) -> None:
+        self._envelopes: dict[tuple[ParticipantId, int], Envelope] = {}
+
+    def inputs(self, act: Act) -> Inputs:
+        """What the participant was given. Raises KeyError for an envelope that was never sent."""
+        inbox = tuple(self._envelopes[reference] for reference in act.heard)
+        return Inputs(act.now_ns, act.observation, inbox)
+
+    def post(self, batch: Batch) -> None:
+        """Note what was sent in a batch."""
+        for act in batch.acts:
+            for envelope in act.outputs.outbox if act.outputs else ():
+                self._envelopes[envelope.source, envelope.sequence] = envelope
+

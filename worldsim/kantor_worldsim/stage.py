@@ -1,0 +1,101 @@
+"""Truth, radio and record together: what each participant is given, and what follows from its act.
+
+Both the virtual loop and the wall relay stand on this; they differ only in who waits for whom.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from kantor_protocol.machine import Inputs, Outputs, ParticipantId, State
+from kantor_protocol.messages import RefusedError, check_outputs
+from kantor_protocol.scenario import Scenario
+from kantor_worldsim.channel import Channel, Sent, Verdict
+from kantor_worldsim.records import Act, Batch, Ending, Record, opening_of
+from kantor_worldsim.world import Site, World
+
+Listener = Callable[[Record], None]
+"""Takes each record as it comes into being: journal, metrics, checker, progress."""
+
+
+class Step(NamedTuple):
+    """What a participant was given and what it returned; None if it returned nothing."""
+
+    name: ParticipantId
+    inputs: Inputs
+    outputs: Outputs | None
+
+
+class Stage:
+    """A mission under way."""
+
+    def __init__(
+        self, scenario: Scenario, seed: int, site: Site, listeners: Iterable[Listener]
+    ) -> None:
+        self.scenario = scenario
+        self.now_ns = 0
+        self.channel = Channel(scenario, seed)
+        self._world = World(scenario, seed, site)
+        self._listeners = tuple(listeners)
+        self._resting: set[ParticipantId] = set()
+        for name in scenario.roster:
+            self.channel.place(name, self._world.pose(name))
+        self._tell(opening_of(scenario, seed, site, self._world.first_look()))
+
+    def inputs(self, name: ParticipantId, now_ns: int) -> Inputs:
+        """What has reached a participant by now. It is handed out once."""
+        return Inputs(now_ns, self._world.observe(name), self.channel.take(name, now_ns))
+
+    def resting(self, name: ParticipantId) -> bool:
+        """Whether a robot is finished or exhausted."""
+        return name in self._resting
+
+    @property
+    def over(self) -> bool:
+        """Whether every robot is finished or exhausted."""
+        return len(self._resting) == self.scenario.robots.count
+
+    def settle(self, now_ns: int, steps: Iterable[Step]) -> tuple[Verdict, ...]:
+        """Let steps made at one moment happen: first everybody moves, then everybody is heard."""
+        self.now_ns = max(self.now_ns, now_ns)
+        acts, sent, absent = [], [], []
+        for name, inputs, outputs in steps:
+            sound = self._sound(name, outputs)
+            if sound is None:
+                absent.append(name)
+            acts.append(self._act(name, inputs, sound))
+            if sound is not None:
+                sent += [Sent(inputs.now_ns, envelope) for envelope in sound.outbox]
+        verdicts, out_of_range = self.channel.transmit(sent)
+        batch = Batch(now_ns, tuple(acts), tuple(verdicts), out_of_range, tuple(absent))
+        self._tell(batch)
+        return batch.verdicts
+
+    def end(self, reason: str) -> None:
+        """Close the record."""
+        self._tell(Ending(self.now_ns, reason))
+
+    def _act(self, name: ParticipantId, inputs: Inputs, outputs: Outputs | None) -> Act:
+        heard = tuple((envelope.source, envelope.sequence) for envelope in inputs.inbox)
+        if outputs is None:
+            return Act(name, inputs.now_ns, inputs.observation, heard, None, None)
+        ruling = self._world.accept(name, inputs.now_ns, outputs)
+        self.channel.place(name, ruling.pose)
+        if outputs.state is not State.EXPLORING and name in self.scenario.robot_ids:
+            self._resting.add(name)
+        return Act(name, inputs.now_ns, inputs.observation, heard, outputs, ruling)
+
+    def _sound(self, name: ParticipantId, outputs: Outputs | None) -> Outputs | None:
+        """The outputs, unless they have no place on the stage: bad numbers, a false sender."""
+        if outputs is None:
+            return None
+        try:
+            check_outputs(outputs)
+        except RefusedError:
+            return None
+        if any(envelope.source != name for envelope in outputs.outbox):
+            return None
+        return outputs
+
+    def _tell(self, record: Record) -> None:
+        for listener in self._listeners:
+            listener(record)
