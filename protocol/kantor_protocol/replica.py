@@ -495,3 +495,45 @@ class Replica:
         """Begin the next step."""
         self.store.counters[_LOWERED] = 0
         self.store.counters[_STEP] += 1
+
+
+@njit(cache=True)
+def _read_logs(logs: np.ndarray, rows: np.ndarray) -> int:
+    at = 0
+    row = 0
+    while at < logs.shape[0]:
+        origin, at = take_uint(logs, at)
+        start, at = take_uint(logs, at)
+        _span, at = take_uint(logs, at)
+        count, at = take_uint(logs, at)
+        index = 0
+        if at < 0 or start > _LENGTH_MAX or count > logs.shape[0]:
+            return -1
+        for i in range(count):
+            step, at = take_int(logs, at)
+            value, at = take_uint(logs, at)
+            if at < 0:
+                return -1
+            index += step
+            rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3] = origin, start + i, index, value
+            row += 1
+    return row
+
+
+def read_logs(logs: bytes) -> npt.NDArray[np.int64] | None:
+    """The entries in a message, as rows (origin, position, sample, value); None if malformed.
+
+    With min, positions count the entries that were sent, which may be fewer than the span.
+    """
+    rows = np.zeros((len(logs) // 2 + 1, 4), dtype=np.int64)
+    count = _read_logs(np.frombuffer(logs, dtype=np.uint8), rows)
+    return None if count < 0 else rows[:count]
+
+
+def read_have(have: bytes, origins: int) -> list[int] | None:
+    """The log lengths in a version vector, in roster order; None if malformed."""
+    buffer, at, lengths = np.frombuffer(have, dtype=np.uint8), 0, []
+    for _ in range(origins):
+        length, at = take_uint(buffer, at)
+        lengths.append(int(length))
+    return None if at < 0 else lengths

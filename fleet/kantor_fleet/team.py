@@ -1,0 +1,22 @@
+"""The participants of a scenario as objects, for runs inside one process."""
+
+from kantor_agent.core import Agent
+from kantor_protocol.machine import SUPERVISOR, ParticipantId, StateMachine
+from kantor_protocol.scenario import Scenario
+from kantor_supervisor.core import Supervisor
+from kantor_worldsim.world import Site
+
+
+def team(scenario: Scenario, seed: int, site: Site) -> dict[ParticipantId, StateMachine]:
+    """Everybody in the roster."""
+    return {
+        name: participant(name, scenario, seed, site) for name in scenario.roster
+    }
+
+
+def participant(name: ParticipantId, scenario: Scenario, seed: int, site: Site) -> StateMachine:
+    """One participant as it is at time 0."""
+    if name == SUPERVISOR:
+        return Supervisor(name, scenario, site.samples_m.shape[0])
+    x_m, y_m = site.starts_m[scenario.robot_ids.index(name)].tolist()
+    return Agent(name, scenario, seed, (x_m, y_m), site.samples_m)

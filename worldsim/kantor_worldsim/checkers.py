@@ -1,0 +1,279 @@
+"""Referees that read only the record. Each rule is one method; each can fail, and a test shows how.
+
+A complaint is one line: rule, time, who, what. A run is clean when there is none.
+"""
+
+import math
+from collections.abc import Iterable
+
+import numpy as np
+
+from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
+from kantor_protocol.messages import RefusedError, decode_news
+from kantor_protocol.packing import Pairs
+from kantor_protocol.replica import read_have, read_logs
+from kantor_worldsim.channel import DROPPED, Verdict
+from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
+from kantor_worldsim.world import SPEED_TOLERANCE
+
+_COMPLAINTS_MAX = 100
+"""A broken record is broken; further complaints only count."""
+
+
+class Checker:
+    """Follows the records of one run and collects complaints.
+
+    Rules
+    -----
+    range       no envelope is delivered to anybody beyond the range at the time of sending
+    delivery    what is in an inbox was delivered to it, is due, and came as often as ruled
+    weights     no entry of a published weight vector ever rises or is negative
+    energy      nobody ships more points than its budget, or more units than a point holds
+    ledger      consumed = sum of the ledgers: what a participant sends of its log is what it consumed,
+                entry for entry, and at the end its vector is exactly what the logs it holds leave
+    credit      no view is lower than the weights that all spending leaves (both merges)
+    speed       no accepted move is longer than speed times time
+    goal        a goal has weight in the robot's own view (transport with standing samples)
+    order       steps count up by one, time never runs back, an opening first, nothing after the end
+    ruling      the world found no fault of its own
+    """
+
+    def __init__(self) -> None:
+        self.complaints: list[str] = []
+        self.count = 0
+        """All complaints, also those beyond the ones that are kept."""
+        self._opening: Opening | None = None
+        self._ended = False
+        self._now_ns = 0
+        self._pairs = Pairs()
+
+    def take(self, record: Record) -> None:
+        """Check one record."""
+        if self._ended:
+            self._complain("order", "record", "something follows the ending")
+        elif isinstance(record, Opening):
+            if self._opening is not None:
+                self._complain("order", "record", "a second opening")
+            self._open(record)
+        elif self._opening is None:
+            self._complain("order", "record", "no opening")
+        elif isinstance(record, Batch):
+            self._check(record)
+        elif isinstance(record, Ending):
+            self._ended = True
+            self._end()
+
+    def _complain(self, rule: str, who: str, what: str) -> None:
+        self.count += 1
+        if len(self.complaints) < _COMPLAINTS_MAX:
+            self.complaints.append(f"{rule}: t={self._now_ns * 1e-9:.3f} s: {who}: {what}")
+
+    def _open(self, opening: Opening) -> None:
+        scenario, site = opening.scenario, opening.site
+        self._opening, self._scenario, self._units = opening, scenario, opening.units
+        self._samples = site.samples_m.shape[0]
+        names = scenario.roster
+        self._places = {name: i for i, name in enumerate(names)}
+        starts = [Pose(float(x), float(y)) for x, y in site.starts_m]
+        if scenario.centralized:
+            starts.append(Pose(*scenario.supervisor_m))
+        self._poses = dict(zip(names, starts, strict=True))
+        self._moved_ns = dict.fromkeys(names, 0)
+        self._steps = dict.fromkeys(names, 0)
+        self._points = dict.fromkeys(names, 0)
+        self._views = np.full((len(names), self._samples), self._units.sample, dtype=np.int64)
+        self._own_spent: dict[ParticipantId, list[list[int]]] = {name: [] for name in names}
+        self._have: dict[ParticipantId, list[int]] = {}
+        self._consumed = np.zeros(self._samples, dtype=np.int64)
+        self._absences = dict.fromkeys(names, 0)
+        self._in_flight: dict[tuple[ParticipantId, int, ParticipantId], list[int]] = {}
+        self._sent: dict[tuple[ParticipantId, int], ParticipantId] = {}
+
+    def _check(self, batch: Batch) -> None:
+        if batch.now_ns < self._now_ns:
+            self._complain("order", "record", f"time runs back to {batch.now_ns * 1e-9:.3f} s")
+        self._now_ns = batch.now_ns
+        for act in batch.acts:
+            if act.name not in self._places:
+                self._complain("order", act.name, "not in the roster")
+                continue
+            self._check_inbox(act)
+            if act.outputs is None or act.ruling is None:
+                self._absences[act.name] += 1
+            else:
+                self._check_act(act)
+        for verdict in batch.verdicts:
+            self._check_verdict(verdict)
+
+    def _check_inbox(self, act: Act) -> None:
+        for source, sequence in act.heard:
+            key = (source, sequence, act.name)
+            due = self._in_flight.get(key, [])
+            arrived = [moment for moment in due if moment <= act.now_ns]
+            if not arrived:
+                self._complain(
+                    "delivery", act.name, f"heard {source}#{sequence}, which was not delivered"
+                )
+                continue
+            due.remove(min(arrived))
+            if not due:
+                del self._in_flight[key]
+
+    def _check_act(self, act: Act) -> None:
+        outputs, ruling = act.outputs, act.ruling
+        assert outputs is not None and ruling is not None
+        for violation in ruling.violations:
+            self._complain("ruling", act.name, f"the world refused its {violation}")
+        expected = self._steps[act.name] + 1
+        if not expected <= outputs.step <= expected + self._absences[act.name]:
+            self._complain("order", act.name, f"step {outputs.step}, expected {expected}")
+        self._check_speed(act.name, act.now_ns, ruling.pose)
+        self._check_goal(act.name, outputs.goal)
+        self._check_weights(act.name, outputs.lowered)
+        self._check_energy(act.name, outputs.spent, outputs.energy_spent)
+        self._steps[act.name], self._absences[act.name] = outputs.step, 0
+        self._moved_ns[act.name] = act.now_ns
+        self._poses[act.name] = ruling.pose
+        for envelope in outputs.outbox:
+            self._sent[envelope.source, envelope.sequence] = envelope.target
+            self._check_ledger(act.name, envelope)
+
+    def _check_speed(self, name: ParticipantId, now_ns: int, pose: Pose) -> None:
+        before, elapsed_ns = self._poses[name], now_ns - self._moved_ns[name]
+        limit_m_s = 0.0 if name == SUPERVISOR else self._scenario.vehicle.speed_m_s
+        limit_m = limit_m_s * elapsed_ns * 1e-9 * (1.0 + 2.0 * SPEED_TOLERANCE)
+        way_m = math.hypot(pose.x_m - before.x_m, pose.y_m - before.y_m)
+        if not way_m <= limit_m:
+            self._complain("speed", name, f"moved {way_m:.6g} m, allowed {limit_m:.6g} m")
+
+    def _check_weights(self, name: ParticipantId, lowered: bytes) -> None:
+        pairs = self._pairs.decode(lowered, self._samples)
+        if pairs is None:
+            self._complain("weights", name, "entries that do not decode")
+            return
+        view = self._views[self._places[name]]
+        for sample, left in zip(pairs[0].tolist(), pairs[1].tolist(), strict=True):
+            if left >= view[sample]:
+                self._complain(
+                    "weights", name, f"sample {sample} from {view[sample]} to {left} units"
+                )
+            view[sample] = left
+
+    def _check_goal(self, name: ParticipantId, goal: tuple[float, float] | None) -> None:
+        if goal is None or self._scenario.samples.diffusion_m > 0.0:
+            return
+        if self._samples_by_place is None:
+            self._samples_by_place = self._index_samples()
+        samples = self._samples_by_place.get(goal)
+        if samples is None:
+            self._complain("goal", name, f"{goal} is no sample")
+        elif not any(self._views[self._places[name], j] > 0 for j in samples):
+            self._complain("goal", name, f"{goal} has no weight left in its view")
+
+    _samples_by_place: dict[tuple[float, float], list[int]] | None = None
+
+    def _index_samples(self) -> dict[tuple[float, float], list[int]]:
+        assert self._opening is not None
+        places: dict[tuple[float, float], list[int]] = {}
+        for j, (x, y) in enumerate(self._opening.site.samples_m.tolist()):
+            places.setdefault((x, y), []).append(j)
+        return places
+
+    def _check_energy(self, name: ParticipantId, spent: bytes, energy_spent: int) -> None:
+        pairs = self._pairs.decode(spent, self._samples)
+        if pairs is None:
+            self._complain("energy", name, "spending that does not decode")
+            return
+        if pairs[0].size:
+            self._points[name] += 1
+            units = int(pairs[1].sum())
+            if units > self._units.point:
+                self._complain("energy", name, f"{units} units in one point")
+            np.add.at(self._consumed, pairs[0], pairs[1])
+            if self._scenario.merge == "ledger":
+                self._own_spent[name] += np.column_stack(pairs).tolist()
+        if self._points[name] > self._scenario.steps_per_robot:
+            self._complain("energy", name, f"{self._points[name]} points shipped")
+        if energy_spent < self._points[name] and name != SUPERVISOR:
+            self._complain("energy", name, f"counts {energy_spent} of {self._points[name]} points")
+
+    def _check_ledger(self, name: ParticipantId, envelope: Envelope) -> None:
+        """Own entries that a participant sends are the ones it consumed, one for one."""
+        if self._scenario.merge != "ledger":
+            return
+        try:
+            news = decode_news(envelope.body)
+        except RefusedError as error:
+            self._complain("ledger", name, f"sends what nobody can read: {error}")
+            return
+        have, logs = read_have(news.have, len(self._places)), read_logs(news.logs)
+        if have is None or logs is None:
+            self._complain("ledger", name, "sends what nobody can read")
+            return
+        self._have[name] = have
+        own = logs[logs[:, 0] == self._places[name]]
+        if own.size:
+            start = int(own[0, 1])
+            consumed = self._own_spent[name][start : start + own.shape[0]]
+            if own[:, 2:].tolist() != consumed:
+                self._complain("ledger", name, f"its log from {start} on is not what it consumed")
+
+    def _check_verdict(self, verdict: Verdict) -> None:
+        target = self._sent.get((verdict.source, verdict.sequence))
+        if target is None or verdict.target not in self._places:
+            self._complain(
+                "delivery", verdict.target, f"{verdict.source}#{verdict.sequence} was never sent"
+            )
+            return
+        if target not in (EVERYBODY, verdict.target):
+            self._complain("delivery", verdict.target, "delivered what was for somebody else")
+        if verdict.due_ns == DROPPED:
+            return
+        by_supervisor = SUPERVISOR in (verdict.source, verdict.target)
+        scenario = self._scenario
+        range_m = scenario.supervisor.range_m if by_supervisor else scenario.radio.range_m
+        here, there = self._poses[verdict.source], self._poses[verdict.target]
+        dx, dy = there.x_m - here.x_m, there.y_m - here.y_m
+        if dx * dx + dy * dy > range_m * range_m:
+            self._complain(
+                "range",
+                verdict.target,
+                f"{verdict.source}#{verdict.sequence} over {math.hypot(dx, dy):.6g} m",
+            )
+        key = (verdict.source, verdict.sequence, verdict.target)
+        self._in_flight.setdefault(key, []).append(verdict.due_ns)
+
+    def _end(self) -> None:
+        left = np.maximum(self._units.sample - self._consumed, 0)
+        for name, place in self._places.items():
+            below = np.flatnonzero(self._views[place] < left)
+            if below.size:
+                self._complain("credit", name, f"its view of sample {below[0]} is below the truth")
+        if self._scenario.merge == "ledger":
+            for name, have in self._have.items():
+                self._check_view(name, have)
+
+    def _check_view(self, name: ParticipantId, have: list[int]) -> None:
+        spent = np.zeros(self._samples, dtype=np.int64)
+        for origin, length in zip(self._places, have, strict=True):
+            log = self._own_spent[origin]
+            if length > len(log):
+                self._complain("ledger", name, f"holds {length} entries of {origin}'s {len(log)}")
+                return
+            entries = np.array(log[:length], dtype=np.int64).reshape(-1, 2)
+            np.add.at(spent, entries[:, 0], entries[:, 1])
+        wrong = np.flatnonzero(
+            self._views[self._places[name]] != np.maximum(self._units.sample - spent, 0)
+        )
+        if wrong.size:
+            self._complain(
+                "ledger", name, f"its view of sample {wrong[0]} is not what its logs leave"
+            )
+
+
+def check(records: Iterable[Record]) -> Checker:
+    """Check a whole record."""
+    checker = Checker()
+    for record in records:
+        checker.take(record)
+    return checker

@@ -1,0 +1,167 @@
+"""The folder that a run leaves (design, part 7), and the referees that follow the run."""
+
+import csv
+import json
+import platform
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import IO, Any
+
+import msgspec
+
+from kantor_protocol.scenario import Scenario, to_toml
+from kantor_worldsim.checkers import Checker
+from kantor_worldsim.journal import Journal, file_digest
+from kantor_worldsim.metrics import Metrics, Result, Row
+from kantor_worldsim.records import Record
+
+JOURNAL = "run.mcap"
+MANIFEST = "manifest.json"
+RESULT = "result.json"
+SCENARIO = "scenario.toml"
+METRICS = "metrics.csv"
+REPORT = "report.png"
+
+
+def folder_for(scenario: Scenario, seed: int, below: Path) -> Path:
+    """Create `<UTC>_<scenario>_s<seed>` below a folder; a number is added if it exists."""
+    stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}_{scenario.name}_s{seed}"
+    for attempt in range(1000):
+        folder = below / (stem if not attempt else f"{stem}_{attempt}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return folder
+    raise FileExistsError(f"{below / stem}: a thousand runs in one second")
+
+
+class Recording:
+    """Follows a run: journal, metrics and checker; writes the run folder if there is one."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        exchange: str,
+        folder: Path | None = None,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """folder: an existing folder for the run's files; None keeps nothing."""
+        self.metrics = Metrics()
+        self.checker = Checker()
+        self._scenario = scenario
+        self._seed = seed
+        self._exchange = exchange
+        self._folder = folder
+        self._monotonic = monotonic
+        self._started = monotonic()
+        self._rows = 0
+        self._table: _Table | None = None
+        if folder is not None:
+            _write_text(folder / SCENARIO, to_toml(scenario))
+            self._manifest = _manifest(scenario, seed, exchange)
+            _write_json(folder / MANIFEST, self._manifest)
+            self._table = _Table(folder / METRICS)
+        self.journal = Journal(None if folder is None else folder / JOURNAL, monotonic)
+
+    def take(self, record: Record) -> None:
+        """Follow one record."""
+        self.journal.take(record)
+        self.metrics.take(record)
+        self.checker.take(record)
+        for row in self.metrics.rows[self._rows :]:
+            self.journal.take_row(row)
+            if self._table is not None:
+                self._table.add(row)
+        self._rows = len(self.metrics.rows)
+
+    def finish(self) -> Result:
+        """Close the files and sum up."""
+        self.journal.close()
+        if self._table is not None:
+            self._table.close()
+        result = self.metrics.result(
+            exchange=self._exchange,
+            digest=self.journal.digest.hex,
+            wall_s=self._monotonic() - self._started,
+            record=self.journal.cut or "whole",
+            complaints=tuple(self.checker.complaints),
+        )
+        if self._folder is not None:
+            self._manifest |= {
+                "digest": result.digest,
+                "records": self.journal.digest.records,
+                "record": result.record,
+                "ended": result.ended,
+                "absences": result.absences,
+                "journal_blake2b": file_digest(self._folder / JOURNAL),
+            }
+            _write_json(self._folder / MANIFEST, self._manifest)
+            _write_text(
+                self._folder / RESULT,
+                msgspec.json.format(msgspec.json.encode(result), indent=2).decode() + "\n",
+            )
+        return result
+
+
+class _Table:
+    """metrics.csv, written as the run goes; a full disk ends it quietly, the journal says so."""
+
+    def __init__(self, path: Path) -> None:
+        self._file: IO[str] | None = None
+        try:
+            self._file = path.open("w", newline="", encoding="utf-8", buffering=1)
+            self._writer = csv.writer(self._file)
+            self._writer.writerow(Row._fields)
+        except OSError:
+            self.close()
+
+    def add(self, row: Row) -> None:
+        if self._file is None:
+            return
+        try:
+            self._writer.writerow("" if value is None else value for value in row)
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            try:
+                file.close()
+            except OSError:
+                pass
+
+
+def _manifest(scenario: Scenario, seed: int, exchange: str) -> dict[str, Any]:
+    libraries = ("kantor", "eclipse-zenoh", "numpy", "scipy", "numba", "msgspec", "mcap")
+    return {
+        "format": 1,
+        "scenario": scenario.name,
+        "seed": seed,
+        "exchange": exchange,
+        "started_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            **{name: version(name) for name in libraries},
+        },
+    }
+
+
+def _write_json(path: Path, tree: dict[str, Any]) -> None:
+    _write_text(path, json.dumps(tree, indent=2) + "\n")
+
+
+def _write_text(path: Path, text: str) -> None:
+    """Replace a file whole, so that nobody ever reads half of it; a full disk leaves the old one."""
+    draft = path.with_name(f".{path.name}.draft")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
