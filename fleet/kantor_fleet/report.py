@@ -51,6 +51,10 @@ _TEAM = (
 _LEFT = ListedColormap(matplotlib.colormaps["YlOrBr"](np.linspace(0.25, 0.85, 256)))
 """Weight left, from hardly any to all."""
 
+_GAP = "  ·  "
+_ENDED = {"done": "energy spent", "limit": "time limit", "cut": "record cut"}
+"""Why a run ended that did not finish."""
+
 _POINTS_SHOWN = 200_000
 _ROWS_SHOWN = 4_000
 _STROKE_POINTS = 4_096
@@ -212,13 +216,11 @@ def _what(run: _Run) -> str:
         f"{scenario.merge} merge {'with' if scenario.claims else 'without'} claims",
         f"{scenario.planner.name} planner",
     )
-    return "  ·  ".join(parts)
+    return _GAP.join(parts)
 
 
 def _outcome(run: _Run) -> str:
-    result = run.metrics.result(
-        exchange="", digest="", wall_s=0.0, record="whole", complaints=()
-    )
+    result = run.metrics.result(exchange="", digest="", wall_s=0.0, record="", complaints=())
     parts = []
     if result.detection_rate is not None:
         parts.append(
@@ -226,14 +228,138 @@ def _outcome(run: _Run) -> str:
             f"({result.detection_rate:.1%})"
         )
     if result.finished_tick is not None:
-        parts.append(f"finished at step {result.finished_tick:,}")
+        parts.append(f"finished at tick {result.finished_tick:,}")
     else:
-        parts.append(f"not finished at tick {result.ticks:,} ({_reason(run, result.ended)})")
-    parts.append(f"$W_{{UB}}$ = {result.w_ub.paper:.4g}")
-    return "  ·  ".join(parts)
+        parts.append(f"{_ENDED.get(result.ended, result.ended)} at tick {result.ticks:,}")
+    parts.append(f"mass left {result.mass_left:.1%}")
+    parts.append(f"$W_{{UB}}$ {result.w_ub.paper:.4g}")
+    return _GAP.join(parts)
 
 
-def _reason(run: _Run, ended: str) -> str:
-    """Why a run ended that did not finish."""
-    words = {"done": "energy spent", "limit": "time limit", "cut": "record cut"}
-    return words.get(ended, ended)
+def _draw_map(place: SubFigure, run: _Run) -> None:
+    """The map as the run left it. Every mark names itself for the legend."""
+    axes = place.subplots()
+    _draw_domain(axes, run)
+    _draw_radio(axes, run)
+    _draw_samples(axes, run)
+    _draw_trails(axes, run)
+    _draw_targets(axes, run)
+    if run.scenario.centralized:
+        _mark(axes, np.array([run.scenario.supervisor_m]), "supervisor", "*", 190.0, "white")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.02)
+    axes.ticklabel_format(useOffset=False, style="plain")
+    _tidy(axes, "x, m", "y, m")
+    handles, _ = axes.get_legend_handles_labels()
+    _legend(place, handles, "outside lower center", columns=7)
+
+
+def _draw_domain(axes: Axes, run: _Run) -> None:
+    low, high = run.scenario.domain.min_m, run.scenario.domain.max_m
+    width_m, height_m = high[0] - low[0], high[1] - low[1]
+    dashes = {"edgecolor": _FAINT, "linewidth": 0.8, "linestyle": (0, (4, 3))}
+    axes.add_patch(Rectangle(low, width_m, height_m, fill=False, zorder=0.5, **dashes))
+
+
+def _draw_radio(axes: Axes, run: _Run) -> None:
+    """How far those who send are heard: the supervisor, or each robot from its end pose."""
+    scenario = run.scenario
+    centres_m = [trail.end_m for trail in run.trails.values()]
+    range_m = scenario.radio.range_m
+    if scenario.centralized:
+        centres_m, range_m = [scenario.supervisor_m], scenario.supervisor.range_m
+    elif len(centres_m) == 1:
+        return
+    if not 0.0 < range_m < np.inf:
+        return
+    line = {"linewidth": 0.8, "alpha": 0.7 if len(centres_m) <= len(_TEAM) else 0.3}
+    circles = EllipseCollection(
+        [2.0 * range_m],
+        [2.0 * range_m],
+        [0.0],
+        units="xy",
+        offsets=centres_m,
+        offset_transform=axes.transData,
+        facecolors="none",
+        edgecolors=_FAINT,
+        zorder=0.8,
+        **line,
+    )
+    axes.add_collection(circles, autolim=False)  # it may be wider than the map
+    label = f"radio range {range_m:g} m"
+    axes.plot([], [], "o", ms=9.0, mfc="none", mec=_FAINT, mew=0.8, label=label)
+
+
+def _draw_samples(axes: Axes, run: _Run) -> None:
+    """Samples by the weight that is left."""
+    xy_m = run.walked(run.site.samples_m, run.scenario.samples.diffusion_m, Purpose.SAMPLE_WALK)
+    thin = _thinned(xy_m.shape[0], _POINTS_SHOWN)  # sorted along a curve, so this thins evenly
+    xy_m, share = xy_m[thin], run.share_left[thin]
+    size = float(np.clip(30_000.0 / xy_m.shape[0], 1.0, 16.0))
+    empty = share <= 0.0
+    if empty.any():
+        axes.scatter(*xy_m[empty].T, s=size, c=_EMPTY, lw=0.0, zorder=1.0, label="sample used up")
+    if not empty.all():
+        scale = {"cmap": _WEIGHT, "norm": Normalize(0.0, 1.0)}
+        marks = axes.scatter(*xy_m[~empty].T, s=size, c=share[~empty], lw=0.0, zorder=1.5, **scale)
+        _draw_scale(axes, marks)
+
+
+def _draw_scale(axes: Axes, marks: PathCollection) -> None:
+    figure = axes.figure
+    bar = figure.colorbar(marks, ax=axes, shrink=0.4, aspect=30.0, pad=0.015)
+    bar.set_ticks([0.0, 0.5, 1.0], labels=["0 %", "50 %", "100 %"])
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=_SMALL_PT, labelcolor=_INK, color=_FAINT)
+    bar.ax.set_ylabel("weight left in a sample", size=_TEXT_PT, color=_INK)
+
+
+def _draw_trails(axes: Axes, run: _Run) -> None:
+    """Every robot's way, its start a cross, its end a dot."""
+    robots = len(run.trails)
+    few = robots <= len(_TEAM)
+    colours = _team_colours(robots)
+    for (name, trail), colour in zip(run.trails.items(), colours, strict=True):
+        axes.add_collection(
+            LineCollection(
+                _strokes(trail.xy_m),
+                colors=colour,
+                linewidths=0.9 if few else 0.4,
+                alpha=0.8 if few else 0.6,
+                label=name if few else None,
+                zorder=2.0,
+            )
+        )
+    size = 60.0 if few else 18.0
+    starts_m = run.site.starts_m
+    ends_m = np.array([trail.end_m for trail in run.trails.values()])
+    axes.scatter(*starts_m.T, s=size, c=_INK, marker="x", lw=size / 40.0, zorder=4.0, label="start")
+    axes.scatter(*ends_m.T, s=size, c=colours, ec=_INK, lw=0.8, zorder=5.0)
+    axes.plot([], [], "o", ms=7.0, mfc="white", mec=_INK, mew=0.8, label="end")
+
+
+def _draw_targets(axes: Axes, run: _Run) -> None:
+    """Detected targets where they were found, the others where they are now."""
+    finds = run.metrics.finds
+    found_m = np.array([(x, y) for *_, x, y in finds]).reshape(-1, 2)
+    site, diffusion_m = run.site, run.scenario.targets.diffusion_m
+    missed_m = np.delete(
+        run.walked(site.targets_m, diffusion_m, Purpose.TARGET_WALK),
+        [target for _, _, target, _, _ in finds],
+        axis=0,
+    )
+    _mark(axes, found_m, "detected", "+", 24.0, _FOUND)
+    _mark(axes, missed_m, "not detected", ".", 20.0, _MISSED)
+
+
+def _draw_curves(place: SubFigure, run: _Run) -> None:
+    """What the run measured, over simulated time."""
+    axes = place.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.2, 1.0))
+    rows = run.rows[_thinned(len(run.rows) - 1, _ROWS_SHOWN)] + run.rows[-1:]
+    _draw_bounds(axes[0], run, rows)
+    _draw_progress(axes[1], run, rows)
+    _draw_mass(axes[2], run, rows)
+    for each in axes:
+        each.set_xlim(0.0, run.end_s)
+    _draw_moments(place, axes, run)
+    place.align_ylabels(list(axes))

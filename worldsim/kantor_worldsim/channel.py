@@ -197,6 +197,10 @@ class Channel:
         ready.sort(key=lambda item: item[:3])
         return tuple(item[3] for item in ready)
 
+    def waits(self, name: ParticipantId, now_ns: int) -> bool:
+        """Whether something has arrived at a participant that was not taken."""
+        return any(item[0] <= now_ns for item in self._under_way[name])
+
     def next_due_ns(self) -> int | None:
         """When the next delivery is due at anybody."""
         return min((item[0] for box in self._under_way.values() for item in box), default=None)

@@ -109,7 +109,7 @@ class Checker:
         for source, sequence in act.heard:
             key = (source, sequence, act.name)
             due = self._in_flight.get(key, [])
-            arrived = [moment for moment in due if moment <= act.now_ns]
+            arrived = [moment for moment in due if moment <= self._now_ns]
             if not arrived:
                 self._complain(
                     "delivery", act.name, f"heard {source}#{sequence}, which was not delivered"

@@ -54,15 +54,7 @@ class Agenda:
 def simulate(stage: Stage, exchange: Exchange, seed: int, stopped: Callable[[], bool]) -> str:
     """Run until every robot rests, the limit is reached or `stopped()`; the reason, also recorded."""
     agenda = Agenda(clocks(stage.scenario, seed))
-    limit_ns = stage.scenario.limit_ns
-    reason = "done"
-    while not stage.over:
-        if stopped():
-            reason = "interrupted"
-            break
-        if agenda.next_ns > limit_ns:
-            reason = "limit"
-            break
+    while not (reason := _reason(stage, agenda.next_ns, stopped)):
         batch = agenda.batch(stage.channel.lookahead_ns)
         inputs = {name: stage.inputs(name, due_ns) for due_ns, name in batch}
         outputs = exchange(inputs)
@@ -75,3 +67,11 @@ def simulate(stage: Stage, exchange: Exchange, seed: int, stopped: Callable[[], 
             stage.settle(moment_ns, steps)
     stage.end(reason)
     return reason
+
+
+def _reason(stage: Stage, next_ns: int, stopped: Callable[[], bool]) -> str | None:
+    if stage.over:
+        return stage.over
+    if stopped():
+        return "interrupted"
+    return "limit" if next_ns > stage.scenario.limit_ns else None

@@ -52,6 +52,20 @@ class Row(NamedTuple):
     drops: int
 
 
+class Glance(NamedTuple):
+    """How the run stands, cheap to get at any time."""
+
+    now_ns: int
+    energy_spent: int
+    detected: int
+    targets: int
+    w_ub: float
+    links: int
+    messages_per_s: float
+    """Deliveries a simulated second over the last ten rows."""
+    robots_done: int
+
+
 class Bounds(msgspec.Struct, frozen=True):
     """The three readings of W_UB, see the module."""
 
@@ -180,6 +194,7 @@ class Metrics:
         self._bytes_weights = self._bytes_total = self._steps = 0
         self._refused: dict[ParticipantId, int] = {}
         self._finished: dict[ParticipantId, int] = {}
+        self._resting: set[ParticipantId] = set()
         self._first_contact: int | None = None
         self._ending = Ending(0, "cut")
         self._tick = 0
@@ -221,6 +236,8 @@ class Metrics:
         self._bytes_total += len(outputs.weights) + sum(len(e.body) for e in outputs.outbox)
         if act.heard and self._first_contact is None:
             self._first_contact = outputs.step
+        if outputs.state is not State.EXPLORING:
+            self._resting.add(act.name)
         if outputs.state is State.FINISHED:
             self._finished.setdefault(act.name, outputs.step)
         time_s = act.now_ns * 1e-9
@@ -279,6 +296,25 @@ class Metrics:
                 deliveries=self._deliveries,
                 drops=self._drops,
             )
+        )
+
+    def glance(self) -> Glance:
+        """How the run stands, by the last row."""
+        if not self.rows:
+            return Glance(0, 0, 0, 0, 0.0, 0, 0.0, 0)
+        last = self.rows[-1]
+        before = self.rows[max(0, len(self.rows) - 11)]
+        elapsed_s = last.time_s - before.time_s
+        rate = (last.deliveries - before.deliveries) / elapsed_s if elapsed_s > 0.0 else 0.0
+        return Glance(
+            now_ns=round(last.time_s * 1e9),
+            energy_spent=self._energy_spent,
+            detected=len(self.finds),
+            targets=self._targets,
+            w_ub=last.w_ub_paper,
+            links=last.links,
+            messages_per_s=rate,
+            robots_done=len(self._resting),
         )
 
     def result(

@@ -37,6 +37,9 @@ class Stage:
         self._world = World(scenario, seed, site)
         self._listeners = tuple(listeners)
         self._resting: set[ParticipantId] = set()
+        self._acted: set[ParticipantId] = set()
+        self.gone: set[ParticipantId] = set()
+        """Participants that have left the bus; whoever runs them keeps this up to date."""
         for name in scenario.roster:
             self.channel.place(name, self._world.pose(name))
         self._tell(opening_of(scenario, seed, site, self._world.first_look()))
@@ -45,14 +48,18 @@ class Stage:
         """What has reached a participant by now. It is handed out once."""
         return Inputs(now_ns, self._world.observe(name), self.channel.take(name, now_ns))
 
-    def resting(self, name: ParticipantId) -> bool:
-        """Whether a robot is finished or exhausted."""
-        return name in self._resting
+    def acted(self, name: ParticipantId) -> bool:
+        """Whether a participant has ever stepped in this mission."""
+        return name in self._acted
 
     @property
-    def over(self) -> bool:
-        """Whether every robot is finished or exhausted."""
-        return len(self._resting) == self.scenario.robots.count
+    def over(self) -> str | None:
+        """Why there is nothing more to do: `done` when every robot that is still there rests,
+        `deserted` when none is there that does not."""
+        robots = set(self.scenario.robot_ids)
+        if not robots <= self._resting | self.gone:
+            return None
+        return "done" if robots - self.gone or robots <= self._resting else "deserted"
 
     def settle(self, now_ns: int, steps: Iterable[Step]) -> tuple[Verdict, ...]:
         """Let steps made at one moment happen: first everybody moves, then everybody is heard."""
@@ -64,7 +71,7 @@ class Stage:
                 absent.append(name)
             acts.append(self._act(name, inputs, sound))
             if sound is not None:
-                sent += [Sent(inputs.now_ns, envelope) for envelope in sound.outbox]
+                sent += [Sent(now_ns, envelope) for envelope in sound.outbox]
         verdicts, out_of_range = self.channel.transmit(sent)
         batch = Batch(now_ns, tuple(acts), tuple(verdicts), out_of_range, tuple(absent))
         self._tell(batch)
@@ -80,6 +87,7 @@ class Stage:
             return Act(name, inputs.now_ns, inputs.observation, heard, None, None)
         ruling = self._world.accept(name, inputs.now_ns, outputs)
         self.channel.place(name, ruling.pose)
+        self._acted.add(name)
         if outputs.state is not State.EXPLORING and name in self.scenario.robot_ids:
             self._resting.add(name)
         return Act(name, inputs.now_ns, inputs.observation, heard, outputs, ruling)

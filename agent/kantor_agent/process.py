@@ -1,0 +1,23 @@
+"""A robot as a process."""
+
+from collections.abc import Callable
+
+from kantor_agent.core import Agent
+from kantor_protocol.credentials import Identity
+from kantor_protocol.messages import Mission
+from kantor_protocol.process import participate
+
+
+def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str], None]) -> str:
+    """Be the robot of this identity until the mission is over; why it ended.
+
+    Raises BusError and NotWantedError.
+    """
+
+    def build(mission: Mission) -> Agent:
+        starts_m = mission.starts.open("<f8", 2)
+        x_m, y_m = starts_m[mission.scenario.robot_ids.index(identity.user)].tolist()
+        samples_m = mission.samples.open("<f8", 2)
+        return Agent(identity.user, mission.scenario, mission.seed, (x_m, y_m), samples_m)
+
+    return participate(connect, identity, build, patience_s, say)
