@@ -7,16 +7,17 @@ metres; times are simulated seconds.
 from array import array
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 import numpy.typing as npt
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.collections import EllipseCollection, LineCollection
+from matplotlib.collections import EllipseCollection, LineCollection, PathCollection
 from matplotlib.colors import ListedColormap, Normalize, to_hex
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
@@ -30,11 +31,11 @@ from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 SIZE_IN = (14.0, 8.0)
 DPI = 110
 
-_INK, _FAINT, _GONE = "#222222", "#8a8a8a", "#dcdcdc"
+_TEXT_PT, _SMALL_PT, _TITLE_PT = 9.5, 8.5, 12.5
+_INK, _FAINT, _EMPTY = "#222222", "#8c8c8c", "#d9d9d9"
 _FOUND, _MISSED = "#00875a", "#111111"
-_BOUND, _TIGHT, _INSTANT = _INK, "#3f90da", "#e76300"
-_TEXT_PT, _SMALL_PT, _TITLE_PT = 9.5, 8.5, 13.0
-
+_FIRST, _SECOND, _THIRD = _INK, "#3f90da", "#e76300"
+"""The lines of a diagram, in this order."""
 _TEAM = (
     "#3f90da",
     "#ffa90e",
@@ -48,17 +49,17 @@ _TEAM = (
     "#94a4a2",
 )
 """Petroff's ten colours, told apart with any colour vision; the greys last, for samples are grey."""
-_LEFT = ListedColormap(matplotlib.colormaps["YlOrBr"](np.linspace(0.25, 0.85, 256)))
-"""Weight left, from hardly any to all."""
+_WEIGHT = ListedColormap(matplotlib.colormaps["YlOrBr"](np.linspace(0.25, 0.85, 256)))
+"""The weight left in a sample, from hardly any to all."""
 
-_GAP = "  ·  "
+_GAP = "   ·   "
 _ENDED = {"done": "energy spent", "limit": "time limit", "cut": "record cut"}
 """Why a run ended that did not finish."""
 
 _POINTS_SHOWN = 200_000
 _ROWS_SHOWN = 4_000
 _STROKE_POINTS = 4_096
-"""Agg gives up on very long lines, so a trail is drawn in strokes."""
+"""The rasterizer gives up on very long lines, so a trail is drawn in strokes."""
 _GRAIN = 1.0 / 4_000
 """A trail keeps a point for each such share of the domain's diagonal: below a pixel."""
 
@@ -71,12 +72,12 @@ def draw(records: Iterable[Record], path: Path) -> None:
     The records may stop anywhere after the opening. Raises ValueError without an opening.
     """
     run = _Run.of(records)
-    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained", facecolor="white")
-    title, body = figure.subfigures(2, 1, height_ratios=(0.09, 0.91))
-    left, right = body.subfigures(1, 2, width_ratios=(1.6, 1.0))
-    _write_title(title, run)
-    _draw_map(left, run)
-    _draw_curves(right, run)
+    layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.06)
+    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout=layout, facecolor="white")
+    grid = figure.add_gridspec(2, 2, height_ratios=(0.08, 0.92), width_ratios=(1.65, 1.0))
+    _write_title(figure.add_subfigure(grid[0, :]), run)
+    _draw_map(figure.add_subfigure(grid[1, 0]), run)
+    _draw_curves(figure.add_subfigure(grid[1, 1]), run)
     figure.savefig(path, format="png", dpi=DPI)
 
 
@@ -111,12 +112,8 @@ class _Run:
         """When a robot first took in a message."""
         domain = self.scenario.domain
         grain_m = _GRAIN * float(np.hypot(*np.subtract(domain.max_m, domain.min_m)))
-        self.trails = {
-            name: _Trail(x, y, grain_m)
-            for name, (x, y) in zip(
-                self.scenario.robot_ids, self.site.starts_m.tolist(), strict=True
-            )
-        }
+        starts_m = zip(self.scenario.robot_ids, self.site.starts_m.tolist(), strict=True)
+        self.trails = {name: _Trail(x_m, y_m, grain_m) for name, (x_m, y_m) in starts_m}
         self._units = opening.units
         self._left = np.full(self.site.samples_m.shape[0], self._units.sample, dtype=np.int64)
         self._finished_ns: dict[ParticipantId, int] = {}
@@ -136,16 +133,6 @@ class _Run:
         return run
 
     @property
-    def rows(self) -> list[Row]:
-        """The measurements; at least the one of time 0."""
-        return self.metrics.rows
-
-    @property
-    def end_s(self) -> float:
-        """Where the time axis ends, after 0."""
-        return max(self.end_ns, self.scenario.period_ns) * 1e-9
-
-    @property
     def finish_s(self) -> float | None:
         """When the last robot saw no weight left, if all came to see that."""
         if len(self._finished_ns) < self.scenario.robots.count:
@@ -154,8 +141,8 @@ class _Run:
 
     @property
     def share_left(self) -> Points:
-        """(N,) of the weight that a sample had, what the common view says is left of it."""
-        return np.maximum(self._left, 0) / self._units.sample
+        """(N,) of the weight that a sample had, what is left of it in the common view."""
+        return np.asarray(np.maximum(self._left, 0) / self._units.sample)
 
     def walked(self, points_m: Points, diffusion_m: float, purpose: Purpose) -> Points:
         """Where points of time 0 are at the end."""
@@ -165,45 +152,45 @@ class _Run:
 
     def _follow(self, record: Record) -> None:
         self.metrics.take(record)
-        if isinstance(record, Batch):
+        if isinstance(record, Batch | Ending):
             self.end_ns = max(self.end_ns, record.now_ns)
+        if isinstance(record, Batch):
             for act in record.acts:
                 self._follow_act(act)
-        elif isinstance(record, Ending):
-            self.end_ns = max(self.end_ns, record.now_ns)
 
     def _follow_act(self, act: Act) -> None:
-        if act.outputs is None or act.ruling is None:
+        outputs, ruling = act.outputs, act.ruling
+        if outputs is None or ruling is None:
             return
-        self._follow_weights(act)
+        if self.scenario.merge == "min":
+            self._lower(outputs.lowered)
+        elif not {"step", "energy", "units"} & set(ruling.violations):
+            self._spend(outputs.spent)
         if act.name == SUPERVISOR:
             return
-        self.trails[act.name].extend(act.ruling.pose.x_m, act.ruling.pose.y_m)
+        self.trails[act.name].extend(ruling.pose.x_m, ruling.pose.y_m)
         if act.heard and self.contact_s is None:
             self.contact_s = act.now_ns * 1e-9
-        if act.outputs.state is State.FINISHED:
+        if outputs.state is State.FINISHED:
             self._finished_ns.setdefault(act.name, act.now_ns)
 
-    def _follow_weights(self, act: Act) -> None:
-        """The common view: with a ledger the true remainder, else the least that anybody published."""
-        assert act.outputs is not None and act.ruling is not None
-        ledger = self.scenario.merge == "ledger"
-        if ledger and {"step", "energy", "units"} & set(act.ruling.violations):
-            return
-        packed = act.outputs.spent if ledger else act.outputs.lowered
+    def _lower(self, packed: bytes) -> None:
+        """With the minimum merge, the common view is the least that anybody has published."""
         pairs = self._pairs.decode(packed, self._left.shape[0])
-        if pairs is None:
-            return
-        if ledger:
-            np.subtract.at(self._left, *pairs)
-        else:
+        if pairs is not None:
             np.minimum.at(self._left, *pairs)
+
+    def _spend(self, packed: bytes) -> None:
+        """With a ledger, the common view is what all have truly spent."""
+        pairs = self._pairs.decode(packed, self._left.shape[0])
+        if pairs is not None:
+            np.subtract.at(self._left, *pairs)
 
 
 def _write_title(place: SubFigure, run: _Run) -> None:
     """What was run, and what came of it, whatever exchange ran it."""
-    place.text(0.012, 0.62, _what(run), size=_TITLE_PT, weight="bold", color=_INK, va="center")
-    place.text(0.012, 0.14, _outcome(run), size=_TITLE_PT - 2.0, color=_INK, va="center")
+    place.text(0.012, 0.66, _what(run), size=_TITLE_PT, weight="bold", color=_INK, va="center")
+    place.text(0.012, 0.16, _outcome(run), size=_TITLE_PT - 1.5, color=_INK, va="center")
 
 
 def _what(run: _Run) -> str:
@@ -223,16 +210,14 @@ def _outcome(run: _Run) -> str:
     result = run.metrics.result(exchange="", digest="", wall_s=0.0, record="", complaints=())
     parts = []
     if result.detection_rate is not None:
-        parts.append(
-            f"{result.detected:,} of {result.targets:,} targets detected "
-            f"({result.detection_rate:.1%})"
-        )
+        targets = f"{result.detected:,} of {result.targets:,} targets detected"
+        parts.append(f"{targets} ({100.0 * result.detection_rate:.1f} %)")
     if result.finished_tick is not None:
         parts.append(f"finished at tick {result.finished_tick:,}")
     else:
         parts.append(f"{_ENDED.get(result.ended, result.ended)} at tick {result.ticks:,}")
-    parts.append(f"mass left {result.mass_left:.1%}")
-    parts.append(f"$W_{{UB}}$ {result.w_ub.paper:.4g}")
+    parts.append(f"mass left {100.0 * result.mass_left:.1f} %")
+    parts.append(f"$W_\\mathrm{{UB}}$ {result.w_ub.paper:.4g} m")
     return _GAP.join(parts)
 
 
@@ -240,126 +225,269 @@ def _draw_map(place: SubFigure, run: _Run) -> None:
     """The map as the run left it. Every mark names itself for the legend."""
     axes = place.subplots()
     _draw_domain(axes, run)
-    _draw_radio(axes, run)
-    _draw_samples(axes, run)
     _draw_trails(axes, run)
+    _draw_samples(axes, run)
     _draw_targets(axes, run)
-    if run.scenario.centralized:
-        _mark(axes, np.array([run.scenario.supervisor_m]), "supervisor", "*", 190.0, "white")
+    _draw_supervisor(axes, run)
+    _draw_radio(axes, run)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.02)
     axes.ticklabel_format(useOffset=False, style="plain")
     _tidy(axes, "x, m", "y, m")
-    handles, _ = axes.get_legend_handles_labels()
-    _legend(place, handles, "outside lower center", columns=7)
+    handles, names = axes.get_legend_handles_labels()
+    ways = [handle for handle in handles if isinstance(handle, LineCollection)]
+    if ways:
+        _add_caption(axes, ways, columns=5)
+    _add_legend(place, [handle for handle in handles if handle not in ways], columns=7)
 
 
 def _draw_domain(axes: Axes, run: _Run) -> None:
     low, high = run.scenario.domain.min_m, run.scenario.domain.max_m
-    width_m, height_m = high[0] - low[0], high[1] - low[1]
-    dashes = {"edgecolor": _FAINT, "linewidth": 0.8, "linestyle": (0, (4, 3))}
-    axes.add_patch(Rectangle(low, width_m, height_m, fill=False, zorder=0.5, **dashes))
+    outline = Rectangle(low, high[0] - low[0], high[1] - low[1], fill=False, ec=_FAINT, zorder=0.5)
+    outline.set(linewidth=0.8, linestyle=(0, (4, 3)))
+    axes.add_patch(outline)
+
+
+def _draw_trails(axes: Axes, run: _Run) -> None:
+    """Every robot's way, its start a cross, its end a dot."""
+    few = len(run.trails) <= len(_TEAM)
+    colours = _team_colours(len(run.trails))
+    for (name, trail), colour in zip(run.trails.items(), colours, strict=True):
+        way = LineCollection(_strokes(trail.xy_m), colors=colour, zorder=2.0)
+        way.set(linewidth=0.9 if few else 0.4, alpha=0.8 if few else 0.6)
+        way.set_label(name if few else "_")
+        axes.add_collection(way)
+    ends_m = np.array([trail.end_m for trail in run.trails.values()])
+    size, edge = (60.0, 1.0) if few else (16.0, 0.5)
+    _add_marks(
+        axes,
+        run.site.starts_m,
+        s=size,
+        c=_INK,
+        marker="x",
+        lw=1.5 * edge,
+        zorder=4.0,
+        label="start",
+    )
+    _add_marks(axes, ends_m, s=size, c=colours, edgecolors=_INK, lw=edge, zorder=5.0)
+    axes.plot([], [], "o", ms=7.0, mfc="white", mec=_INK, mew=1.0, label="end")
+
+
+def _draw_samples(axes: Axes, run: _Run) -> None:
+    """Samples by the weight that is left in them."""
+    xy_m = run.walked(run.site.samples_m, run.scenario.samples.diffusion_m, Purpose.SAMPLE_WALK)
+    thin = _thinned(xy_m.shape[0], _POINTS_SHOWN)  # they lie along a curve, so this is even
+    xy_m, share = xy_m[thin], run.share_left[thin]
+    size = float(np.clip(30_000.0 / xy_m.shape[0], 1.0, 16.0))
+    empty = share <= 0.0
+    if empty.any():
+        _add_marks(axes, xy_m[empty], s=size, c=_EMPTY, zorder=1.0, label="sample used up")
+    if not empty.all():
+        scale = Normalize(0.0, 1.0)
+        marks = _add_marks(
+            axes, xy_m[~empty], s=size, c=share[~empty], cmap=_WEIGHT, norm=scale, zorder=1.5
+        )
+        _add_scale(axes, marks)
+
+
+def _add_scale(axes: Axes, marks: PathCollection) -> None:
+    """What the samples' colours mean, in the map's upper right corner, outside."""
+    place = axes.inset_axes((0.86, 1.009, 0.14, 0.014))
+    bar = axes.figure.colorbar(marks, cax=place, orientation="horizontal", ticks=[0.0, 1.0])
+    bar.ax.set_xticks([])
+    bar.outline.set_visible(False)
+    words: dict[str, Any] = {
+        "transform": place.transAxes,
+        "va": "center",
+        "size": _TEXT_PT,
+        "color": _INK,
+    }
+    place.text(-0.04, 0.5, "weight left  0 %", ha="right", **words)
+    place.text(1.04, 0.5, "100 %", ha="left", **words)
+
+
+def _draw_targets(axes: Axes, run: _Run) -> None:
+    """Detected targets where they were found, the others where they are at the end."""
+    finds = run.metrics.finds
+    found_m = np.array([(x_m, y_m) for *_, x_m, y_m in finds]).reshape(-1, 2)
+    ends_m = run.walked(run.site.targets_m, run.scenario.targets.diffusion_m, Purpose.TARGET_WALK)
+    missed_m = np.delete(ends_m, [target for _, _, target, _, _ in finds], axis=0)
+    found_m, missed_m = (xy_m[_thinned(len(xy_m), _POINTS_SHOWN)] for xy_m in (found_m, missed_m))
+    if found_m.size:
+        _add_marks(
+            axes, found_m, s=24.0, c=_FOUND, marker="+", lw=0.9, zorder=3.0, label="target detected"
+        )
+    if missed_m.size:
+        _add_marks(axes, missed_m, s=8.0, c=_MISSED, zorder=3.0, label="not detected")
+
+
+def _draw_supervisor(axes: Axes, run: _Run) -> None:
+    if run.scenario.centralized:
+        x_m, y_m = run.scenario.supervisor_m
+        axes.plot([x_m], [y_m], "*", ms=15.0, mfc="white", mec=_INK, zorder=6.0, label="supervisor")
 
 
 def _draw_radio(axes: Axes, run: _Run) -> None:
-    """How far those who send are heard: the supervisor, or each robot from its end pose."""
+    """How far the supervisor is heard, or else each robot from where it ended."""
     scenario = run.scenario
     centres_m = [trail.end_m for trail in run.trails.values()]
     range_m = scenario.radio.range_m
     if scenario.centralized:
         centres_m, range_m = [scenario.supervisor_m], scenario.supervisor.range_m
-    elif len(centres_m) == 1:
+    if len(scenario.roster) == 1 or not 0.0 < range_m < np.inf:
         return
-    if not 0.0 < range_m < np.inf:
-        return
-    line = {"linewidth": 0.8, "alpha": 0.7 if len(centres_m) <= len(_TEAM) else 0.3}
+    width_m = [2.0 * range_m]
     circles = EllipseCollection(
-        [2.0 * range_m],
-        [2.0 * range_m],
-        [0.0],
-        units="xy",
-        offsets=centres_m,
-        offset_transform=axes.transData,
-        facecolors="none",
-        edgecolors=_FAINT,
-        zorder=0.8,
-        **line,
+        width_m, width_m, [0.0], units="xy", offsets=centres_m, offset_transform=axes.transData
     )
+    circles.set(facecolor="none", edgecolor=_FAINT, linewidth=0.8, zorder=0.8)
+    circles.set_alpha(0.8 if len(centres_m) <= len(_TEAM) else 0.25)
     axes.add_collection(circles, autolim=False)  # it may be wider than the map
-    label = f"radio range {range_m:g} m"
-    axes.plot([], [], "o", ms=9.0, mfc="none", mec=_FAINT, mew=0.8, label=label)
-
-
-def _draw_samples(axes: Axes, run: _Run) -> None:
-    """Samples by the weight that is left."""
-    xy_m = run.walked(run.site.samples_m, run.scenario.samples.diffusion_m, Purpose.SAMPLE_WALK)
-    thin = _thinned(xy_m.shape[0], _POINTS_SHOWN)  # sorted along a curve, so this thins evenly
-    xy_m, share = xy_m[thin], run.share_left[thin]
-    size = float(np.clip(30_000.0 / xy_m.shape[0], 1.0, 16.0))
-    empty = share <= 0.0
-    if empty.any():
-        axes.scatter(*xy_m[empty].T, s=size, c=_EMPTY, lw=0.0, zorder=1.0, label="sample used up")
-    if not empty.all():
-        scale = {"cmap": _WEIGHT, "norm": Normalize(0.0, 1.0)}
-        marks = axes.scatter(*xy_m[~empty].T, s=size, c=share[~empty], lw=0.0, zorder=1.5, **scale)
-        _draw_scale(axes, marks)
-
-
-def _draw_scale(axes: Axes, marks: PathCollection) -> None:
-    figure = axes.figure
-    bar = figure.colorbar(marks, ax=axes, shrink=0.4, aspect=30.0, pad=0.015)
-    bar.set_ticks([0.0, 0.5, 1.0], labels=["0 %", "50 %", "100 %"])
-    bar.outline.set_visible(False)
-    bar.ax.tick_params(labelsize=_SMALL_PT, labelcolor=_INK, color=_FAINT)
-    bar.ax.set_ylabel("weight left in a sample", size=_TEXT_PT, color=_INK)
-
-
-def _draw_trails(axes: Axes, run: _Run) -> None:
-    """Every robot's way, its start a cross, its end a dot."""
-    robots = len(run.trails)
-    few = robots <= len(_TEAM)
-    colours = _team_colours(robots)
-    for (name, trail), colour in zip(run.trails.items(), colours, strict=True):
-        axes.add_collection(
-            LineCollection(
-                _strokes(trail.xy_m),
-                colors=colour,
-                linewidths=0.9 if few else 0.4,
-                alpha=0.8 if few else 0.6,
-                label=name if few else None,
-                zorder=2.0,
-            )
-        )
-    size = 60.0 if few else 18.0
-    starts_m = run.site.starts_m
-    ends_m = np.array([trail.end_m for trail in run.trails.values()])
-    axes.scatter(*starts_m.T, s=size, c=_INK, marker="x", lw=size / 40.0, zorder=4.0, label="start")
-    axes.scatter(*ends_m.T, s=size, c=colours, ec=_INK, lw=0.8, zorder=5.0)
-    axes.plot([], [], "o", ms=7.0, mfc="white", mec=_INK, mew=0.8, label="end")
-
-
-def _draw_targets(axes: Axes, run: _Run) -> None:
-    """Detected targets where they were found, the others where they are now."""
-    finds = run.metrics.finds
-    found_m = np.array([(x, y) for *_, x, y in finds]).reshape(-1, 2)
-    site, diffusion_m = run.site, run.scenario.targets.diffusion_m
-    missed_m = np.delete(
-        run.walked(site.targets_m, diffusion_m, Purpose.TARGET_WALK),
-        [target for _, _, target, _, _ in finds],
-        axis=0,
-    )
-    _mark(axes, found_m, "detected", "+", 24.0, _FOUND)
-    _mark(axes, missed_m, "not detected", ".", 20.0, _MISSED)
+    axes.plot([], [], "o", ms=9.0, mfc="none", mec=_FAINT, label=f"radio range {range_m:g} m")
 
 
 def _draw_curves(place: SubFigure, run: _Run) -> None:
     """What the run measured, over simulated time."""
-    axes = place.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.2, 1.0))
-    rows = run.rows[_thinned(len(run.rows) - 1, _ROWS_SHOWN)] + run.rows[-1:]
-    _draw_bounds(axes[0], run, rows)
-    _draw_progress(axes[1], run, rows)
-    _draw_mass(axes[2], run, rows)
-    for each in axes:
-        each.set_xlim(0.0, run.end_s)
-    _draw_moments(place, axes, run)
-    place.align_ylabels(list(axes))
+    bounds, progress, mass = place.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.2, 1.0))
+    rows = run.metrics.rows
+    rows = rows[:-1][_thinned(len(rows) - 1, _ROWS_SHOWN)] + rows[-1:]
+    _draw_bounds(bounds, run, rows)
+    _draw_progress(progress, run, rows)
+    _draw_mass(mass, rows)
+    _tidy(mass, "simulated time, s", "mass, %")
+    end_s = max(run.end_ns, run.scenario.period_ns) * 1e-9
+    mass.set_xlim(0.0, 1.02 * end_s)  # so that what happens at the very end is seen
+    moments = _mark_moments((bounds, progress, mass), run)
+    if moments:
+        _add_legend(place, moments, columns=2)
+
+
+def _draw_bounds(axes: Axes, run: _Run, rows: Sequence[Row]) -> None:
+    equation = 6 if run.scenario.robots.count == 1 else 11 if run.scenario.centralized else 12
+    lines = (
+        (f"bound (eq. {equation})", [row.w_ub_paper for row in rows], _FIRST, 2.4),
+        ("tight bound", [row.w_ub_tight for row in rows], _SECOND, 1.4),
+        ("instant", [row.w_ub_instant for row in rows], _THIRD, 1.1),
+    )
+    for label, values, colour, width in lines:
+        _add_line(axes, rows, values, label, colour, width)
+    if any(row.w_ub_paper > 0.0 for row in rows):
+        axes.set_yscale("log", nonpositive="mask")
+    _tidy(axes, "", "$W_\\mathrm{UB}$, m")
+    _add_caption(axes, axes.lines)
+
+
+def _draw_progress(axes: Axes, run: _Run, rows: Sequence[Row]) -> None:
+    targets = run.site.targets_m.shape[0]
+    energy = run.scenario.steps_per_robot * run.scenario.robots.count
+    if targets:
+        detected = [100.0 * row.detected / targets for row in rows]
+        _add_line(axes, rows, detected, f"detected, of {targets:,}", _FOUND)
+    spent = [100.0 * row.energy_spent / energy for row in rows]
+    _add_line(axes, rows, spent, f"energy spent, of {energy:,}", _FIRST)
+    axes.set_ylim(0.0, 102.0)
+    _tidy(axes, "", "share, %")
+    _add_caption(axes, axes.lines)
+
+
+def _draw_mass(axes: Axes, rows: Sequence[Row]) -> None:
+    _add_line(axes, rows, [100.0 * row.mass_left for row in rows], "mass left", _FIRST)
+    twice = [100.0 * row.mass_double_counted for row in rows]
+    if any(twice):
+        _add_line(axes, rows, twice, "mass counted twice", _THIRD)
+    axes.set_ylim(0.0, 1.02 * max(100.0, *twice))
+    _add_caption(axes, axes.lines)
+
+
+def _mark_moments(diagrams: Sequence[Axes], run: _Run) -> list[Line2D]:
+    """Vertical lines where something happened; one of each for the legend."""
+    moments = (("first contact", run.contact_s, ":"), ("finished", run.finish_s, "--"))
+    marks = []
+    for name, at_s, style in moments:
+        if at_s is not None:
+            lines = [axes.axvline(at_s, color=_FAINT, ls=style, lw=1.1) for axes in diagrams]
+            lines[0].set_label(f"{name}, {at_s:.1f} s")
+            marks.append(lines[0])
+    return marks
+
+
+def _add_marks(axes: Axes, xy_m: Points, *, lw: float = 0.0, **style: Any) -> PathCollection:
+    return axes.scatter(xy_m[:, 0], xy_m[:, 1], linewidths=lw, **style)
+
+
+def _add_line(
+    axes: Axes,
+    rows: Sequence[Row],
+    values: Sequence[float | None],
+    label: str,
+    colour: str,
+    width: float = 1.4,
+) -> None:
+    """A measurement over time; where it is no number, nothing. One row alone shows as a dot."""
+    times_s = [row.time_s for row in rows]
+    numbers = np.array(values, dtype=np.float64)
+    if not np.isnan(numbers).all():
+        marker = "o" if len(rows) == 1 else ""
+        axes.plot(times_s, numbers, color=colour, lw=width, marker=marker, ms=4.0, label=label)
+
+
+def _add_caption(axes: Axes, handles: Sequence[Artist], columns: int = 3) -> None:
+    """The legend of a diagram, above it, where no line can run into it."""
+    axes.legend(
+        handles=handles,
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        borderaxespad=0.2,
+        borderpad=0.0,
+        ncols=columns,
+        frameon=False,
+        fontsize=_TEXT_PT,
+        handlelength=1.4,
+        columnspacing=1.4,
+        labelcolor=_INK,
+    )
+
+
+def _add_legend(place: SubFigure, handles: Sequence[Artist], columns: int) -> None:
+    place.legend(
+        handles=handles,
+        loc="outside lower center",
+        ncols=min(columns, len(handles)),
+        frameon=False,
+        fontsize=_TEXT_PT,
+        handlelength=1.6,
+        columnspacing=1.6,
+        labelcolor=_INK,
+    )
+
+
+def _tidy(axes: Axes, x_label: str, y_label: str) -> None:
+    """Quiet axes: two spines, small ticks."""
+    axes.set_xlabel(x_label, size=_TEXT_PT, color=_INK)
+    axes.set_ylabel(y_label, size=_TEXT_PT, color=_INK)
+    axes.tick_params(labelsize=_SMALL_PT, labelcolor=_INK, color=_FAINT, which="both")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(_FAINT)
+
+
+def _team_colours(robots: int) -> list[str]:
+    """One colour each. Beyond ten they only tell neighbours apart, along a cyclic map."""
+    if robots <= len(_TEAM):
+        return list(_TEAM[:robots])
+    golden = 0.6180339887498949  # its multiples fall evenly, and far from the one before
+    around = 2.0 * np.pi * golden * np.arange(robots)
+    # Twilight is pale at 0 and dark at 1/2; keep to its blue and its red side.
+    cycle = matplotlib.colormaps["twilight"]
+    places = np.where(np.cos(around) > 0.0, 0.25, 0.75) + 0.1 * np.sin(around)
+    return [to_hex(colour) for colour in cycle(places)]
+
+
+def _strokes(way_m: Points) -> list[Points]:
+    """A way in pieces that join."""
+    starts = range(0, max(1, way_m.shape[0] - 1), _STROKE_POINTS)
+    return [way_m[i : i + _STROKE_POINTS + 1] for i in starts]
+
+
+def _thinned(count: int, most: int) -> slice:
+    """Every so many of `count`, to be at most `most`."""
+    return slice(None, None, max(1, -(-count // most)))

@@ -49,9 +49,22 @@ class Plan(NamedTuple):
     """How long to wait for the whole roster before starting without the rest; None: for ever."""
 
 
-def run(host: Host, plan: Plan, recording: Recording, stopped: Callable[[], bool]) -> Result:
-    """Run a mission to its end, or until `stopped()`. The record is closed in every case."""
-    doorway = _Doorway(host, plan, recording.metrics, stopped)
+def _unseen(_progress: Progress) -> None:
+    """Progress that nobody here looks at."""
+
+
+def run(
+    host: Host,
+    plan: Plan,
+    recording: Recording,
+    stopped: Callable[[], bool],
+    show: Callable[[Progress], None] = _unseen,
+) -> Result:
+    """Run a mission to its end, or until `stopped()`. The record is closed in every case.
+
+    show: takes what observers on the bus are told as well.
+    """
+    doorway = _Doorway(host, plan, recording.metrics, stopped, show)
     doorway.gather()
     stage = Stage(plan.scenario, plan.seed, plan.site, [recording.take, doorway.tell])
     doorway.stage = stage
@@ -70,7 +83,12 @@ class _Doorway:
     """Who is on the bus: lets each participant in once, and hands its messages on."""
 
     def __init__(
-        self, host: Host, plan: Plan, metrics: Metrics, stopped: Callable[[], bool]
+        self,
+        host: Host,
+        plan: Plan,
+        metrics: Metrics,
+        stopped: Callable[[], bool],
+        show: Callable[[Progress], None],
     ) -> None:
         self.host = host
         self.stage: Stage | None = None
@@ -81,6 +99,7 @@ class _Doorway:
         """Messages that were malformed, or from a process that does not play that participant."""
         self._plan = plan
         self._metrics = metrics
+        self._show = show
         self._nonces: dict[ParticipantId, str] = {}
         self._started = False
         self._told = 0.0
@@ -189,9 +208,9 @@ class _Doorway:
         now = time.monotonic()
         if now - self._told >= _PROGRESS_S:
             self._told = now
-            self.host.publish_progress(
-                encode(progress(self._metrics, self._plan.scenario, phase, detail))
-            )
+            message = progress(self._metrics, self._plan.scenario, phase, detail)
+            self.host.publish_progress(encode(message))
+            self._show(message)
 
 
 class _Lockstep:

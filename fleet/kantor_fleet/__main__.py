@@ -1,0 +1,234 @@
+"""The `kantor` command."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from kantor_fleet.exits import Exit, fail
+
+
+def run(
+    scenario: Annotated[str, tyro.conf.Positional] = "fleet",
+    /,
+    seed: int = 0,
+    exchange: Literal["in-process", "lockstep", "wall"] = "lockstep",
+    speed: float = 1.0,
+    out: Path = Path("runs"),
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002  the flag is --set
+) -> int:
+    """Run a mission, with live progress, and leave its record and its picture.
+
+    Args:
+        scenario: A packaged name (see `kantor scenarios`) or a TOML file.
+        seed: Decides every draw.
+        exchange: in-process: one process, as fast as possible. lockstep: a process each, the same
+            result. wall: a process each, every robot on its own clock.
+        speed: wall only: simulated seconds in a real one.
+        out: Where the run folder is made.
+        set: Override a key of the scenario, such as radio.range_m=150; any number of times.
+    """
+    from kantor_fleet.catalog import find  # noqa: PLC0415  each verb imports what it needs
+    from kantor_fleet.run import run as run_mission  # noqa: PLC0415
+
+    _check_seed(seed)
+    if not 0.0 < speed <= 1000.0:
+        fail(Exit.USAGE, f"--speed {speed:g}: give a factor above 0, at most 1000")
+    return run_mission(find(scenario, set), seed, exchange, speed, out)
+
+
+def worldsim(
+    scenario: Annotated[str, tyro.conf.Positional] = "fleet",
+    /,
+    listen: str = "tcp/127.0.0.1:7447",
+    credentials: Path = Path("credentials"),
+    fleet: str = "kantor",
+    seed: int = 0,
+    exchange: Literal["lockstep", "wall"] = "wall",
+    speed: float = 1.0,
+    start_after: float | None = None,
+    out: Path = Path("runs"),
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
+) -> int:
+    """World-sim by hand: host the bus, wait for the roster, run the mission, record it.
+
+    Args:
+        scenario: A packaged name or a TOML file.
+        listen: Endpoint of the bus, tcp/HOST:PORT.
+        credentials: Folder of the identities; world-sim writes what is missing.
+        fleet: Name of the fleet in every key.
+        seed: Decides every draw.
+        exchange: lockstep: step by step together. wall: every robot on its own clock.
+        speed: wall only: simulated seconds in a real one.
+        start_after: Seconds after which to start without whoever is missing; by default never.
+        out: Where the run folder is made.
+        set: Override a key of the scenario.
+    """
+    from kantor_fleet.catalog import find  # noqa: PLC0415
+    from kantor_fleet.by_hand import host_by_hand  # noqa: PLC0415
+
+    _check_seed(seed)
+    if not 0.0 < speed <= 1000.0:
+        fail(Exit.USAGE, f"--speed {speed:g}: give a factor above 0, at most 1000")
+    return host_by_hand(
+        find(scenario, set), seed, exchange, speed, listen, credentials, fleet, start_after, out
+    )
+
+
+def agent(
+    id: Annotated[str, tyro.conf.Positional],  # noqa: A002  the word users know
+    /,
+    connect: str = "tcp/127.0.0.1:7447",
+    credentials: Path = Path("credentials"),
+    patience: float = 60.0,
+) -> int:
+    """A robot by hand. It needs only an endpoint, its id and its credentials.
+
+    Args:
+        id: Which robot, such as r1.
+        connect: World-sim's endpoint, tcp/HOST:PORT.
+        credentials: The credentials folder, or this robot's file.
+        patience: Seconds to wait for world-sim to come up.
+    """
+    from kantor_agent.process import run as run_agent  # noqa: PLC0415
+    from kantor_fleet.by_hand import participate_by_hand  # noqa: PLC0415
+
+    if id == "supervisor":
+        fail(Exit.USAGE, "supervisor: not a robot; use `kantor supervisor`")
+    return participate_by_hand(run_agent, id, connect, credentials, patience)
+
+
+def supervisor(
+    connect: str = "tcp/127.0.0.1:7447",
+    credentials: Path = Path("credentials"),
+    patience: float = 60.0,
+) -> int:
+    """The supervisor by hand, for centralized scenarios.
+
+    Args:
+        connect: World-sim's endpoint, tcp/HOST:PORT.
+        credentials: The credentials folder, or the supervisor's file.
+        patience: Seconds to wait for world-sim to come up.
+    """
+    from kantor_fleet.by_hand import participate_by_hand  # noqa: PLC0415
+    from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
+
+    return participate_by_hand(run_supervisor, "supervisor", connect, credentials, patience)
+
+
+def scenarios(
+    action: Annotated[Literal["list", "show"], tyro.conf.Positional] = "list",
+    name: Annotated[str, tyro.conf.Positional] = "fleet",
+    /,
+) -> int:
+    """List the packaged scenarios, or show one as TOML.
+
+    Args:
+        action: list, or show.
+        name: Which one to show.
+    """
+    from kantor_fleet.catalog import find, names, path_of  # noqa: PLC0415
+
+    if action == "show":
+        print(path_of(name).read_text(encoding="utf-8"), end="")
+        return Exit.DONE
+    width = max(map(len, names()))
+    for known in names():
+        print(f"{known:<{width}}  {find(known).summary}")
+    return Exit.DONE
+
+
+def verify(run: Annotated[Path, tyro.conf.Positional], /) -> int:
+    """Execute a recorded run again and compare; exit code 1 if anything differs.
+
+    A deterministic run is executed anew from its scenario and seed. A wall run is replayed robot by
+    robot from the inboxes that it recorded.
+
+    Args:
+        run: A run folder.
+    """
+    from kantor_fleet.verify import verify as verify_run  # noqa: PLC0415
+
+    return verify_run(run)
+
+
+def tap(
+    connect: str = "tcp/127.0.0.1:7447",
+    credentials: Path = Path("credentials"),
+    only: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    count: int = 0,
+    patience: float = 60.0,
+) -> int:
+    """Print what goes over the bus, decoded; it reads and never writes.
+
+    Args:
+        connect: World-sim's endpoint, tcp/HOST:PORT.
+        credentials: The credentials folder, or the observer's file.
+        only: Kinds to print: pose, weights, tx, rx, world; by default all.
+        count: Stop after so many messages; 0: never.
+        patience: Seconds to wait for world-sim to come up.
+    """
+    from kantor_fleet.tap import tap as tap_bus  # noqa: PLC0415
+
+    return tap_bus(connect, credentials, frozenset(only), count, patience)
+
+
+VERBS = {
+    "run": run,
+    "worldsim": worldsim,
+    "agent": agent,
+    "supervisor": supervisor,
+    "scenarios": scenarios,
+    "verify": verify,
+    "tap": tap,
+}
+
+
+def main() -> None:
+    """Entry point: one verb, one exit code, no traceback for what a user can mend."""
+    from kantor_protocol.bus import BusError  # noqa: PLC0415
+    from kantor_protocol.credentials import CredentialsError  # noqa: PLC0415
+    from kantor_protocol.scenario import ScenarioError  # noqa: PLC0415
+
+    try:
+        code = tyro.extras.subcommand_cli_from_dict(
+            VERBS,
+            prog="kantor",
+            description="Fleets of robot processes on the Zenoh bus that explore together.",
+            args=_spread_set(sys.argv[1:]),
+        )
+    except (ScenarioError, CredentialsError) as error:
+        fail(Exit.USAGE, str(error))
+    except BusError as error:
+        fail(Exit.UNREACHABLE, str(error))
+    except BrokenPipeError:
+        sys.stderr.close()
+        code = Exit.DONE
+    except OSError as error:
+        fail(Exit.USAGE, f"{error.filename or 'file'}: {error.strerror or error}")
+    except KeyboardInterrupt:
+        code = Exit.INTERRUPTED
+    sys.exit(code)
+
+
+def _check_seed(seed: int) -> None:
+    if not 0 <= seed < 2**63:
+        fail(Exit.USAGE, f"--seed {seed}: give a whole number from 0 to 2^63 - 1")
+
+
+def _spread_set(arguments: list[str]) -> list[str]:
+    """`--set a=1 b=2` as `--set a=1 --set b=2`."""
+    spread: list[str] = []
+    in_set = False
+    for argument in arguments:
+        if in_set and "=" in argument and not argument.startswith("-") and spread[-1] != "--set":
+            spread.append("--set")
+        elif argument.startswith("-") or spread[-1:] != ["--set"]:
+            in_set = argument == "--set"
+        spread.append(argument)
+    return spread
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,77 @@
+"""Processes started one by one, each in its own terminal or on its own machine."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from kantor_fleet.exits import Exit, fail
+from kantor_fleet.interrupts import Interrupts
+from kantor_protocol import bus, credentials
+from kantor_protocol.credentials import FLEET_PATTERN, Identity
+from kantor_protocol.machine import ParticipantId
+from kantor_protocol.process import NotWantedError
+from kantor_protocol.scenario import Scenario
+
+RunParticipant = Callable[[str, Identity, float, Callable[[str], None]], str]
+
+
+def host_by_hand(
+    scenario: Scenario,
+    seed: int,
+    exchange: str,
+    speed: float,
+    listen: str,
+    secrets: Path,
+    fleet: str,
+    start_after_s: float | None,
+    out: Path,
+) -> Exit:
+    """World-sim in this terminal. Raises ScenarioError, BusError, OSError."""
+    from kantor_fleet.preload import warm_up  # noqa: PLC0415  robots by hand do not need these
+    from kantor_fleet.progress import ProgressView  # noqa: PLC0415
+    from kantor_fleet.run import conclude, read_result, verdict  # noqa: PLC0415
+    from kantor_worldsim.process import Plan, run  # noqa: PLC0415
+    from kantor_worldsim.recording import Recording, folder_for  # noqa: PLC0415
+    from kantor_worldsim.world import Site  # noqa: PLC0415
+
+    if not FLEET_PATTERN.fullmatch(fleet):
+        fail(Exit.USAGE, f"--fleet {fleet}: use lower-case letters, digits and dashes")
+    bus.check_endpoint(listen)
+    plan = Plan(scenario, seed, Site.of(scenario, seed), exchange, speed, start_after_s)
+    identities = credentials.issue(secrets, fleet, scenario.roster)
+    bus.init_log()
+    with Interrupts() as interrupts, ProgressView(scenario.name) as view:
+        warm_up()
+        users = credentials.users_file(secrets)
+        with bus.Host(identities[credentials.HOST], listen, users, scenario.roster) as host:
+            folder = folder_for(scenario, seed, out)
+            view.note(f"world-sim of fleet {fleet} at {listen}, credentials in {secrets}/")
+            for name in scenario.roster:
+                verb = name if name == "supervisor" else f"agent {name}"
+                view.note(f"  kantor {verb} --connect {listen} --credentials {secrets}")
+            recording = Recording(scenario, seed, exchange, folder)
+            run(host, plan, recording, interrupts, view.show)
+    conclude(folder)
+    result = read_result(folder)
+    return interrupts.code or (verdict(result) if result is not None else Exit.PROCESS_FAILED)
+
+
+def participate_by_hand(
+    run: RunParticipant, name: ParticipantId, connect: str, place: Path, patience_s: float
+) -> Exit:
+    """A participant in this terminal. Raises BusError, CredentialsError."""
+    bus.check_endpoint(connect)
+    # A robot may start before world-sim, which writes the credentials: look for them when it is up.
+    if not place.exists() or place.is_dir():
+        bus.await_endpoint(connect, patience_s)
+    identity = credentials.find(place, name)
+    bus.init_log()
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+
+    try:
+        reason = run(connect, identity, patience_s, say)
+    except NotWantedError as error:
+        fail(Exit.USAGE, str(error))
+    say(f"{name}: mission over: {reason}")
+    return Exit.DONE

@@ -1,0 +1,41 @@
+"""What every process of a local fleet shares: imported and compiled once, in the fork server.
+
+It opens nothing. Zenoh must not be open in a process that forks.
+"""
+
+import kantor_agent.process
+import kantor_protocol.bus
+import kantor_supervisor.process
+import kantor_worldsim.process  # noqa: F401
+from kantor_fleet.team import team
+from kantor_protocol.scenario import parse
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.recording import Recording
+from kantor_worldsim.stage import Stage
+from kantor_worldsim.world import Site
+
+_TINY = """
+name = "warm-up"
+coordination = "centralized"
+domain = { min_m = [0, 0], max_m = [10, 10] }
+robots = { count = 2 }
+energy = { points = 8 }
+samples = { count = 8 }
+targets = { count = 2 }
+starts = { random = true }
+clock = { jitter_s = 0.01 }
+radio = { drop = 0.1, duplicate = 0.1, jitter_s = 0.01, reorder = 0.1 }
+density = [{ mean_m = [5, 5], variance_m2 = [4, 4] }]
+"""
+
+
+def warm_up() -> None:
+    """Compile every kernel, or load it from the cache, by two tiny missions."""
+    for merge in ("merge='ledger'", "merge='min'"):
+        still = "samples.diffusion_m=0" if "ledger" in merge else "samples.diffusion_m=1"
+        scenario = parse(_TINY, "warm-up", [merge, still, "targets.diffusion_m=1"])
+        site = Site.of(scenario, 0)
+        recording = Recording(scenario, 0, "in-process")
+        stage = Stage(scenario, 0, site, [recording.take])
+        simulate(stage, in_process(team(scenario, 0, site)), 0, lambda: False)
+

@@ -1,0 +1,149 @@
+"""`kantor run`: a mission from start to picture."""
+
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+
+from kantor_fleet.exits import Exit
+from kantor_fleet.interrupts import Interrupts
+from kantor_fleet.local import Order, local_fleet, watch_progress
+from kantor_fleet.preload import warm_up
+from kantor_fleet.progress import ProgressView
+from kantor_fleet.team import team
+from kantor_protocol.bus import BusError
+from kantor_protocol.scenario import Scenario
+from kantor_worldsim.journal import read
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.metrics import Result
+from kantor_worldsim.process import progress
+from kantor_worldsim.recording import JOURNAL, REPORT, RESULT, Recording, folder_for
+from kantor_worldsim.records import Record
+from kantor_worldsim.stage import Stage
+from kantor_worldsim.world import Site
+
+_GLANCE_S = 0.2
+
+
+def run(scenario: Scenario, seed: int, exchange: str, speed: float, out: Path) -> Exit:
+    """Run a mission and leave its folder; what to exit with. Raises ScenarioError, BusError, OSError."""
+    site = Site.of(scenario, seed)
+    folder = folder_for(scenario, seed, out)
+    with Interrupts() as interrupts:
+        if exchange == "in-process":
+            code = _run_in_process(scenario, seed, site, folder, interrupts)
+        else:
+            order = Order(scenario, seed, exchange, speed, folder)
+            code = _run_processes(order, interrupts)
+        conclude(folder)
+        return interrupts.code or code
+
+
+def conclude(folder: Path) -> None:
+    """Draw the report and print the summary of a run folder."""
+    from kantor_fleet.report import draw  # noqa: PLC0415  matplotlib is slow to import
+
+    try:
+        draw((record for _, record in read(folder / JOURNAL)), folder / REPORT)
+    except OSError as error:
+        print(f"kantor: no {REPORT}: {error}", file=sys.stderr)
+    result = read_result(folder)
+    if result is not None:
+        print(summary(result))
+    print(f"  {folder}/  ({', '.join(sorted(path.name for path in folder.iterdir()))})")
+
+
+def read_result(folder: Path) -> Result | None:
+    """The result of a run folder, if it has one."""
+    try:
+        return msgspec.json.decode((folder / RESULT).read_bytes(), type=Result)
+    except (OSError, msgspec.MsgspecError):
+        return None
+
+
+def verdict(result: Result) -> Exit:
+    """What a result means as an exit code."""
+    met = result.ended == "done" and result.violations == 0
+    return Exit.DONE if met else Exit.NOT_MET
+
+
+def summary(result: Result) -> str:
+    """A few lines for a person."""
+    found = f"{result.detected}/{result.targets} targets"
+    if result.detection_rate is not None:
+        found += f" ({100.0 * result.detection_rate:.1f} %)"
+    finished = "-" if result.finished_tick is None else f"tick {result.finished_tick}"
+    wire = result.bytes_per_robot_tick
+    tight = "-" if result.w_ub.tight is None else f"{result.w_ub.tight:.4g}"
+    rules = "all rules held" if not result.violations else f"{result.violations} VIOLATIONS"
+    lines = [
+        f"{result.scenario} (seed {result.seed}, {result.exchange}): {result.ended}",
+        f"  detected  {found}",
+        f"  finished  {finished}; {result.ticks} ticks, {result.wall_s:.1f} s",
+        f"  energy    {result.energy_spent}/{result.energy_total} points, "
+        f"{100.0 * result.mass_left:.2f} % of the mass left, "
+        f"{100.0 * result.mass_double_counted:.2f} % counted twice",
+        f"  W_UB      {result.w_ub_start:.4g} -> {result.w_ub.paper:.4g} "
+        f"(tight {tight}, last tick's {result.w_ub.final_instant:.4g})",
+        f"  radio     {result.deliveries} deliveries, {result.drops} dropped, "
+        f"{result.out_of_range_refused} out of range; "
+        f"{wire.weights:.1f} B weights, {wire.total:.1f} B in all a robot and tick",
+        f"  checker   {rules}; record {result.record}",
+        *(f"            {complaint}" for complaint in result.complaints),
+        f"  digest    {result.digest}",
+    ]
+    return "\n".join(lines)
+
+
+def _run_in_process(
+    scenario: Scenario, seed: int, site: Site, folder: Path, interrupts: Interrupts
+) -> Exit:
+    recording = Recording(scenario, seed, "in-process", folder)
+    with ProgressView(scenario.name) as view:
+        warm_up()
+        glanced = time.monotonic()
+
+        def glance(_record: Record) -> None:
+            nonlocal glanced
+            if time.monotonic() - glanced >= _GLANCE_S:
+                glanced = time.monotonic()
+                view.show(progress(recording.metrics, scenario, "running", ""))
+
+        stage = Stage(scenario, seed, site, [recording.take, glance])
+        reason = simulate(stage, in_process(team(scenario, seed, site)), seed, interrupts)
+        view.show(progress(recording.metrics, scenario, "over", reason))
+    return verdict(recording.finish())
+
+
+def _run_processes(order: Order, interrupts: Interrupts) -> Exit:
+    with ProgressView(order.scenario.name) as view:
+        view.note("starting the fleet (the first time, kernels are compiled: about half a minute)")
+        warm_up()
+        if interrupts():
+            return Exit.INTERRUPTED
+        with local_fleet(order) as fleet:
+            asked = False
+            try:
+                for message in watch_progress(fleet):
+                    if message is not None:
+                        view.show(message)
+                    for name, code in fleet.newly_failed():
+                        view.note(f"{name} ended with {_told(code)}; the others go on")
+                    if interrupts() and not asked:
+                        asked = True
+                        view.note("ending the mission")
+                        fleet.stop()
+            except BusError:
+                view.note(f"world-sim is not there; see {order.folder / 'logs' / 'worldsim.log'}")
+            fleet.disband()
+            code = fleet.world_sim.exitcode
+            failed = fleet.any_failed
+    result = read_result(order.folder)
+    if code or result is None:
+        return Exit(code) if code in set(Exit) else Exit.PROCESS_FAILED
+    return Exit.PROCESS_FAILED if failed else verdict(result)
+
+
+def _told(code: int) -> str:
+    return f"signal {-code}" if code < 0 else f"exit code {code}"

@@ -1,0 +1,144 @@
+"""`kantor verify`: execute a recorded run again and compare."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from kantor_fleet.exits import Exit, fail
+from kantor_fleet.team import participant, team
+from kantor_protocol.machine import StateMachine
+from kantor_protocol.messages import RefusedError
+from kantor_worldsim.checkers import check
+from kantor_worldsim.journal import Digest, file_digest, read
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.recording import JOURNAL, MANIFEST
+from kantor_worldsim.records import Batch, Ending, Mailbag, Opening, Record, encode_record
+from kantor_worldsim.stage import Stage
+from kantor_worldsim.world import Site
+
+
+def verify(folder: Path) -> Exit:
+    """Print a verdict on each thing that can be verified; NOT_MET if any differs."""
+    manifest = _manifest(folder)
+    try:
+        records = list(read(folder / JOURNAL))
+    except FileNotFoundError:
+        fail(Exit.USAGE, f"{folder / JOURNAL}: no such file; give a folder that a run left")
+    if not records or not isinstance(records[0][1], Opening):
+        print(f"FAIL  {JOURNAL}: no opening record in it")
+        return Exit.NOT_MET
+    verdicts = [
+        *_verdicts_on_file(folder, manifest, records),
+        _verdict_of_checker(records),
+        _verdict_of_execution(manifest, records),
+    ]
+    for held, line in verdicts:
+        print(f"{'ok  ' if held else 'FAIL'}  {line}")
+    return Exit.DONE if all(held for held, _ in verdicts) else Exit.NOT_MET
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
+    path = folder / MANIFEST
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        fail(Exit.USAGE, f"{path}: no such file; give a folder that a run left")
+    except (OSError, ValueError):
+        fail(Exit.USAGE, f"{path}: not readable as JSON; it cannot be verified")
+    if not isinstance(manifest, dict) or manifest.get("format") != 1:
+        fail(Exit.USAGE, f"{path}: written by another version; verify it with that one")
+    return manifest
+
+
+_Verdict = tuple[bool, str]
+
+
+def _verdicts_on_file(
+    folder: Path, manifest: dict[str, Any], records: list[tuple[bytes, Record]]
+) -> Iterator[_Verdict]:
+    if "digest" not in manifest:
+        yield True, f"{JOURNAL}: the run was killed; {len(records)} records up to then"
+        return
+    same = file_digest(folder / JOURNAL) == manifest.get("journal_blake2b")
+    yield same, f"{JOURNAL}: {'as it was written' if same else 'changed since it was written'}"
+    if manifest.get("record") != "whole":
+        yield True, f"{JOURNAL}: {manifest.get('record')}; {len(records)} records up to then"
+        return
+    digest = Digest()
+    for payload, _ in records:
+        digest.add(payload)
+    same = digest.hex == manifest["digest"] and digest.records == manifest.get("records")
+    yield same, f"digest of {digest.records} records: {digest.hex}"
+
+
+def _verdict_of_checker(records: list[tuple[bytes, Record]]) -> _Verdict:
+    checker = check(record for _, record in records)
+    if not checker.count:
+        return True, "checker: all rules held"
+    return False, f"checker: {checker.count} complaints, first: {checker.complaints[0]}"
+
+
+def _verdict_of_execution(
+    manifest: dict[str, Any], records: list[tuple[bytes, Record]]
+) -> _Verdict:
+    opening = records[0][1]
+    assert isinstance(opening, Opening)
+    absent = any(isinstance(record, Batch) and record.absent for _, record in records)
+    if manifest.get("exchange") == "wall" or absent:
+        return _replayed(opening, records)
+    return _executed(opening, records)
+
+
+def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict:
+    """The whole run anew, in process, record by record."""
+    scenario, seed = opening.scenario, opening.seed
+    from_files = scenario.samples.file or scenario.targets.file
+    site = opening.site if from_files else Site.of(scenario, seed)
+    expected = iter(payload for payload, _ in records)
+    compared, differing = 0, -1
+
+    def compare(record: Record) -> None:
+        nonlocal compared, differing
+        payload = next(expected, None)
+        if payload is None or differing >= 0:
+            return
+        if payload != encode_record(record):
+            differing = compared
+        compared += 1
+
+    whole = isinstance(records[-1][1], Ending)
+    steps = len(records) - (1 if whole else 0)
+    stage = Stage(scenario, seed, site, [compare])
+    simulate(
+        stage, in_process(team(scenario, seed, site)), seed, lambda: compared >= steps or differing >= 0
+    )
+    if differing >= 0:
+        return False, f"executed again: record {differing} differs"
+    if compared < len(records):
+        return False, f"executed again: {compared} records, the journal has {len(records)}"
+    return True, f"executed again: {compared} records, every byte the same"
+
+
+def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict:
+    """Every participant anew, each from the inbox that it had."""
+    scenario, seed, site = opening.scenario, opening.seed, opening.site
+    machines: dict[str, StateMachine] = {}
+    mailbag, steps = Mailbag(), 0
+    for _, record in records:
+        if not isinstance(record, Batch):
+            continue
+        for act in record.acts:
+            if act.outputs is None:
+                continue
+            if act.name not in machines:
+                machines[act.name] = participant(act.name, scenario, seed, site)
+            try:
+                outputs = machines[act.name].step(mailbag.inputs(act))
+            except (KeyError, RefusedError):
+                return False, f"replayed: {act.name} heard at t={act.now_ns} what nobody sent"
+            if outputs != act.outputs:
+                return False, f"replayed: {act.name} differs at its step {act.outputs.step}"
+            steps += 1
+        mailbag.post(record)
+    return True, f"replayed: {steps} steps of {len(machines)} participants, all the same"
