@@ -4,14 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
-
-from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
 from kantor_protocol.messages import News
 from kantor_protocol.packing import Pairs
 from kantor_protocol.replica import Manner, Replica, Store, spend
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, Weights
+from numba import njit
+
+from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
 
 _NO_SKIP = np.zeros(0, dtype=np.int64)
 
@@ -21,7 +21,7 @@ class _Room(NamedTuple):
 
     best: npt.NDArray[np.float64]
     near: npt.NDArray[np.int64]
-    index: npt.NDArray[np.int64]
+    sample: npt.NDArray[np.int64]
     units: npt.NDArray[np.int64]
 
 
@@ -32,7 +32,7 @@ def ship(
     """Ship one robot point from (x, y) by Proposition 1, log it, and drop emptied samples.
 
     Fills the nearest sample that has weight with min(n, m), again and again until m is 0 or nothing
-    is left. Returns how many samples got something; they are in room.index, room.units.
+    is left. Returns how many samples got something; they are in room.sample, room.units.
     """
     count = 0
     left = point
@@ -42,7 +42,7 @@ def ship(
         spend(store, manner, j, units)
         if store.weights[j] <= 0:
             remove(grid, j)
-        room.index[count] = j
+        room.sample[count] = j
         room.units[count] = units
         left -= units
         count += 1
@@ -66,7 +66,7 @@ class Belief:
         self._room = _Room(
             best=np.zeros(1, dtype=np.float64),
             near=np.zeros(1, dtype=np.int64),
-            index=np.zeros(most, dtype=np.int64),
+            sample=np.zeros(most, dtype=np.int64),
             units=np.zeros(most, dtype=np.int64),
         )
         self._pairs = Pairs()
@@ -94,7 +94,7 @@ class Belief:
 
     def spend(self, x_m: float, y_m: float) -> bytes:
         """Ship one robot point from here (Prop. 1); packed pairs (sample, units), nearest first."""
-        self.replica.reserve(self._room.index.shape[0])
+        self.replica.reserve(self._room.sample.shape[0])
         count = ship(
             self.grid,
             self.replica.store,
@@ -104,10 +104,9 @@ class Belief:
             self._units.point,
             self._room,
         )
-        return self._pairs.encode(self._room.index, self._room.units, count)
+        return self._pairs.encode(self._room.sample, self._room.units, count)
 
     def lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""
         index = self.replica.lowered()
         return self._pairs.encode(index, self.weights[index], index.shape[0])
-

@@ -2,10 +2,6 @@
 
 import numpy as np
 import numpy.typing as npt
-
-from kantor_agent.belief import Belief
-from kantor_agent.planners import PLANNERS, Goal
-from kantor_agent.vehicles import VEHICLES
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import (
     EVERYBODY,
@@ -17,12 +13,15 @@ from kantor_protocol.machine import (
     Pose,
     State,
 )
-
 from kantor_protocol.radio import Radio, replica_of
 from kantor_protocol.replica import NOBODY
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, WeightsPublisher
+
+from kantor_agent.belief import Belief
+from kantor_agent.planners import PLANNERS, Goal
+from kantor_agent.vehicles import VEHICLES
 
 
 class Agent:

@@ -211,9 +211,7 @@ def nearest(
         reach = min(reach, grid.frame[_Y] + (high_row + 1) * edge - y)
     reach -= grid.frame[_MARGIN_M]
     if not (near[k - 1] >= 0 and reach > 0.0 and best[k - 1] < reach * reach):
-        _descend(
-            grid, x, y, skip, best, near, low_row, high_row, low_column, high_column
-        )
+        _descend(grid, x, y, skip, best, near, low_row, high_row, low_column, high_column)
     found = 0
     while found < k and near[found] >= 0:
         found += 1
@@ -278,8 +276,10 @@ def _descend(
 
 
 def grid_over(xy_m: npt.NDArray[np.float64], weights: npt.NDArray[np.int64]) -> Grid:
-    """The index over samples (N, 2); it keeps and reads `xy_m` itself, so walking samples may be
-    moved in place and sorted in again by `build`."""
+    """The index over samples (N, 2).
+
+    It keeps and reads `xy_m` itself: samples may be moved in place and sorted in anew by `build`.
+    """
     count = xy_m.shape[0]
     low, high = xy_m.min(axis=0), xy_m.max(axis=0)
     extent = float(max(high[0] - low[0], high[1] - low[1], 1e-9))

@@ -28,6 +28,12 @@ def _clamped(value: float, bound: float) -> float:
     return max(-bound, min(bound, value))
 
 
+def _stopping(distance_m: float, acceleration_m_s2: float, dt_s: float) -> float:
+    """The speed from which braking over steps of dt stops within v^2 / 2a + v dt / 2, solved for v."""
+    half = acceleration_m_s2 * dt_s / 2.0
+    return math.sqrt(half * half + 2.0 * acceleration_m_s2 * distance_m) - half
+
+
 class FirstOrder:
     """x <- x + u_max dt (g - x) / |g - x| (Kabir & Lee, eq. 16), and no further than the goal."""
 
@@ -64,9 +70,7 @@ class SecondOrder:
             return pose
         dx, dy = x_m - pose.x_m, y_m - pose.y_m
         distance = math.hypot(dx, dy)
-        # Braking with a over steps of dt stops within v^2 / 2a + v dt / 2, solved for v.
-        half = self._acceleration_m_s2 * dt_s / 2.0
-        braking = math.sqrt(half * half + 2.0 * self._acceleration_m_s2 * distance) - half
+        braking = _stopping(distance, self._acceleration_m_s2, dt_s)
         wanted = min(self._speed_m_s, braking, distance / dt_s)
         share = wanted / distance if distance > 0.0 else 0.0
         vx = pose.speed_m_s * math.cos(pose.heading_rad)
@@ -101,7 +105,8 @@ class Unicycle:
         error = _wrapped(math.atan2(dy, dx) - pose.heading_rad) if distance > 0.0 else 0.0
         turn = _clamped(error, self._turn_rate_rad_s * dt_s)
         heading = _wrapped(pose.heading_rad + turn)
-        wanted = min(self._speed_m_s, distance / dt_s) * max(0.0, math.cos(error - turn))
+        braking = _stopping(distance, self._acceleration_m_s2, dt_s)
+        wanted = min(self._speed_m_s, braking, distance / dt_s) * max(0.0, math.cos(error - turn))
         bound = self._acceleration_m_s2 * dt_s
         speed = pose.speed_m_s + _clamped(wanted - pose.speed_m_s, bound)
         speed = max(0.0, min(speed, self._speed_m_s))

@@ -1,6 +1,7 @@
 """The `kantor` command."""
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -65,8 +66,8 @@ def worldsim(
         out: Where the run folder is made.
         set: Override a key of the scenario.
     """
-    from kantor_fleet.catalog import find  # noqa: PLC0415
     from kantor_fleet.by_hand import host_by_hand  # noqa: PLC0415
+    from kantor_fleet.catalog import find  # noqa: PLC0415
 
     _check_seed(seed)
     if not 0.0 < speed <= 1000.0:
@@ -92,6 +93,7 @@ def agent(
         patience: Seconds to wait for world-sim to come up.
     """
     from kantor_agent.process import run as run_agent  # noqa: PLC0415
+
     from kantor_fleet.by_hand import participate_by_hand  # noqa: PLC0415
 
     if id == "supervisor":
@@ -111,8 +113,9 @@ def supervisor(
         credentials: The credentials folder, or the supervisor's file.
         patience: Seconds to wait for world-sim to come up.
     """
-    from kantor_fleet.by_hand import participate_by_hand  # noqa: PLC0415
     from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
+
+    from kantor_fleet.by_hand import participate_by_hand  # noqa: PLC0415
 
     return participate_by_hand(run_supervisor, "supervisor", connect, credentials, patience)
 
@@ -174,7 +177,7 @@ def tap(
     return tap_bus(connect, credentials, frozenset(only), count, patience)
 
 
-VERBS = {
+VERBS: dict[str, Callable[..., int]] = {
     "run": run,
     "worldsim": worldsim,
     "agent": agent,
@@ -192,7 +195,7 @@ def main() -> None:
     from kantor_protocol.scenario import ScenarioError  # noqa: PLC0415
 
     try:
-        code = tyro.extras.subcommand_cli_from_dict(
+        code: int = tyro.extras.subcommand_cli_from_dict(
             VERBS,
             prog="kantor",
             description="Fleets of robot processes on the Zenoh bus that explore together.",

@@ -2,6 +2,7 @@
 
 import signal
 from types import FrameType
+from typing import Self
 
 from kantor_fleet.exits import Exit
 
@@ -13,7 +14,7 @@ class Interrupts:
         self.code: Exit | None = None
         """What to exit with, once a signal has come."""
 
-    def __enter__(self) -> "Interrupts":
+    def __enter__(self) -> Self:
         self._before = {
             number: signal.signal(number, self._note) for number in (signal.SIGINT, signal.SIGTERM)
         }

@@ -3,16 +3,14 @@
 It opens nothing. Zenoh must not be open in a process that forks.
 """
 
-import kantor_agent.process
-import kantor_protocol.bus
-import kantor_supervisor.process
 import kantor_worldsim.process  # noqa: F401
-from kantor_fleet.team import team
 from kantor_protocol.scenario import parse
 from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.recording import Recording
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
+
+from kantor_fleet.team import team
 
 _TINY = """
 name = "warm-up"
@@ -38,4 +36,3 @@ def warm_up() -> None:
         recording = Recording(scenario, 0, "in-process")
         stage = Stage(scenario, 0, site, [recording.take])
         simulate(stage, in_process(team(scenario, 0, site)), 0, lambda: False)
-

@@ -9,9 +9,15 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import numpy.typing as npt
+from kantor_protocol.keyed import Purpose
+from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
+from kantor_protocol.packing import Pairs
+from kantor_protocol.walk import Walk
+from kantor_worldsim.metrics import Metrics, Row
+from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
+from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection, PathCollection
@@ -21,17 +27,12 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
-from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
-from kantor_protocol.packing import Pairs
-from kantor_protocol.walk import Walk
-from kantor_worldsim.metrics import Metrics, Row
-from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
-
 SIZE_IN = (14.0, 8.0)
 DPI = 110
 
 _TEXT_PT, _SMALL_PT, _TITLE_PT = 9.5, 8.5, 12.5
+_TITLE_LETTERS = 130
+"""What fits on a line of that size."""
 _INK, _FAINT, _EMPTY = "#222222", "#8c8c8c", "#d9d9d9"
 _FOUND, _MISSED = "#00875a", "#111111"
 _FIRST, _SECOND, _THIRD = _INK, "#3f90da", "#e76300"
@@ -49,7 +50,7 @@ _TEAM = (
     "#94a4a2",
 )
 """Petroff's ten colours, told apart with any colour vision; the greys last, for samples are grey."""
-_WEIGHT = ListedColormap(matplotlib.colormaps["YlOrBr"](np.linspace(0.25, 0.85, 256)))
+_WEIGHT = ListedColormap(colormaps["YlOrBr"](np.linspace(0.2, 0.65, 256)))
 """The weight left in a sample, from hardly any to all."""
 
 _GAP = "   ·   "
@@ -69,9 +70,11 @@ Points = npt.NDArray[np.float64]
 def draw(records: Iterable[Record], path: Path) -> None:
     """Write the picture of a run as PNG, 14 x 8 inches at 110 dpi.
 
-    The records may stop anywhere after the opening. Raises ValueError without an opening.
+    The records may stop anywhere. Without an opening there is nothing to draw, and no file.
     """
-    run = _Run.of(records)
+    run = Run.of(records)
+    if run is None:
+        return
     layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.06)
     figure = Figure(figsize=SIZE_IN, dpi=DPI, layout=layout, facecolor="white")
     grid = figure.add_gridspec(2, 2, height_ratios=(0.08, 0.92), width_ratios=(1.65, 1.0))
@@ -81,7 +84,7 @@ def draw(records: Iterable[Record], path: Path) -> None:
     figure.savefig(path, format="png", dpi=DPI)
 
 
-class _Trail:
+class Trail:
     """The way of one robot, at the resolution of the picture, however many steps it made."""
 
     def __init__(self, x_m: float, y_m: float, grain_m: float) -> None:
@@ -101,7 +104,7 @@ class _Trail:
         return np.array([*self._kept, *self.end_m]).reshape(-1, 2)
 
 
-class _Run:
+class Run:
     """What the picture needs to know of a run."""
 
     def __init__(self, opening: Opening) -> None:
@@ -113,7 +116,7 @@ class _Run:
         domain = self.scenario.domain
         grain_m = _GRAIN * float(np.hypot(*np.subtract(domain.max_m, domain.min_m)))
         starts_m = zip(self.scenario.robot_ids, self.site.starts_m.tolist(), strict=True)
-        self.trails = {name: _Trail(x_m, y_m, grain_m) for name, (x_m, y_m) in starts_m}
+        self.trails = {name: Trail(x_m, y_m, grain_m) for name, (x_m, y_m) in starts_m}
         self._units = opening.units
         self._left = np.full(self.site.samples_m.shape[0], self._units.sample, dtype=np.int64)
         self._finished_ns: dict[ParticipantId, int] = {}
@@ -121,15 +124,15 @@ class _Run:
         self.metrics.take(opening)
 
     @classmethod
-    def of(cls, records: Iterable[Record]) -> "_Run":
-        """Follow records to their end."""
+    def of(cls, records: Iterable[Record]) -> "Run | None":
+        """Follow records to their end; None if they do not even open."""
         following = iter(records)
         opening = next(following, None)
         if not isinstance(opening, Opening):
-            raise ValueError("a record without an opening: there is nothing to draw")
+            return None
         run = cls(opening)
         for record in following:
-            run._follow(record)
+            run.follow(record)
         return run
 
     @property
@@ -150,7 +153,8 @@ class _Run:
         walk.advance(self.end_ns)
         return walk.xy_m
 
-    def _follow(self, record: Record) -> None:
+    def follow(self, record: Record) -> None:
+        """Take in one record after the opening."""
         self.metrics.take(record)
         if isinstance(record, Batch | Ending):
             self.end_ns = max(self.end_ns, record.now_ns)
@@ -187,13 +191,15 @@ class _Run:
             np.subtract.at(self._left, *pairs)
 
 
-def _write_title(place: SubFigure, run: _Run) -> None:
+def _write_title(place: SubFigure, run: Run) -> None:
     """What was run, and what came of it, whatever exchange ran it."""
-    place.text(0.012, 0.66, _what(run), size=_TITLE_PT, weight="bold", color=_INK, va="center")
+    what = _what(run)
+    size = _TITLE_PT * min(1.0, _TITLE_LETTERS / len(what))
+    place.text(0.012, 0.66, what, size=size, weight="bold", color=_INK, va="center")
     place.text(0.012, 0.16, _outcome(run), size=_TITLE_PT - 1.5, color=_INK, va="center")
 
 
-def _what(run: _Run) -> str:
+def _what(run: Run) -> str:
     scenario, robots = run.scenario, run.scenario.robots.count
     parts = (
         scenario.name,
@@ -206,7 +212,7 @@ def _what(run: _Run) -> str:
     return _GAP.join(parts)
 
 
-def _outcome(run: _Run) -> str:
+def _outcome(run: Run) -> str:
     result = run.metrics.result(exchange="", digest="", wall_s=0.0, record="", complaints=())
     parts = []
     if result.detection_rate is not None:
@@ -217,11 +223,13 @@ def _outcome(run: _Run) -> str:
     else:
         parts.append(f"{_ENDED.get(result.ended, result.ended)} at tick {result.ticks:,}")
     parts.append(f"mass left {100.0 * result.mass_left:.1f} %")
-    parts.append(f"$W_\\mathrm{{UB}}$ {result.w_ub.paper:.4g} m")
+    bound_m = result.w_ub.paper
+    digits = f"{bound_m:,.0f}" if bound_m >= 1000.0 else f"{bound_m:.4g}"
+    parts.append(f"$W_\\mathrm{{UB}}$ {digits} m")
     return _GAP.join(parts)
 
 
-def _draw_map(place: SubFigure, run: _Run) -> None:
+def _draw_map(place: SubFigure, run: Run) -> None:
     """The map as the run left it. Every mark names itself for the legend."""
     axes = place.subplots()
     _draw_domain(axes, run)
@@ -234,24 +242,24 @@ def _draw_map(place: SubFigure, run: _Run) -> None:
     axes.margins(0.02)
     axes.ticklabel_format(useOffset=False, style="plain")
     _tidy(axes, "x, m", "y, m")
-    handles, names = axes.get_legend_handles_labels()
+    handles, _ = axes.get_legend_handles_labels()
     ways = [handle for handle in handles if isinstance(handle, LineCollection)]
     if ways:
         _add_caption(axes, ways, columns=5)
     _add_legend(place, [handle for handle in handles if handle not in ways], columns=7)
 
 
-def _draw_domain(axes: Axes, run: _Run) -> None:
+def _draw_domain(axes: Axes, run: Run) -> None:
     low, high = run.scenario.domain.min_m, run.scenario.domain.max_m
     outline = Rectangle(low, high[0] - low[0], high[1] - low[1], fill=False, ec=_FAINT, zorder=0.5)
     outline.set(linewidth=0.8, linestyle=(0, (4, 3)))
     axes.add_patch(outline)
 
 
-def _draw_trails(axes: Axes, run: _Run) -> None:
+def _draw_trails(axes: Axes, run: Run) -> None:
     """Every robot's way, its start a cross, its end a dot."""
     few = len(run.trails) <= len(_TEAM)
-    colours = _team_colours(len(run.trails))
+    colours = team_colours(len(run.trails))
     for (name, trail), colour in zip(run.trails.items(), colours, strict=True):
         way = LineCollection(_strokes(trail.xy_m), colors=colour, zorder=2.0)
         way.set(linewidth=0.9 if few else 0.4, alpha=0.8 if few else 0.6)
@@ -273,12 +281,12 @@ def _draw_trails(axes: Axes, run: _Run) -> None:
     axes.plot([], [], "o", ms=7.0, mfc="white", mec=_INK, mew=1.0, label="end")
 
 
-def _draw_samples(axes: Axes, run: _Run) -> None:
+def _draw_samples(axes: Axes, run: Run) -> None:
     """Samples by the weight that is left in them."""
     xy_m = run.walked(run.site.samples_m, run.scenario.samples.diffusion_m, Purpose.SAMPLE_WALK)
     thin = _thinned(xy_m.shape[0], _POINTS_SHOWN)  # they lie along a curve, so this is even
     xy_m, share = xy_m[thin], run.share_left[thin]
-    size = float(np.clip(30_000.0 / xy_m.shape[0], 1.0, 16.0))
+    size = _mark_size(xy_m.shape[0], 16.0)
     empty = share <= 0.0
     if empty.any():
         _add_marks(axes, xy_m[empty], s=size, c=_EMPTY, zorder=1.0, label="sample used up")
@@ -306,28 +314,29 @@ def _add_scale(axes: Axes, marks: PathCollection) -> None:
     place.text(1.04, 0.5, "100 %", ha="left", **words)
 
 
-def _draw_targets(axes: Axes, run: _Run) -> None:
+def _draw_targets(axes: Axes, run: Run) -> None:
     """Detected targets where they were found, the others where they are at the end."""
     finds = run.metrics.finds
     found_m = np.array([(x_m, y_m) for *_, x_m, y_m in finds]).reshape(-1, 2)
     ends_m = run.walked(run.site.targets_m, run.scenario.targets.diffusion_m, Purpose.TARGET_WALK)
     missed_m = np.delete(ends_m, [target for _, _, target, _, _ in finds], axis=0)
-    found_m, missed_m = (xy_m[_thinned(len(xy_m), _POINTS_SHOWN)] for xy_m in (found_m, missed_m))
+    size = _mark_size(ends_m.shape[0], 24.0)
     if found_m.size:
-        _add_marks(
-            axes, found_m, s=24.0, c=_FOUND, marker="+", lw=0.9, zorder=3.0, label="target detected"
-        )
+        found_m = found_m[_thinned(found_m.shape[0], _POINTS_SHOWN)]
+        plus: dict[str, Any] = {"marker": "+", "lw": 0.9, "label": "target detected"}
+        _add_marks(axes, found_m, s=size, c=_FOUND, zorder=3.0, **plus)
     if missed_m.size:
-        _add_marks(axes, missed_m, s=8.0, c=_MISSED, zorder=3.0, label="not detected")
+        missed_m = missed_m[_thinned(missed_m.shape[0], _POINTS_SHOWN)]
+        _add_marks(axes, missed_m, s=size / 3.0, c=_MISSED, zorder=3.0, label="not detected")
 
 
-def _draw_supervisor(axes: Axes, run: _Run) -> None:
+def _draw_supervisor(axes: Axes, run: Run) -> None:
     if run.scenario.centralized:
         x_m, y_m = run.scenario.supervisor_m
         axes.plot([x_m], [y_m], "*", ms=15.0, mfc="white", mec=_INK, zorder=6.0, label="supervisor")
 
 
-def _draw_radio(axes: Axes, run: _Run) -> None:
+def _draw_radio(axes: Axes, run: Run) -> None:
     """How far the supervisor is heard, or else each robot from where it ended."""
     scenario = run.scenario
     centres_m = [trail.end_m for trail in run.trails.values()]
@@ -346,7 +355,7 @@ def _draw_radio(axes: Axes, run: _Run) -> None:
     axes.plot([], [], "o", ms=9.0, mfc="none", mec=_FAINT, label=f"radio range {range_m:g} m")
 
 
-def _draw_curves(place: SubFigure, run: _Run) -> None:
+def _draw_curves(place: SubFigure, run: Run) -> None:
     """What the run measured, over simulated time."""
     bounds, progress, mass = place.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.2, 1.0))
     rows = run.metrics.rows
@@ -362,7 +371,7 @@ def _draw_curves(place: SubFigure, run: _Run) -> None:
         _add_legend(place, moments, columns=2)
 
 
-def _draw_bounds(axes: Axes, run: _Run, rows: Sequence[Row]) -> None:
+def _draw_bounds(axes: Axes, run: Run, rows: Sequence[Row]) -> None:
     equation = 6 if run.scenario.robots.count == 1 else 11 if run.scenario.centralized else 12
     lines = (
         (f"bound (eq. {equation})", [row.w_ub_paper for row in rows], _FIRST, 2.4),
@@ -377,7 +386,7 @@ def _draw_bounds(axes: Axes, run: _Run, rows: Sequence[Row]) -> None:
     _add_caption(axes, axes.lines)
 
 
-def _draw_progress(axes: Axes, run: _Run, rows: Sequence[Row]) -> None:
+def _draw_progress(axes: Axes, run: Run, rows: Sequence[Row]) -> None:
     targets = run.site.targets_m.shape[0]
     energy = run.scenario.steps_per_robot * run.scenario.robots.count
     if targets:
@@ -399,7 +408,7 @@ def _draw_mass(axes: Axes, rows: Sequence[Row]) -> None:
     _add_caption(axes, axes.lines)
 
 
-def _mark_moments(diagrams: Sequence[Axes], run: _Run) -> list[Line2D]:
+def _mark_moments(diagrams: Sequence[Axes], run: Run) -> list[Line2D]:
     """Vertical lines where something happened; one of each for the legend."""
     moments = (("first contact", run.contact_s, ":"), ("finished", run.finish_s, "--"))
     marks = []
@@ -428,7 +437,16 @@ def _add_line(
     numbers = np.array(values, dtype=np.float64)
     if not np.isnan(numbers).all():
         marker = "o" if len(rows) == 1 else ""
-        axes.plot(times_s, numbers, color=colour, lw=width, marker=marker, ms=4.0, label=label)
+        axes.plot(
+            times_s,
+            numbers,
+            color=colour,
+            lw=width,
+            marker=marker,
+            ms=4.0,
+            clip_on=False,
+            label=label,
+        )
 
 
 def _add_caption(axes: Axes, handles: Sequence[Artist], columns: int = 3) -> None:
@@ -449,7 +467,7 @@ def _add_caption(axes: Axes, handles: Sequence[Artist], columns: int = 3) -> Non
 
 
 def _add_legend(place: SubFigure, handles: Sequence[Artist], columns: int) -> None:
-    place.legend(
+    legend = place.legend(
         handles=handles,
         loc="outside lower center",
         ncols=min(columns, len(handles)),
@@ -459,6 +477,9 @@ def _add_legend(place: SubFigure, handles: Sequence[Artist], columns: int) -> No
         columnspacing=1.6,
         labelcolor=_INK,
     )
+    for handle in legend.legend_handles:
+        if isinstance(handle, PathCollection):  # a crowd's marks are too small to tell
+            handle.set_sizes(np.maximum(handle.get_sizes(), 12.0))
 
 
 def _tidy(axes: Axes, x_label: str, y_label: str) -> None:
@@ -470,14 +491,14 @@ def _tidy(axes: Axes, x_label: str, y_label: str) -> None:
     axes.spines[["left", "bottom"]].set_color(_FAINT)
 
 
-def _team_colours(robots: int) -> list[str]:
+def team_colours(robots: int) -> list[str]:
     """One colour each. Beyond ten they only tell neighbours apart, along a cyclic map."""
     if robots <= len(_TEAM):
         return list(_TEAM[:robots])
     golden = 0.6180339887498949  # its multiples fall evenly, and far from the one before
     around = 2.0 * np.pi * golden * np.arange(robots)
     # Twilight is pale at 0 and dark at 1/2; keep to its blue and its red side.
-    cycle = matplotlib.colormaps["twilight"]
+    cycle = colormaps["twilight"]
     places = np.where(np.cos(around) > 0.0, 0.25, 0.75) + 0.1 * np.sin(around)
     return [to_hex(colour) for colour in cycle(places)]
 
@@ -486,6 +507,11 @@ def _strokes(way_m: Points) -> list[Points]:
     """A way in pieces that join."""
     starts = range(0, max(1, way_m.shape[0] - 1), _STROKE_POINTS)
     return [way_m[i : i + _STROKE_POINTS + 1] for i in starts]
+
+
+def _mark_size(count: int, most: float) -> float:
+    """The area of a mark in square points: smaller in a crowd."""
+    return max(1.0, min(most, 30_000.0 / max(1, count)))
 
 
 def _thinned(count: int, most: int) -> slice:

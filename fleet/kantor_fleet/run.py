@@ -5,13 +5,6 @@ import time
 from pathlib import Path
 
 import msgspec
-
-from kantor_fleet.exits import Exit
-from kantor_fleet.interrupts import Interrupts
-from kantor_fleet.local import Order, local_fleet, watch_progress
-from kantor_fleet.preload import warm_up
-from kantor_fleet.progress import ProgressView
-from kantor_fleet.team import team
 from kantor_protocol.bus import BusError
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.journal import read
@@ -22,6 +15,13 @@ from kantor_worldsim.recording import JOURNAL, REPORT, RESULT, Recording, folder
 from kantor_worldsim.records import Record
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
+
+from kantor_fleet.exits import Exit
+from kantor_fleet.interrupts import Interrupts
+from kantor_fleet.local import Order, local_fleet, watch_progress
+from kantor_fleet.preload import warm_up
+from kantor_fleet.progress import ProgressView
+from kantor_fleet.team import team
 
 _GLANCE_S = 0.2
 
@@ -77,18 +77,27 @@ def summary(result: Result) -> str:
     wire = result.bytes_per_robot_tick
     tight = "-" if result.w_ub.tight is None else f"{result.w_ub.tight:.4g}"
     rules = "all rules held" if not result.violations else f"{result.violations} VIOLATIONS"
+    energy = (
+        f"{result.energy_spent}/{result.energy_total} points, "
+        f"{100.0 * result.mass_left:.2f} % of the mass left, "
+        f"{100.0 * result.mass_double_counted:.2f} % counted twice"
+    )
+    bound = (
+        f"{result.w_ub_start:.4g} -> {result.w_ub.paper:.4g} "
+        f"(tight {tight}, last tick's {result.w_ub.final_instant:.4g})"
+    )
+    radio = (
+        f"{result.deliveries} deliveries, {result.drops} dropped, "
+        f"{result.out_of_range_refused} out of range; "
+        f"{wire.weights:.1f} B weights, {wire.total:.1f} B in all a robot and tick"
+    )
     lines = [
         f"{result.scenario} (seed {result.seed}, {result.exchange}): {result.ended}",
         f"  detected  {found}",
         f"  finished  {finished}; {result.ticks} ticks, {result.wall_s:.1f} s",
-        f"  energy    {result.energy_spent}/{result.energy_total} points, "
-        f"{100.0 * result.mass_left:.2f} % of the mass left, "
-        f"{100.0 * result.mass_double_counted:.2f} % counted twice",
-        f"  W_UB      {result.w_ub_start:.4g} -> {result.w_ub.paper:.4g} "
-        f"(tight {tight}, last tick's {result.w_ub.final_instant:.4g})",
-        f"  radio     {result.deliveries} deliveries, {result.drops} dropped, "
-        f"{result.out_of_range_refused} out of range; "
-        f"{wire.weights:.1f} B weights, {wire.total:.1f} B in all a robot and tick",
+        f"  energy    {energy}",
+        f"  W_UB      {bound}",
+        f"  radio     {radio}",
         f"  checker   {rules}; record {result.record}",
         *(f"            {complaint}" for complaint in result.complaints),
         f"  digest    {result.digest}",
@@ -128,8 +137,8 @@ def _run_processes(order: Order, interrupts: Interrupts) -> Exit:
                 for message in watch_progress(fleet):
                     if message is not None:
                         view.show(message)
-                    for name, code in fleet.newly_failed():
-                        view.note(f"{name} ended with {_told(code)}; the others go on")
+                    for name, failure in fleet.newly_failed():
+                        view.note(f"{name} ended with {_told(failure)}; the others go on")
                     if interrupts() and not asked:
                         asked = True
                         view.note("ending the mission")

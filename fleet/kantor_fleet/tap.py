@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
+from kantor_protocol import bus, credentials, keys
 
 from kantor_fleet.exits import Exit, fail
 from kantor_fleet.interrupts import Interrupts
-from kantor_protocol import bus, credentials, keys
 
 KINDS = frozenset({"pose", "weights", "tx", "rx", keys.WORLD})
 _BYTES_SHOWN = 24
@@ -65,8 +65,8 @@ def _shown(value: Any) -> str:
         return f"0x{value[:_BYTES_SHOWN].hex()}{more}"
     if isinstance(value, list):
         items = [_shown(item) for item in value[:_ITEMS_SHOWN]]
-        more = [f"…({len(value)})"] if len(value) > _ITEMS_SHOWN else []
-        return f"[{', '.join(items + more)}]"
+        items += [f"…({len(value)})"] if len(value) > _ITEMS_SHOWN else []
+        return f"[{', '.join(items)}]"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key}: {_shown(item)}" for key, item in value.items()) + "}"
     return f"{value:.6g}" if isinstance(value, float) else repr(value)

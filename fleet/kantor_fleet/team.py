@@ -9,9 +9,7 @@ from kantor_worldsim.world import Site
 
 def team(scenario: Scenario, seed: int, site: Site) -> dict[ParticipantId, StateMachine]:
     """Everybody in the roster."""
-    return {
-        name: participant(name, scenario, seed, site) for name in scenario.roster
-    }
+    return {name: participant(name, scenario, seed, site) for name in scenario.roster}
 
 
 def participant(name: ParticipantId, scenario: Scenario, seed: int, site: Site) -> StateMachine:

@@ -5,8 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from kantor_fleet.exits import Exit, fail
-from kantor_fleet.team import participant, team
 from kantor_protocol.machine import StateMachine
 from kantor_protocol.messages import RefusedError
 from kantor_worldsim.checkers import check
@@ -16,6 +14,9 @@ from kantor_worldsim.recording import JOURNAL, MANIFEST
 from kantor_worldsim.records import Batch, Ending, Mailbag, Opening, Record, encode_record
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
+
+from kantor_fleet.exits import Exit, fail
+from kantor_fleet.team import participant, team
 
 
 def verify(folder: Path) -> Exit:
@@ -111,7 +112,10 @@ def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict
     steps = len(records) - (1 if whole else 0)
     stage = Stage(scenario, seed, site, [compare])
     simulate(
-        stage, in_process(team(scenario, seed, site)), seed, lambda: compared >= steps or differing >= 0
+        stage,
+        in_process(team(scenario, seed, site)),
+        seed,
+        lambda: compared >= steps or differing >= 0,
     )
     if differing >= 0:
         return False, f"executed again: record {differing} differs"

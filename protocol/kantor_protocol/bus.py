@@ -8,13 +8,13 @@ protocol/README.md.
 A callback only enqueues; all work is done by whoever calls `next`.
 """
 
+import contextlib
 import json
 import queue
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -27,7 +27,7 @@ from kantor_protocol.messages import MESSAGE_BYTES_MAX
 
 LEASE_MS = 1000
 """A frozen or cut-off process is noticed after this."""
-_HANDSHAKE_S = 5.0
+_HANDSHAKE_S = 3.0
 _CLOSE_S = 5.0
 
 
@@ -216,7 +216,7 @@ class Watch:
         self._received.put((str(sample.key_expr), sample.payload.to_bytes()))
 
 
-@contextmanager
+@contextlib.contextmanager
 def line(connect: str, identity: Identity, nonce: str, patience_s: float) -> Iterator[Line]:
     """Join world-sim's bus as a participant, waiting for it up to `patience_s`. Raises BusError."""
     opened = Line(_client(connect, identity, patience_s), identity, nonce)
@@ -226,7 +226,7 @@ def line(connect: str, identity: Identity, nonce: str, patience_s: float) -> Ite
         opened.close()
 
 
-@contextmanager
+@contextlib.contextmanager
 def watch(connect: str, identity: Identity, key: str, patience_s: float) -> Iterator[Watch]:
     """Join world-sim's bus as an observer of the keys that match. Raises BusError."""
     opened = Watch(_client(connect, identity, patience_s), key)
@@ -335,9 +335,7 @@ def _access(fleet: str, roster: tuple[ParticipantId, ...]) -> dict[str, Any]:
                 }
             )
         subjects.append({"id": user, "usernames": [user]})
-        policies.append(
-            {"rules": [f"{user}-{label}" for label, *_ in grants], "subjects": [user]}
-        )
+        policies.append({"rules": [f"{user}-{label}" for label, *_ in grants], "subjects": [user]})
 
     for name in roster:
         own = [keys.tx(fleet, name), keys.pose(fleet, name), keys.weights(fleet, name)]
@@ -368,10 +366,8 @@ def _close(session: zenoh.Session, held: list[Any]) -> None:
     held.clear()
 
     def close() -> None:
-        try:
-            session.close()
-        except zenoh.ZError:
-            pass
+        with contextlib.suppress(zenoh.ZError):
+            session.close()  # type: ignore[no-untyped-call]
 
     closing = threading.Thread(target=close, daemon=True)
     closing.start()
@@ -383,6 +379,5 @@ def _short(error: Exception) -> str:
 
 
 def init_log() -> None:
-    """Zenoh's own log, errors only unless RUST_LOG says more."""
-    zenoh.init_log_from_env_or("error")
-
+    """Zenoh's own log: silent, since kantor tells what a user can mend, unless RUST_LOG says more."""
+    zenoh.init_log_from_env_or("off")

@@ -1,5 +1,4 @@
-"""Identities on the bus: one user and password for each participant, in files that only their owner
-reads.
+"""Identities on the bus: a user and a password for each participant, in files for its eyes only.
 
 A folder holds `<id>.toml` for each identity, to be handed to whoever runs it, and `users.txt` for the
 router. World-sim writes it; nothing else does.

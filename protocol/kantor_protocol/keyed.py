@@ -41,7 +41,7 @@ class Purpose(enum.IntEnum):
 
 @njit(cache=True)
 def philox(seed: int, purpose: int, who: int, step: int, index: int) -> tuple[int, int]:
-    """One Philox4x32-10 block as two 64-bit words (uint64), from a 64-bit seed and four 32-bit counters."""
+    """One Philox4x32-10 block as two 64-bit words (uint64), from a seed below 2^63 and four 32-bit counters."""
     key_0 = uint64(seed) & _LOW
     key_1 = uint64(seed) >> _HIGH
     word_0 = uint64(uint32(purpose))
@@ -73,7 +73,7 @@ def uniform(seed: int, purpose: int, who: int, step: int, index: int) -> float:
 
 
 def generator(seed: int, purpose: Purpose) -> np.random.Generator:
-    """numpy's generator (Philox4x64) for draws that one process makes once, such as the samples."""
+    """Numpy's generator (Philox4x64) for draws that one process makes once, such as the samples."""
     return np.random.Generator(np.random.Philox(key=np.array([seed, purpose], dtype=np.uint64)))
 
 

@@ -1,11 +1,11 @@
 """Every key expression on the bus, built and taken apart in one place.
 
-    kantor/v1/<fleet>/<id>/pose      robot -> observers
-    kantor/v1/<fleet>/<id>/weights   robot -> observers
-    kantor/v1/<fleet>/<id>/tx        participant -> world-sim
-    kantor/v1/<fleet>/<id>/rx        world-sim -> participant
-    kantor/v1/<fleet>/<id>/alive/<nonce>   liveliness token of one process
-    kantor/v1/<fleet>/world/<name>   world-sim -> observers
+kantor/v1/<fleet>/<id>/pose      robot -> observers
+kantor/v1/<fleet>/<id>/weights   robot -> observers
+kantor/v1/<fleet>/<id>/tx        participant -> world-sim
+kantor/v1/<fleet>/<id>/rx        world-sim -> participant
+kantor/v1/<fleet>/<id>/alive/<nonce>   liveliness token of one process
+kantor/v1/<fleet>/world/<name>   world-sim -> observers
 """
 
 from typing import NamedTuple

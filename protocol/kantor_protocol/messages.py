@@ -40,8 +40,8 @@ class Array(msgspec.Struct, frozen=True, array_like=True):
     @classmethod
     def of(cls, array: npt.NDArray[Any]) -> "Array":
         """Pack an array of numbers."""
-        ordered = np.ascontiguousarray(array)
-        return cls(ordered.dtype.newbyteorder("<").str, ordered.shape, ordered.tobytes())
+        ordered = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+        return cls(ordered.dtype.str, ordered.shape, ordered.tobytes())
 
     def open(self, dtype: str, dimensions: int) -> npt.NDArray[Any]:
         """The array, if it is of this dtype and number of dimensions; raises RefusedError."""
@@ -52,7 +52,10 @@ class Array(msgspec.Struct, frozen=True, array_like=True):
             self.content
         ):
             raise RefusedError(f"array {self.dtype}{self.shape}: {len(self.content)} bytes")
-        return np.frombuffer(self.content, dtype=kind).reshape(self.shape)
+        try:
+            return np.frombuffer(self.content, dtype=kind).reshape(self.shape)
+        except ValueError as error:  # an empty array of an impossible shape
+            raise RefusedError(f"array {self.dtype}{self.shape}: {error}") from None
 
 
 class News(_Message, frozen=True, array_like=True, tag=1):
@@ -226,6 +229,11 @@ def check_outputs(outputs: Outputs) -> None:
     numbers = (pose.x_m, pose.y_m, pose.heading_rad, pose.speed_m_s, *(goal or ()))
     if not all(map(math.isfinite, numbers)):
         raise RefusedError("outputs with a number that is not finite")
+    sequences = (envelope.sequence for envelope in outputs.outbox)
+    if not all(
+        0 <= n < 2**63 for n in (outputs.step, outputs.energy_spent, outputs.refused, *sequences)
+    ):
+        raise RefusedError("outputs with a count that is out of range")
     if any(len(envelope.body) > BODY_BYTES_MAX for envelope in outputs.outbox):
         raise RefusedError("outputs with an oversized body")
 
@@ -233,7 +241,7 @@ def check_outputs(outputs: Outputs) -> None:
 def _decoded(decoder: msgspec.msgpack.Decoder[Any], payload: bytes) -> Any:
     try:
         return decoder.decode(payload)
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise RefusedError(str(error)) from None
 
 

@@ -41,7 +41,7 @@ def take_uint(buffer: np.ndarray, at: int) -> tuple[int, int]:
     while at < buffer.shape[0] and shift < 63:
         byte = np.int64(buffer[at])
         at += 1
-        value |= (byte & 127) << shift
+        value |= int((byte & 127) << shift)
         if byte < 128:
             return value, at
         shift += 7
@@ -53,7 +53,7 @@ def take_int(buffer: np.ndarray, at: int) -> tuple[int, int]:
     """Read a signed value; see `take_uint`."""
     folded, at = take_uint(buffer, at)
     if folded & 1:
-        return -((folded + 1) >> 1), at
+        return -(folded >> 1) - 1, at
     return folded >> 1, at
 
 
@@ -116,9 +116,7 @@ class Pairs:
         if len(packed) > 2 * self._index.shape[0]:  # a pair takes two bytes at least
             self._index = np.zeros(len(packed), dtype=np.int64)
             self._value = np.zeros(len(packed), dtype=np.int64)
-        count = unpack_pairs(
-            np.frombuffer(packed, dtype=np.uint8), bound, self._index, self._value
-        )
+        count = unpack_pairs(np.frombuffer(packed, dtype=np.uint8), bound, self._index, self._value)
         if count < 0:
             return None
         return self._index[:count], self._value[:count]

@@ -6,8 +6,9 @@ Theory of operation
    the newest value wins by the origin's stamp). Nobody else writes them.
 2. A version vector says how much of every log, and which stamp of every register, somebody holds.
    Everybody sends its own with every message, which is at once its acknowledgement.
-3. A sender puts in the suffixes that somebody it hears lacks. New entries go out once, at once; they
-   go out again only when the acknowledgement has not come within `patience` steps.
+3. A sender puts in the suffixes that somebody it hears lacks. A few unacknowledged entries ride along
+   with every message; a longer suffix goes out once, and again only when the acknowledgement has not
+   come within `patience` steps.
 4. Entries of others are forwarded, so news travels over several hops. A robot holds foreign entries
    back for `patience` steps, since a neighbour most likely heard them itself; a relay does not.
 5. Receiving is idempotent: a suffix that starts beyond what is held is left (it will come again), what
@@ -44,6 +45,8 @@ _CLAIM_RENEWAL_STEPS = 6
 _FRESH_STEPS = 4
 """A participant heard within so many steps beyond `patience` counts as a neighbour."""
 
+_REPEATED = 32
+"""So many unacknowledged entries are repeated with every message, so that one loss costs nothing."""
 _LENGTH_MAX = 1 << 40
 """No log is longer; it keeps sums of positions within 64 bits."""
 
@@ -138,9 +141,7 @@ def _merge_entry(store: Store, manner: Manner, origin: int, index: int, value: i
 
 
 @njit(cache=True)
-def _walk_logs(
-    store: Store, manner: Manner, logs: np.ndarray, source: int, apply: bool
-) -> int:
+def _walk_logs(store: Store, manner: Manner, logs: np.ndarray, source: int, apply: bool) -> int:
     """Read all suffixes; apply what is new, or only check. The position at the end or negative."""
     ledger = manner.ledger
     at = 0
@@ -190,9 +191,7 @@ def _walk_claims(store: Store, manner: Manner, claims: np.ndarray, apply: bool) 
 
 
 @njit(cache=True)
-def _walk_have(
-    store: Store, manner: Manner, have: np.ndarray, source: int, apply: bool
-) -> int:
+def _walk_have(store: Store, manner: Manner, have: np.ndarray, source: int, apply: bool) -> int:
     origins = store.length.shape[0]
     at = 0
     for slot in range(2 * origins if manner.claims else origins):
@@ -247,9 +246,7 @@ def _neighbours_lack(store: Store, me: int, target: int, slot: int, patience: in
 
 
 @njit(cache=True)
-def _start_of_suffix(
-    store: Store, manner: Manner, target: int, origin: int, aged: int
-) -> int:
+def _start_of_suffix(store: Store, manner: Manner, target: int, origin: int, aged: int) -> int:
     """First entry to send of an origin's log; its length when nothing is to be sent."""
     me, relay, patience = manner.me, manner.relay, manner.patience
     length = store.length[origin]
@@ -259,6 +256,8 @@ def _start_of_suffix(
     if least < 0:
         return store.sending[0, origin] if target >= 0 and origin == me else length
     step = store.counters[_STEP]
+    if (origin == me or relay) and length - least <= _REPEATED:
+        return least
     if least < aged and step - store.sending[1, origin] >= patience:
         store.sending[1, origin] = step
         return least
@@ -286,8 +285,8 @@ def _put_suffix(
     at = put_uint(out, at, count)
     before = 0
     for entry in range(start, end):
-        index = np.int64(store.log_index[row, entry])
-        value = np.int64(store.log_value[row, entry])
+        index = int(store.log_index[row, entry])
+        value = int(store.log_value[row, entry])
         if ledger or value == store.weights[index]:
             at = put_int(out, at, index - before)
             at = put_uint(out, at, value)
@@ -320,9 +319,7 @@ def _put_claims(store: Store, manner: Manner, out: np.ndarray, at: int, target: 
 
 
 @njit(cache=True)
-def _compose(
-    store: Store, manner: Manner, out: np.ndarray, target: int
-) -> tuple[int, int, int]:
+def _compose(store: Store, manner: Manner, out: np.ndarray, target: int) -> tuple[int, int, int]:
     """Write have, logs and claims one after the other; the position at the end of each."""
     me, ledger = manner.me, manner.ledger
     origins = store.length.shape[0]
@@ -358,11 +355,7 @@ def _taken(store: Store, me: int, out: np.ndarray) -> int:
     step = store.counters[_STEP]
     for origin in range(store.length.shape[0]):
         sample = store.claims[_SAMPLE, origin]
-        if (
-            origin == me
-            or sample < 0
-            or step - store.claims[_HEARD, origin] > _CLAIM_LEASE_STEPS
-        ):
+        if origin == me or sample < 0 or step - store.claims[_HEARD, origin] > _CLAIM_LEASE_STEPS:
             continue
         if sample == store.claims[_SAMPLE, me]:
             mine = store.claims[_SINCE, me]

@@ -10,7 +10,7 @@ import re
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import msgspec
 from msgspec import Meta
@@ -20,6 +20,7 @@ from kantor_protocol.machine import SUPERVISOR, ParticipantId
 Positive = Annotated[float, Meta(gt=0.0)]
 NotNegative = Annotated[float, Meta(ge=0.0)]
 Probability = Annotated[float, Meta(ge=0.0, lt=1.0)]
+Seconds = Annotated[float, Meta(ge=0.0, le=1e6)]
 Point = tuple[float, float]
 
 PlannerName = Literal["transport"]
@@ -28,6 +29,9 @@ VehicleName = Literal["first-order", "second-order", "unicycle", "dubins"]
 
 class ScenarioError(ValueError):
     """A scenario that cannot be run; the message is one line with the place and the remedy."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -81,7 +85,7 @@ class Clock(_Table, frozen=True, kw_only=True):
     """Each robot's period is drawn from [1 - spread, 1 + spread] times the nominal one."""
     drift_ppm: Annotated[float, Meta(ge=0.0, le=100_000.0)] = 0.0
     """Each robot's clock runs wrong by a rate drawn from plus or minus this."""
-    jitter_s: NotNegative = 0.0
+    jitter_s: Seconds = 0.0
     """Each step is late by a time drawn from [0, jitter_s]; below the period."""
 
 
@@ -138,14 +142,14 @@ class Radio(_Table, frozen=True, kw_only=True):
     """Between true poses at the time of sending; the bound itself is in range."""
     drop: Probability = 0.0
     """Per receiver."""
-    delay_s: NotNegative = 0.0
-    jitter_s: NotNegative = 0.0
+    delay_s: Seconds = 0.0
+    jitter_s: Seconds = 0.0
     """Each delivery takes delay_s plus up to this."""
     duplicate: Probability = 0.0
     """A second copy arrives, with its own delay."""
     reorder: Probability = 0.0
     """A delivery is held back by up to reorder_s, so that later ones overtake it."""
-    reorder_s: NotNegative = 0.3
+    reorder_s: Seconds = 0.3
     beacon: Literal["versions", "state"] = "versions"
     """What a robot sends while it hears nobody: which versions it holds, or all that it knows.
     With state one message is enough to inform whoever comes into range, as Algorithm 3 presupposes."""
@@ -195,7 +199,7 @@ class Scenario(_Table, frozen=True, kw_only=True):
     """min: elementwise minimum, as in the paper. ledger: everybody's spending, counted once."""
     claims: bool = True
     """Robots claim the sample they head for."""
-    limit_s: Positive | None = None
+    limit_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     """Simulated time after which the mission is cut; by default 1.5 times the energy's."""
     domain: Domain
     robots: Robots
@@ -262,7 +266,7 @@ def parse(text: str, origin: str, overrides: Iterable[str] = ()) -> Scenario:
     """
     try:
         tree = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ScenarioError(f"{origin}: not valid TOML: {error}") from None
     for override in overrides:
         _override(tree, override)
@@ -277,7 +281,7 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
         raise ScenarioError(
             f"{path}: no such scenario file; `kantor scenarios` lists the packaged ones"
         ) from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise ScenarioError(f"{path}: cannot be read: {error}") from None
     return rooted(parse(text, str(path), overrides), path.parent)
 
@@ -292,7 +296,10 @@ def rooted(scenario: Scenario, folder: Path) -> Scenario:
     def place(name: str | None) -> str | None:
         if name is None or Path(name).is_absolute():
             return name
-        return str(Path(name).resolve() if Path(name).exists() else (folder / name).resolve())
+        try:
+            return str(Path(name).resolve() if Path(name).exists() else (folder / name).resolve())
+        except (OSError, ValueError) as error:
+            raise ScenarioError(f"{name}: cannot be the name of a file: {error}") from None
 
     return msgspec.structs.replace(
         scenario,
@@ -333,7 +340,7 @@ def to_toml(scenario: Scenario) -> str:
         if isinstance(value, bool):
             return str(value).lower()
         if isinstance(value, str):
-            return msgspec.json.encode(value).decode()
+            return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
         if isinstance(value, list):
             return "[" + ", ".join(literal(v) for v in value) + "]"
         return repr(value)
@@ -364,7 +371,7 @@ def _override(tree: dict[str, Any], override: str) -> None:
             raise ScenarioError(f"--set {override}: {'.'.join(path[: i + 1])} is not a table")
     try:
         table[path[-1]] = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         table[path[-1]] = text.strip()
 
 
@@ -389,7 +396,7 @@ _KNOWN: dict[str, tuple[str, ...]] = {
 
 
 def _readable(message: str) -> str:
-    """msgspec's complaint with the key first and, for an unknown key, the nearest known one."""
+    """Msgspec's complaint with the key first and, for an unknown key, the nearest known one."""
     problem, _, place = message.partition(" - at ")
     place = place.strip("`").removeprefix("$").removeprefix(".")
     table = re.sub(r"\[.*?\]", "", place)
@@ -401,7 +408,17 @@ def _readable(message: str) -> str:
             near = difflib.get_close_matches(found[1], _KNOWN.get(table, ()), 1)
             known = f"did you mean {near[0]}?" if near else f"known: {', '.join(_KNOWN[table])}"
             return f"{key}: no such key; {known}"
+    if problem.startswith("Invalid enum value"):
+        return f"{place}: {problem.removeprefix('Invalid enum value ')} is not known; known: {_choices(place)}"
     return f"{place}: {problem[0].lower()}{problem[1:]}" if place else problem
+
+
+def _choices(place: str) -> str:
+    """The names that a key may be set to."""
+    kind: Any = Scenario
+    for part in place.split("."):
+        kind = get_type_hints(kind)[part]
+    return ", ".join(get_args(kind))
 
 
 def _complaints(scenario: Scenario) -> Iterable[str]:
@@ -422,8 +439,10 @@ def _complaints(scenario: Scenario) -> Iterable[str]:
             yield f"{key}.file: {name} has an unknown kind; use one of {known}"
     if scenario.energy.points < scenario.robots.count:
         yield "energy.points: fewer than robots; set at least one point for each"
-    if round(scenario.clock.jitter_s * 1e9) >= scenario.period_ns:
-        yield "clock.jitter_s: must be below clock.period_s"
+    clock = scenario.clock
+    shortest_s = clock.period_s * (1.0 - clock.spread) * (1.0 - clock.drift_ppm * 1e-6)
+    if clock.jitter_s + 1e-9 >= shortest_s:  # a step must not overtake the next one
+        yield f"clock.jitter_s: must be below the shortest period after spread and drift, {shortest_s:g} s"
     if scenario.claims and scenario.planner.name != "transport":
         yield "claims: only the transport planner has them; set claims=false"
 
@@ -437,7 +456,8 @@ def _not_finite(tree: Any, path: str = "") -> Iterable[str]:
         for i, value in enumerate(tree):
             yield from _not_finite(value, f"{path}[{i}]")
     elif isinstance(tree, float) and not math.isfinite(tree):
-        if not (tree == math.inf and path in {"radio.range_m", "supervisor.range_m"}):
+        boundless = tree == math.inf and path in {"radio.range_m", "supervisor.range_m"}
+        if not boundless:
             yield f"{path}: {tree} is no usable number; set a finite one"
 
 

@@ -65,7 +65,7 @@ class WeightsPublisher:
         self._sequence = 0
         self._changed: list[npt.NDArray[np.int64]] = []
 
-    def step(self, lowered: npt.NDArray[np.int64], last: bool) -> bytes:
+    def step(self, lowered: npt.NDArray[np.int64], *, last: bool) -> bytes:
         """Note the indices that fell; the encoded message when one is due, else nothing.
 
         last: nothing will fall any more, so a message is due now.
@@ -113,10 +113,11 @@ class WeightsSubscriber:
             if weights is None:
                 return False
             self.weights = weights
-        elif self.weights is None or message.base != self._sequence:
-            self.weights = None
-            return False
-        elif not _apply(self.weights, message.content):
+        elif (
+            self.weights is None
+            or message.base != self._sequence
+            or message.size != self.weights.shape[0]
+        ) or not _apply(self.weights, message.content):
             self.weights = None
             return False
         self._sequence = message.sequence
@@ -154,5 +155,3 @@ def _apply(weights: Weights, content: bytes) -> bool:
         return False
     weights[pairs[0]] = pairs[1]
     return True
-
-

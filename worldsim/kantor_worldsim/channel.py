@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numba import njit
-
 from kantor_protocol.keyed import Purpose, uniform
 from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.scenario import Scenario
+from numba import njit
 
 _LINK_WIDTH = 4096
 """Links are numbered source * width + target; the roster is smaller."""
@@ -87,7 +86,7 @@ def _transmit(
         for other in range(xy_m.shape[0]):
             if other == source or (target >= 0 and other != target):
                 continue
-            by_supervisor = other == supervisor or source == supervisor
+            by_supervisor = supervisor in (other, source)
             range_m = law.supervisor_range_m if by_supervisor else law.range_m
             dx = xy_m[other, 0] - xy_m[source, 0]
             dy = xy_m[other, 1] - xy_m[source, 1]

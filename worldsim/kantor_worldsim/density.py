@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-
 from kantor_protocol.keyed import Purpose, generator
 from kantor_protocol.scenario import Domain, Gaussian, Scenario, ScenarioError, is_image
 
@@ -36,9 +35,7 @@ def targets_of(scenario: Scenario, seed: int) -> Points:
         return np.zeros((0, 2))
     if scenario.samples.file is not None and not is_image(scenario.samples.file):
         return _around(_points("samples", scenario.samples.file), targets.count, seed)
-    return _drawn(
-        "targets", scenario, scenario.samples.file, targets.count, seed, stratified=False
-    )
+    return _drawn("targets", scenario, scenario.samples.file, targets.count, seed, stratified=False)
 
 
 def starts_of(scenario: Scenario, seed: int) -> Points:
@@ -51,7 +48,13 @@ def starts_of(scenario: Scenario, seed: int) -> Points:
 
 
 def _drawn(
-    key: str, scenario: Scenario, file: str | None, count: int | None, seed: int, *, stratified: bool
+    key: str,
+    scenario: Scenario,
+    file: str | None,
+    count: int | None,
+    seed: int,
+    *,
+    stratified: bool,
 ) -> Points:
     purpose = Purpose.SAMPLES if key == "samples" else Purpose.TARGETS
     random = generator(seed, purpose)

@@ -4,6 +4,7 @@ Messages go straight to a buffered file that is flushed on a timer, so a killed 
 that much; MCAP's own chunks would hold seconds back. A file cut anywhere reads up to the cut.
 """
 
+import contextlib
 import hashlib
 import json
 import struct
@@ -14,7 +15,7 @@ from typing import IO
 
 import msgspec
 from mcap.exceptions import McapError
-from mcap.records import Message
+from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
@@ -111,7 +112,7 @@ class Journal:
             return
         if self.cut is None:
             try:
-                self._writer.finish()
+                self._writer.finish()  # type: ignore[no-untyped-call]
                 self._file.flush()
             except OSError as error:
                 self._give_up(error)
@@ -141,10 +142,8 @@ class Journal:
     def _drop_file(self) -> None:
         file, self._file = self._file, None
         if file is not None:
-            try:
+            with contextlib.suppress(OSError):  # what was buffered did not fit: it ends before
                 file.close()
-            except OSError:  # what was buffered did not fit; the file ends before it
-                pass
 
 
 def read(path: Path) -> Iterator[tuple[bytes, Record]]:
@@ -164,7 +163,7 @@ def _messages(path: Path) -> Iterator[tuple[str, Message]]:
             for item in StreamReader(file, record_size_limit=1 << 30).records:
                 if isinstance(item, Message):
                     yield channels.get(item.channel_id, ""), item
-                elif hasattr(item, "topic"):
+                elif isinstance(item, Channel):
                     channels[item.id] = item.topic
         except (McapError, ValueError, EOFError, OverflowError, struct.error):
             return

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from kantor_protocol.clock import Clock, clocks
 from kantor_protocol.machine import Exchange, Inputs, Outputs, ParticipantId, StateMachine
 from kantor_protocol.messages import decode_inputs, decode_outputs, encode
+
 from kantor_worldsim.stage import Stage, Step
 
 
@@ -42,7 +43,9 @@ class Agenda:
         until_ns = self._due[0][0] + lookahead_ns
         batch: list[tuple[int, ParticipantId]] = []
         again = []
-        while self._due and (self._due[0][0] < until_ns or not batch or self._due[0][0] == batch[0][0]):
+        while self._due and (
+            self._due[0][0] < until_ns or not batch or self._due[0][0] == batch[0][0]
+        ):
             due_ns, order, step, name = heapq.heappop(self._due)
             batch.append((due_ns, name))
             again.append((self._clocks[name].due_ns(step + 1), order, step + 1, name))

@@ -21,13 +21,12 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
-from numba import njit
-
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
 from kantor_protocol.packing import Pairs
 from kantor_protocol.walk import Walk
+from numba import njit
+
 from kantor_worldsim.channel import DROPPED, links
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 
@@ -318,7 +317,14 @@ class Metrics:
         )
 
     def result(
-        self, *, exchange: str, digest: str, wall_s: float, record: str, complaints: tuple[str, ...]
+        self,
+        *,
+        exchange: str,
+        digest: str,
+        wall_s: float,
+        refused_at_door: int = 0,
+        record: str,
+        complaints: tuple[str, ...],
     ) -> Result:
         """The summary; call it after the last record. complaints: the checker's."""
         scenario, last = self._scenario, self.rows[-1]
@@ -354,7 +360,7 @@ class Metrics:
             deliveries=self._deliveries,
             drops=self._drops,
             out_of_range_refused=self._out_of_range,
-            messages_refused=sum(self._refused.values()),
+            messages_refused=sum(self._refused.values()) + refused_at_door,
             absences=self._absences,
             ended=self._ending.reason,
             record=record,

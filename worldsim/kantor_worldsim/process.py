@@ -13,8 +13,8 @@ from kantor_protocol.messages import (
     Mission,
     Progress,
     Ready,
-    RefusedError,
     Refusal,
+    RefusedError,
     Report,
     Stop,
     Turn,
@@ -22,6 +22,7 @@ from kantor_protocol.messages import (
     encode,
 )
 from kantor_protocol.scenario import Scenario
+
 from kantor_worldsim.loop import simulate
 from kantor_worldsim.metrics import Metrics, Result
 from kantor_worldsim.recording import Recording
@@ -74,6 +75,7 @@ def run(
     else:
         reason = simulate(stage, _Lockstep(doorway), plan.seed, stopped)
     doorway.dismiss(reason)
+    recording.refused_at_door = doorway.refused
     result = recording.finish()
     doorway.tell_progress("over", reason)
     return result
@@ -236,8 +238,11 @@ class _Lockstep:
 
 
 class _Relay:
-    """The wall exchange: every participant steps by its own clock; what it sends is ruled on and
-    passed on when it arrives. Every inbox is recorded as the participant reports it."""
+    """The wall exchange: every participant steps by its own clock.
+
+    What it sends is ruled on and passed on when it arrives. Every inbox is recorded as the
+    participant reports it.
+    """
 
     def __init__(self, doorway: _Doorway, stage: Stage, plan: Plan) -> None:
         self._doorway = doorway
@@ -288,7 +293,9 @@ class _Relay:
         if inputs is None or ahead_ns > _CLOCK_TOLERANCE_NS * self._speed:
             self._doorway.refused += 1
             return
-        self._stage.settle(max(self._now_ns, self._stage.now_ns), [Step(name, inputs, report.outputs)])
+        self._stage.settle(
+            max(self._now_ns, self._stage.now_ns), [Step(name, inputs, report.outputs)]
+        )
         self._hand(name, self._now_ns)
 
     def _inputs(self, name: ParticipantId, report: Report) -> Inputs | None:

@@ -1,5 +1,6 @@
 """The folder that a run leaves (design, part 7), and the referees that follow the run."""
 
+import contextlib
 import csv
 import json
 import platform
@@ -11,8 +12,8 @@ from pathlib import Path
 from typing import IO, Any
 
 import msgspec
-
 from kantor_protocol.scenario import Scenario, to_toml
+
 from kantor_worldsim.checkers import Checker
 from kantor_worldsim.journal import Journal, file_digest
 from kantor_worldsim.metrics import Metrics, Result, Row
@@ -53,6 +54,8 @@ class Recording:
         """folder: an existing folder for the run's files; None keeps nothing."""
         self.metrics = Metrics()
         self.checker = Checker()
+        self.refused_at_door = 0
+        """Messages to world-sim that it could not take in; whoever runs the bus counts them."""
         self._scenario = scenario
         self._seed = seed
         self._exchange = exchange
@@ -88,6 +91,7 @@ class Recording:
             exchange=self._exchange,
             digest=self.journal.digest.hex,
             wall_s=self._monotonic() - self._started,
+            refused_at_door=self.refused_at_door,
             record=self.journal.cut or "whole",
             complaints=tuple(self.checker.complaints),
         )
@@ -131,10 +135,8 @@ class _Table:
     def close(self) -> None:
         file, self._file = self._file, None
         if file is not None:
-            try:
+            with contextlib.suppress(OSError):
                 file.close()
-            except OSError:
-                pass
 
 
 def _manifest(scenario: Scenario, seed: int, exchange: str) -> dict[str, Any]:

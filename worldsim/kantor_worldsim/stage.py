@@ -9,6 +9,7 @@ from typing import NamedTuple
 from kantor_protocol.machine import Inputs, Outputs, ParticipantId, State
 from kantor_protocol.messages import RefusedError, check_outputs
 from kantor_protocol.scenario import Scenario
+
 from kantor_worldsim.channel import Channel, Sent, Verdict
 from kantor_worldsim.records import Act, Batch, Ending, Record, opening_of
 from kantor_worldsim.world import Site, World
@@ -54,8 +55,10 @@ class Stage:
 
     @property
     def over(self) -> str | None:
-        """Why there is nothing more to do: `done` when every robot that is still there rests,
-        `deserted` when none is there that does not."""
+        """Why there is nothing more to do, or None.
+
+        `done`: every robot rests, or has left while others rest. `deserted`: nobody is left.
+        """
         robots = set(self.scenario.robot_ids)
         if not robots <= self._resting | self.gone:
             return None

@@ -1,7 +1,6 @@
-"""Optimal-transport exploration (Kabir & Lee, eq. 2-3): head for the first sample of the best order
-through the h nearest that still have weight.
+"""Optimal-transport exploration (Kabir & Lee, eq. 2-3).
 
-The paper walks through all h! orders. Held and Karp's recursion over subsets finds the same optimum:
+The goal is the first sample of the best order through the h nearest that still have weight. The paper walks through all h! orders. Held and Karp's recursion over subsets finds the same optimum:
 the cost of a step into a sample depends on where it comes from and on that sample alone.
 """
 
@@ -9,13 +8,13 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+from kantor_protocol.machine import Pose
+from kantor_protocol.replica import NOBODY
 from numba import njit
 
 from kantor_agent.belief import Belief
 from kantor_agent.field import Grid, nearest
 from kantor_agent.planners.base import Goal
-from kantor_protocol.machine import Pose
-from kantor_protocol.replica import NOBODY
 
 
 @njit(cache=True)
@@ -85,8 +84,7 @@ class Transport:
         self._cost_to_go = np.zeros((1 << horizon, horizon), dtype=np.float64)
 
     def choose(self, belief: Belief, pose: Pose, now_ns: int, /) -> Goal | None:
-        """The first sample of the best order; a sample that another robot holds only when all are
-        held."""
+        """The first sample of the best order; one that another robot holds only if all are held."""
         taken = belief.replica.taken()
         sample = self._first(belief, pose, taken)
         if sample == NOBODY and taken.size:

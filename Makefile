@@ -1,0 +1,58 @@
+# Two commands are all a newcomer needs: `make demo` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+KANTOR := $(BIN)/kantor
+
+.PHONY: help demo test check lint types contracts format paper bench clean
+
+help:
+	@echo "make demo    set up, then five robot processes explore on the bus and leave a picture"
+	@echo "make test    set up, then run the tests"
+	@echo "make check   lint, types and import contracts"
+	@echo "make paper   the first paper's claims over 20 seeds, as a table"
+	@echo "make bench   speed, as ratios in one run"
+
+demo: $(VENV)/.installed
+	$(KANTOR) run fleet --exchange wall --speed 4
+
+test: $(VENV)/.developing
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+check: lint types contracts
+
+lint: $(VENV)/.developing
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+types: $(VENV)/.developing
+	$(BIN)/mypy
+
+contracts: $(VENV)/.developing
+	$(BIN)/lint-imports
+
+format: $(VENV)/.developing
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+paper: $(VENV)/.installed
+	$(BIN)/python benchmarks/paper_figures.py
+
+bench: $(VENV)/.installed
+	$(BIN)/python benchmarks/run.py
+
+$(VENV)/.installed: pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit("kantor needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	@touch $@
+
+# pip reads [dependency-groups] from version 25.1 on.
+$(VENV)/.developing: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'
+	$(BIN)/python -m pip install --quiet --group dev
+	@touch $@
+
+clean:
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,72 @@
+"""What tests of processes share: the kantor command, and fleets that are gone afterwards."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from hypothesis import settings
+
+settings.register_profile("kantor", deadline=None, print_blob=True)
+settings.load_profile("kantor")
+
+COMMAND_S = 120.0
+
+
+class Finished(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+class Kantor:
+    """Runs the kantor command in a folder of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._started: list[subprocess.Popen[str]] = []
+
+    def __call__(self, *arguments: object, **environment: str) -> Finished:
+        """Run to the end."""
+        process = self.start(*arguments, **environment)
+        out, err = process.communicate(timeout=COMMAND_S)
+        return Finished(process.returncode, out, err)
+
+    def start(self, *arguments: object, **environment: str) -> subprocess.Popen[str]:
+        """Start and go on."""
+        process = subprocess.Popen(
+            [sys.executable, "-m", "kantor_fleet", *map(str, arguments)],
+            cwd=self.folder,
+            env=os.environ | {"NO_COLOR": "1", "COLUMNS": "120"} | environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        self._started.append(process)
+        return process
+
+    def runs(self) -> list[Path]:
+        """The run folders that commands left, oldest first."""
+        return sorted((self.folder / "runs").glob("*"))
+
+    def stop_all(self) -> None:
+        """End whatever is left, with all that it started."""
+        for process in self._started:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+            process.communicate(timeout=COMMAND_S)
+
+
+@pytest.fixture
+def kantor(tmp_path: Path) -> Iterator[Kantor]:
+    """The kantor command."""
+    command = Kantor(tmp_path)
+    yield command
+    command.stop_all()

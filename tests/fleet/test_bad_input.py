@@ -1,0 +1,148 @@
+"""Bad input: one clear line that names the place and the remedy, the right exit code, no traceback."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Kantor
+
+
+def refused(kantor: "Kantor", *arguments: object) -> tuple[int, str]:
+    """The exit code and the one line of a command that must be refused."""
+    finished = kantor(*arguments)
+    assert "Traceback" not in finished.err + finished.out
+    lines = [line for line in finished.err.splitlines() if line]
+    assert len(lines) == 1, finished.err
+    assert kantor.runs() == []
+    return finished.code, lines[0]
+
+
+@pytest.mark.parametrize(
+    ("override", "says"),
+    [
+        ("radio.rang_m=3", "radio.rang_m: no such key; did you mean range_m?"),
+        ("radio.range_m=wide", "radio.range_m: expected `float`, got `str`"),
+        ("radio.range_m=-1", "radio.range_m: expected `float` >= 0.0"),
+        ("domain.max_m=[nan,9.0]", "domain.max_m[0]: nan is no usable number; set a finite one"),
+        ("samples.count=0", "samples.count: expected `int` >= 1"),
+        ("planner.name=psychic", "planner.name: 'psychic' is not known; known: transport"),
+        ("samples.file=nowhere.csv", "nowhere.csv: no such file"),
+        ("targets.file=nowhere.npy", "nowhere.npy: no such file"),
+        ("samples.file=points.docx", "points.docx has an unknown kind"),
+        ("robots.count=3", "starts.poses_m: 5 given for 3 robots; give one for each or set"),
+        ("starts.poses_m=[[1,1],[1,1],[1,1],[1,1],[9999,1]]", "is outside the domain; move it"),
+        ("clock.jitter_s=5", "clock.jitter_s: must be below the shortest period"),
+        ("radio.drop=1.5", "radio.drop: expected `float` < 1.0"),
+        ("radio=3", "radio: expected `object`, got `int`"),
+    ],
+)
+def test_a_bad_scenario_value_is_refused_by_name(
+    kantor: "Kantor", override: str, says: str
+) -> None:
+    """`--set` with a value that cannot be run exits with 2 and names the key."""
+    code, line = refused(kantor, "run", "fleet", "--exchange", "in-process", "--set", override)
+
+    assert code == 2
+    assert says in line
+
+
+def test_an_override_without_a_value_is_refused(kantor: "Kantor") -> None:
+    """`--set` wants key=value."""
+    assert refused(kantor, "run", "fleet", "--set", "radio") == (
+        2,
+        "kantor: --set radio: write it as key.sub=value",
+    )
+
+
+def test_an_unknown_scenario_is_refused_with_the_known_ones(kantor: "Kantor") -> None:
+    """A name that is not packaged lists those that are."""
+    code, line = refused(kantor, "run", "flet")
+
+    assert code == 2
+    assert "flet: no packaged scenario; there are fleet, paper-centralized" in line
+
+
+def test_a_missing_scenario_file_is_refused(kantor: "Kantor") -> None:
+    """A file that does not exist is named, with where to look."""
+    code, line = refused(kantor, "run", "mine.toml")
+
+    assert code == 2
+    assert "mine.toml: no such scenario file; `kantor scenarios` lists the packaged ones" in line
+
+
+def test_a_scenario_that_is_no_toml_is_refused(kantor: "Kantor") -> None:
+    """The parser's complaint names file and place."""
+    (kantor.folder / "mine.toml").write_text("radio = [")
+
+    code, line = refused(kantor, "run", "mine.toml")
+
+    assert code == 2
+    assert "mine.toml: not valid TOML" in line
+
+
+@pytest.mark.parametrize(
+    ("points", "says"),
+    [
+        (np.zeros((0, 2)), "no points in it"),
+        (np.zeros((3, 4)), "give two columns"),
+        (np.array([[0.0, 1.0], [np.nan, 0.0]]), "row 2 is not finite"),
+        (np.array([{"a": 1}]), "not a table of x, y"),
+    ],
+)
+def test_a_useless_file_of_samples_is_refused(
+    kantor: "Kantor", points: np.ndarray, says: str
+) -> None:
+    """Files are checked before anything is made; nothing in them is ever unpickled."""
+    path = kantor.folder / "points.npy"
+    np.save(path, points, allow_pickle=True)
+
+    code, line = refused(kantor, "run", "fleet", "--set", f"samples.file={path}")
+
+    assert code == 2
+    assert says in line
+
+
+def test_usage_errors_exit_with_two(kantor: "Kantor") -> None:
+    """Values that no run can have."""
+    assert refused(kantor, "run", "fleet", "--seed", "-1")[0] == 2
+    assert refused(kantor, "run", "fleet", "--speed", "0")[0] == 2
+    assert kantor("run", "fleet", "--exchange", "telepathy").code == 2
+    assert kantor("dance").code == 2
+
+
+def test_a_folder_that_cannot_be_made_is_refused(kantor: "Kantor") -> None:
+    """`--out` below a file."""
+    (kantor.folder / "file").write_text("")
+
+    code, line = refused(kantor, "run", "fleet", "--out", kantor.folder / "file")
+
+    assert code == 2
+    assert "file" in line
+
+
+def test_a_folder_that_is_no_run_cannot_be_verified(kantor: "Kantor", tmp_path: Path) -> None:
+    """`kantor verify` names what it misses."""
+    code, line = refused(kantor, "verify", tmp_path)
+
+    assert code == 2
+    assert "manifest.json: no such file; give a folder that a run left" in line
+
+
+def test_where_nothing_listens_the_bus_is_unreachable(kantor: "Kantor") -> None:
+    """Exit code 4, with what to do, after the patience that was given."""
+    assert refused(kantor, "agent", "r1", "--connect", "tcp/127.0.0.1:9", "--patience", "0.2") == (
+        4,
+        "kantor: tcp/127.0.0.1:9: nothing listens there after 0.2 s; "
+        "start `kantor worldsim` or check --connect",
+    )
+
+
+def test_an_endpoint_that_is_none_is_refused(kantor: "Kantor") -> None:
+    """The form of an endpoint is told."""
+    code, line = refused(kantor, "agent", "r1", "--connect", "here")
+
+    assert code == 4
+    assert "here: not an endpoint; write it as tcp/HOST:PORT" in line

@@ -1,0 +1,181 @@
+"""`kantor run`, `scenarios` and `verify` as a user runs them."""
+
+import json
+import signal
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+if TYPE_CHECKING:
+    from conftest import Finished, Kantor
+
+RESULT_NAMES = [
+    "scenario", "seed", "exchange", "clock", "planner", "merge", "robots", "ticks",
+    "finished_tick", "detected", "targets", "detection_rate", "w_ub", "w1_exact", "energy_spent",
+    "mass_left", "mass_double_counted", "bytes_per_robot_tick", "deliveries", "drops",
+    "out_of_range_refused", "violations", "digest", "wall_s",
+]  # fmt: skip
+SHORT = ("--set", "limit_s=5")
+
+
+def result_of(folder: Path) -> dict[str, object]:
+    """result.json of a run folder."""
+    tree = json.loads((folder / "result.json").read_text())
+    assert isinstance(tree, dict)
+    return tree
+
+
+def in_process(kantor: "Kantor", *arguments: object) -> "Finished":
+    """A run in one process."""
+    return kantor("run", *arguments, "--exchange", "in-process")
+
+
+def test_a_run_leaves_its_folder(kantor: "Kantor") -> None:
+    """Design, part 7: the files, and the stable names in result.json."""
+    finished = in_process(kantor, "fleet")
+
+    (folder,) = kantor.runs()
+    result = result_of(folder)
+    assert finished.code == 0, finished.err
+    assert {path.name for path in folder.iterdir()} == {
+        "manifest.json", "metrics.csv", "report.png", "result.json", "run.mcap", "scenario.toml",
+    }  # fmt: skip
+    assert set(RESULT_NAMES) <= set(result)
+    assert (result["ended"], result["violations"], result["record"]) == ("done", 0, "whole")
+    assert set(result["w_ub"]) == {"paper", "tight", "final_instant"}
+    assert set(result["bytes_per_robot_tick"]) == {"weights", "total"}
+    assert (folder / "report.png").read_bytes().startswith(b"\x89PNG")
+    assert str(result["digest"]) in finished.out
+
+
+def test_a_mission_that_is_not_met_exits_with_one(kantor: "Kantor") -> None:
+    """The limit cut it."""
+    finished = in_process(kantor, "fleet", *SHORT)
+
+    assert finished.code == 1
+    assert result_of(kantor.runs()[0])["ended"] == "limit"
+
+
+def test_the_scenario_in_the_folder_runs_again_to_the_same_digest(kantor: "Kantor") -> None:
+    """scenario.toml is the resolved scenario, overrides included."""
+    in_process(kantor, "paper-decentralized", *SHORT, "--seed", 4)
+    first = kantor.runs()[0]
+    in_process(kantor, first / "scenario.toml", "--seed", 4, "--out", "again")
+
+    again = next((kantor.folder / "again").iterdir())
+    assert result_of(first)["digest"] == result_of(again)["digest"]
+
+
+def test_verify_confirms_a_run_and_fails_on_one_changed_byte(kantor: "Kantor") -> None:
+    """Any byte of the journal, wherever it is."""
+    in_process(kantor, "paper-decentralized", *SHORT)
+    (folder,) = kantor.runs()
+    assert kantor("verify", folder).code == 0
+    whole = (folder / "run.mcap").read_bytes()
+
+    for position in (0, 40, len(whole) // 3, len(whole) // 2, len(whole) - 1):
+        changed = bytearray(whole)
+        changed[position] ^= 1
+        (folder / "run.mcap").write_bytes(changed)
+        finished = kantor("verify", folder)
+        assert finished.code == 1
+        assert "FAIL" in finished.out
+
+
+def test_verify_finds_a_forged_record_behind_a_forged_manifest(kantor: "Kantor") -> None:
+    """Executing again needs no digest: a record that another seed made is found out."""
+    in_process(kantor, "paper-decentralized", *SHORT, "--seed", 1)
+    in_process(
+        kantor, "paper-decentralized", "--set", "limit_s=5", "radio.range_m=120", "--seed", 1
+    )
+    first, second = kantor.runs()
+    manifest = json.loads((second / "manifest.json").read_text())
+    shutil.copy(first / "run.mcap", second / "run.mcap")
+    del manifest["digest"]
+    (second / "manifest.json").write_text(json.dumps(manifest))
+    assert kantor("verify", second).code == 0, "the record itself is sound"
+
+    data = (second / "run.mcap").read_bytes()
+    place = data.rindex(b"limit")
+    (second / "run.mcap").write_bytes(data[:place] + b"limut" + data[place + 5 :])
+
+    finished = kantor("verify", second)
+    assert finished.code == 1
+    assert "executed again" in finished.out
+
+
+def test_ctrl_c_leaves_a_valid_partial_record(kantor: "Kantor") -> None:
+    """SIGINT ends the mission, closes the record, draws the picture, exits with 130."""
+    process = kantor.start("run", "paper-single", "--exchange", "in-process")
+    assert process.stdout is not None
+    while not process.stdout.readline().startswith("t="):
+        pass
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+
+    (folder,) = kantor.runs()
+    assert process.returncode == 130
+    assert result_of(folder)["ended"] == "interrupted"
+    assert (folder / "report.png").exists()
+    assert kantor("verify", folder).code == 0
+
+
+def test_a_full_disk_cuts_the_record_and_not_the_mission(kantor: "Kantor") -> None:
+    """The run goes on to its end and says where the record was cut; what was written verifies."""
+    arguments = ["run", "fleet", "--exchange", "in-process"]
+    script = (
+        "import resource, sys; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, 400_000)); "
+        "from kantor_fleet.__main__ import main; sys.argv[1:] = " + repr(arguments) + "; main()"
+    )
+    import subprocess
+    import sys
+
+    finished = subprocess.run(
+        [sys.executable, "-c", script], cwd=kantor.folder, capture_output=True, text=True,
+        timeout=120, check=False,
+    )  # fmt: skip
+
+    (folder,) = kantor.runs()
+    result = result_of(folder)
+    assert finished.returncode == 0, finished.stderr
+    assert result["ended"] == "done"
+    assert str(result["record"]).startswith("cut at t=")
+    assert kantor("verify", folder).code == 0
+
+
+@pytest.mark.parametrize("kind", ["csv", "npy"])
+def test_samples_and_targets_come_from_files(kantor: "Kantor", kind: str) -> None:
+    """Points of the user's own, found relative to where the command runs."""
+    rng = np.random.default_rng(0)
+    samples, targets = rng.normal(800, 60, (300, 2)), rng.normal(800, 60, (40, 2))
+    for name, points in (("samples", samples), ("targets", targets)):
+        if kind == "csv":
+            text = "x,y\n" + "\n".join(f"{x},{y}" for x, y in points)
+            (kantor.folder / f"{name}.csv").write_text(text)
+        else:
+            np.save(kantor.folder / f"{name}.npy", points)
+
+    finished = in_process(
+        kantor, "fleet", "--set", f"samples.file=samples.{kind}", f"targets.file=targets.{kind}",
+        "targets.count=0", "energy.points=750", "energy.steps=750",
+    )  # fmt: skip
+
+    result = result_of(kantor.runs()[0])
+    assert finished.code == 0, finished.err
+    assert result["targets"] == 40
+    assert result["detection_rate"] > 0.8
+
+
+def test_scenarios_are_listed_and_shown(kantor: "Kantor") -> None:
+    """What `show` prints is a scenario that runs."""
+    listed = kantor("scenarios").out
+    shown = kantor("scenarios", "show", "paper-timevarying").out
+    (kantor.folder / "mine.toml").write_text(shown)
+
+    assert listed.splitlines()[0].startswith("fleet ")
+    assert len(listed.splitlines()) == 7
+    assert in_process(kantor, "mine.toml", *SHORT).code == 1

@@ -1,0 +1,104 @@
+"""A participant's end of the radio: what is taken in, what is counted, what is said."""
+
+import pytest
+from kantor_protocol.machine import SUPERVISOR, Envelope, Pose
+from kantor_protocol.messages import News, decode_news, encode
+from kantor_protocol.radio import Radio, patience_steps, replica_of
+from kantor_protocol.weights import Units
+
+from tests.strategies import mission
+
+ROSTER = ("r1", "r2", "r3")
+SOUND = encode(News(version=1, step=1, x_m=0.0, y_m=0.0, have=b"", logs=b"", claims=b""))
+
+
+def heard(*envelopes: Envelope, taken: bool = True) -> tuple[list[int], int]:
+    """Which places in the roster r2 learns from, and how many envelopes it refuses."""
+    radio = Radio("r2", ROSTER)
+    places: list[int] = []
+
+    def learn(source: int, _news: News) -> bool:
+        places.append(source)
+        return taken
+
+    radio.hear(envelopes, learn)
+    return places, radio.refused
+
+
+def test_messages_are_learned_in_order_of_arrival() -> None:
+    """A speaker is known by its place in the roster."""
+    first, second = Envelope("r3", 1, "", SOUND), Envelope("r1", 1, "r2", SOUND)
+
+    assert heard(first, second, first) == ([2, 0, 2], 0)
+
+
+@pytest.mark.parametrize(
+    "envelope",
+    [
+        Envelope("r4", 1, "", SOUND),
+        Envelope("", 1, "", SOUND),
+        Envelope("r2", 1, "", SOUND),
+        Envelope("r1", 1, "", b""),
+        Envelope("r1", 1, "", b"\xff"),
+        Envelope("r1", 1, "", SOUND[:-1]),
+    ],
+)
+def test_unsound_envelopes_are_counted_and_learned_from_nobody(envelope: Envelope) -> None:
+    """A stranger, the robot itself, noise, a cut message."""
+    assert heard(envelope, Envelope("r3", 1, "", SOUND)) == ([2], 1)
+
+
+def test_what_the_replica_refuses_is_counted() -> None:
+    """The door has two leaves: the codec and the replica."""
+    assert heard(Envelope("r1", 1, "", SOUND), taken=False) == ([0], 1)
+
+
+@pytest.mark.parametrize("target", ["", "r3"])
+def test_word_carries_what_the_replica_composes(target: str) -> None:
+    """An envelope is from the speaker, numbered by its step, and holds its place and its state."""
+    scenario = mission()
+    units = Units.of(30, 12)
+    envelope = Radio("r2", scenario.roster).say(
+        replica_of("r2", scenario, units, 12), target, 7, Pose(1.0, 2.0)
+    )
+    have, logs, claims = replica_of("r2", scenario, units, 12).compose()
+
+    assert envelope == Envelope("r2", 7, target, envelope.body)
+    assert decode_news(envelope.body) == News(1, 7, 1.0, 2.0, have, logs, claims)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "merges", "relays", "beacons"),
+    [
+        ("r1", (), "ledger", False, False),
+        ("r1", ("radio.beacon=state", "merge=min"), "min", False, True),
+        (SUPERVISOR, ("coordination=centralized",), "ledger", True, False),
+    ],
+)
+def test_replica_follows_the_mission(
+    name: str, overrides: tuple[str, ...], merges: str, relays: bool, beacons: bool
+) -> None:
+    """Merge rule and beacon are the mission's; only the supervisor forwards at once."""
+    manner = replica_of(name, mission(*overrides), Units.of(30, 12), 12).manner
+
+    assert manner.ledger == (merges == "ledger")
+    assert (manner.relay, manner.beacon) == (relays, beacons)
+    assert manner.value_max == (2 if merges == "ledger" else 5)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "steps"),
+    [
+        ("r1", (), 2),
+        ("r1", ("radio.delay_s=0.05",), 3),
+        ("r1", ("radio.delay_s=0.2", "radio.jitter_s=0.1"), 8),
+        ("r1", ("clock.spread=0.5",), 3),
+        (SUPERVISOR, ("coordination=centralized",), 2),
+        (SUPERVISOR, ("coordination=centralized", "clock.order=turn"), 5),
+    ],
+)
+def test_answer_is_due_after_both_ways_and_the_others_next_step(
+    name: str, overrides: tuple[str, ...], steps: int
+) -> None:
+    """Patience is counted in own steps; the supervisor's are shorter when robots act in turn."""
+    assert patience_steps(name, mission(*overrides)) == steps
