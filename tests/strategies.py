@@ -1,6 +1,5 @@
 """What the tests draw from and stand on: small missions, crowds of points, messages, TOML trees."""
 
-import datetime
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -155,8 +154,7 @@ _CROWDS_AROUND_0 = st.one_of(
 
 @st.composite
 def crowds(draw: st.DrawFn) -> Points:
-    """Points as they come: scattered, on a lattice with duplicates, on a line, all in one place;
-    some of them far from the origin."""
+    """Points scattered, on a lattice with duplicates, on a line, in one place; near 0 or far off."""
     xy_m = np.array(draw(_CROWDS_AROUND_0), dtype=np.float64)
     return xy_m + draw(st.sampled_from([0.0, 0.0, 1e3, -1e8]))
 
@@ -206,13 +204,13 @@ OUTPUTS = st.builds(
 
 # TOML trees.
 
-_WORDS_OF_SCENARIOS = (
-    "name summary coordination merge claims limit_s domain robots energy samples density starts "
-    "targets vehicle clock sensor radio supervisor planner publish metrics min_m max_m count "
-    "random poses_m speed_m_s period_s order spread drift_ppm jitter_s points steps mean_m "
-    "variance_m2 weight file diffusion_m range_m drop delay_s horizon every"
-).split()
-TOML_KEYS = st.sampled_from(_WORDS_OF_SCENARIOS) | st.text(max_size=6)
+_KEYS_OF_SCENARIOS = """
+name summary coordination merge claims limit_s domain robots energy samples density starts
+targets vehicle clock sensor radio supervisor planner publish metrics min_m max_m count
+random poses_m speed_m_s period_s order spread drift_ppm jitter_s points steps mean_m
+variance_m2 weight file diffusion_m range_m drop delay_s horizon every
+"""
+TOML_KEYS = st.sampled_from(_KEYS_OF_SCENARIOS.split()) | st.text(max_size=6)
 _TOML_SCALARS = st.one_of(
     st.booleans(),
     st.integers(-3, 2000),
@@ -227,9 +225,7 @@ _TOML_SCALARS = st.one_of(
 TomlTree = dict[str, Any]
 TOML_VALUES: st.SearchStrategy[Any] = st.recursive(
     _TOML_SCALARS,
-    lambda inner: (
-        st.lists(inner, max_size=4) | st.dictionaries(TOML_KEYS, inner, max_size=4)
-    ),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(TOML_KEYS, inner, max_size=4),
     max_leaves=10,
 )
 TOML_TREES: st.SearchStrategy[TomlTree] = st.dictionaries(TOML_KEYS, TOML_VALUES, max_size=6)
@@ -243,7 +239,9 @@ def paths_of(tree: Any) -> list[tuple[str | int, ...]]:
     elif isinstance(tree, list):
         inside = list(enumerate(tree))
     return [
-        way for key, value in inside for way in [(key,), *((key, *rest) for rest in paths_of(value))]
+        way
+        for key, value in inside
+        for way in [(key,), *((key, *rest) for rest in paths_of(value))]
     ]
 
 
@@ -256,12 +254,3 @@ def planted(tree: Any, path: tuple[str | int, ...], value: Any) -> Any:
     copy = list(tree)
     copy[int(path[0])] = planted(copy[int(path[0])], path[1:], value)
     return copy
-
-
-def toml_literal(value: Any) -> str:
-    """A TOML value as text, written without the code under test."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, datetime.date | datetime.time):
-        return value.isoformat()
-    return repr(value)

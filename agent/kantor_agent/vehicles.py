@@ -140,8 +140,9 @@ class Dubins:
         if distance * distance >= 2.0 * self._radius_m * abs(left) and distance > 0.0:
             turn = _clamped(math.atan2(left, ahead), length / self._radius_m)
         heading = _wrapped(pose.heading_rad + turn)
-        chord = length if turn == 0.0 else 2.0 * (length / turn) * math.sin(turn / 2.0)
-        middle = pose.heading_rad + turn / 2.0
+        half = turn / 2.0
+        chord = length if half == 0.0 else length * (math.sin(half) / half)
+        middle = pose.heading_rad + half
         return Pose(
             pose.x_m + chord * math.cos(middle),
             pose.y_m + chord * math.sin(middle),

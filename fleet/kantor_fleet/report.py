@@ -246,7 +246,7 @@ def _draw_map(place: SubFigure, run: Run) -> None:
     ways = [handle for handle in handles if isinstance(handle, LineCollection)]
     if ways:
         _add_caption(axes, ways, columns=5)
-    _add_legend(place, [handle for handle in handles if handle not in ways], columns=7)
+    _add_legend(place, [handle for handle in handles if handle not in ways])
 
 
 def _draw_domain(axes: Axes, run: Run) -> None:
@@ -368,7 +368,7 @@ def _draw_curves(place: SubFigure, run: Run) -> None:
     mass.set_xlim(0.0, 1.02 * end_s)  # so that what happens at the very end is seen
     moments = _mark_moments((bounds, progress, mass), run)
     if moments:
-        _add_legend(place, moments, columns=2)
+        _add_legend(place, moments)
 
 
 def _draw_bounds(axes: Axes, run: Run, rows: Sequence[Row]) -> None:
@@ -466,11 +466,12 @@ def _add_caption(axes: Axes, handles: Sequence[Artist], columns: int = 3) -> Non
     )
 
 
-def _add_legend(place: SubFigure, handles: Sequence[Artist], columns: int) -> None:
+def _add_legend(place: SubFigure, handles: Sequence[Artist]) -> None:
+    """The legend of a part of the picture, below it, in one row or two."""
     legend = place.legend(
         handles=handles,
         loc="outside lower center",
-        ncols=min(columns, len(handles)),
+        ncols=len(handles) if len(handles) <= 6 else 4,
         frameon=False,
         fontsize=_TEXT_PT,
         handlelength=1.6,
@@ -496,11 +497,10 @@ def team_colours(robots: int) -> list[str]:
     if robots <= len(_TEAM):
         return list(_TEAM[:robots])
     golden = 0.6180339887498949  # its multiples fall evenly, and far from the one before
-    around = 2.0 * np.pi * golden * np.arange(robots)
+    around = golden * np.arange(robots) % 1.0
     # Twilight is pale at 0 and dark at 1/2; keep to its blue and its red side.
-    cycle = colormaps["twilight"]
-    places = np.where(np.cos(around) > 0.0, 0.25, 0.75) + 0.1 * np.sin(around)
-    return [to_hex(colour) for colour in cycle(places)]
+    places = np.where(around < 0.5, 0.12, 0.28) + 0.6 * around
+    return [to_hex(colour) for colour in colormaps["twilight"](places)]
 
 
 def _strokes(way_m: Points) -> list[Points]:

@@ -1,8 +1,8 @@
 """`kantor run`, `scenarios` and `verify` as a user runs them."""
 
 import json
-import signal
 import shutil
+import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from kantor_protocol.clock import clocks
 from kantor_protocol.machine import SUPERVISOR
 from kantor_protocol.scenario import Scenario, ScenarioError
-
-from tests.strategies import examples, mission
+from strategies import examples, mission
 
 PERIOD_NS = 100_000_000
 
@@ -51,7 +50,7 @@ def test_time_rises_with_every_step(
 
 
 def test_concurrent_robots_step_at_the_same_moment() -> None:
-    """order = concurrent: all phases are equal, and there is no supervisor without the word."""
+    """Order `concurrent`: all phases are equal, and there is no supervisor without the word."""
     scenario = mission()
 
     assert timetable(scenario, 1, 2) == [
@@ -76,7 +75,7 @@ def test_supervisor_steps_half_way_between_concurrent_robots() -> None:
 
 
 def test_in_turn_phases_are_spread_over_the_period() -> None:
-    """order = turn: one robot after the other, each once a period."""
+    """Order `turn`: one robot after the other, each once a period."""
     scenario = mission("clock.order=turn")
 
     assert timetable(scenario, 1, 2) == [

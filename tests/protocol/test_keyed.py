@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from kantor_protocol.keyed import Purpose, generator, philox, philox_plain, to_unit, uniform
-
-from tests.strategies import SEEDS, WORDS, examples
+from strategies import SEEDS, WORDS, examples
 
 Words = tuple[int, int, int, int]
 

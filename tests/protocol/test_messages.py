@@ -1,7 +1,7 @@
 """The wire: every message both ways, an independent decoder, and a door that only ever refuses.
 
 The golden bytes pin the format. After a deliberate change of it, run this file as a program
-(`python -m tests.protocol.test_messages`), look at the difference, and paste what it prints.
+(`PYTHONPATH=tests python tests/protocol/test_messages.py`), look at the difference, and paste what it prints.
 """
 
 import msgpack
@@ -22,8 +22,8 @@ from kantor_protocol.messages import (
     PoseMessage,
     Progress,
     Ready,
-    RefusedError,
     Refusal,
+    RefusedError,
     Report,
     Stop,
     Turn,
@@ -36,8 +36,7 @@ from kantor_protocol.messages import (
     decode_to_participant,
     encode,
 )
-
-from tests.strategies import (
+from strategies import (
     COUNTS,
     FINITE,
     INPUTS,
@@ -99,7 +98,13 @@ PROGRESS = st.builds(
 )
 
 GOLDEN_NEWS = News(
-    version=1, step=7, x_m=1.5, y_m=-2.0, have=b"\x03\x00", logs=b"\x00\x02\x01\x01\x06\x02", claims=b""
+    version=1,
+    step=7,
+    x_m=1.5,
+    y_m=-2.0,
+    have=b"\x03\x00",
+    logs=b"\x00\x02\x01\x01\x06\x02",
+    claims=b"",
 )
 GOLDEN_NEWS_BYTES = bytes.fromhex(
     "98010107cb3ff8000000000000cbc000000000000000c4020300c406000201010602c400"
@@ -372,7 +377,9 @@ def test_deep_nesting_is_refused(level: bytes) -> None:
         decode_news(further)
 
 
-@pytest.mark.parametrize("head", [b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff"])
+@pytest.mark.parametrize(
+    "head", [b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff"]
+)
 def test_length_that_does_not_follow_is_refused(head: bytes) -> None:
     """An array, a map or bytes of four thousand million items that are not there take no room."""
     for decode in DOORS:

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from kantor_protocol.packing import MALFORMED, Pairs, put_int, put_uint, take_int, take_uint
-
-from tests.strategies import COUNTS, examples
+from strategies import COUNTS, examples
 
 BOUND = 5000
 SIGNED = st.integers(-(2**62), 2**62 - 1)

@@ -5,8 +5,7 @@ from kantor_protocol.machine import SUPERVISOR, Envelope, Pose
 from kantor_protocol.messages import News, decode_news, encode
 from kantor_protocol.radio import Radio, patience_steps, replica_of
 from kantor_protocol.weights import Units
-
-from tests.strategies import mission
+from strategies import mission
 
 ROSTER = ("r1", "r2", "r3")
 SOUND = encode(News(version=1, step=1, x_m=0.0, y_m=0.0, have=b"", logs=b"", claims=b""))
@@ -76,7 +75,7 @@ def test_word_carries_what_the_replica_composes(target: str) -> None:
     ],
 )
 def test_replica_follows_the_mission(
-    name: str, overrides: tuple[str, ...], merges: str, relays: bool, beacons: bool
+    *, name: str, overrides: tuple[str, ...], merges: str, relays: bool, beacons: bool
 ) -> None:
     """Merge rule and beacon are the mission's; only the supervisor forwards at once."""
     manner = replica_of(name, mission(*overrides), Units.of(30, 12), 12).manner

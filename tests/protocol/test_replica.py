@@ -6,6 +6,7 @@ nothing with the kernels. Its reference for weights is a plain sum, or a plain m
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kantor_protocol.replica import NOBODY, Replica, spend
 from kantor_protocol.weights import Units
-
-from tests.strategies import examples
+from strategies import examples
 
 N = 6
 UNITS = Units.of(8, N)
@@ -188,7 +188,7 @@ class Air:
 @MODES
 @examples(60)
 @given(bought=TEAM_PURCHASES)
-def test_merge_is_idempotent(ledger: bool, bought: tuple[Purchases, ...]) -> None:
+def test_merge_is_idempotent(*, ledger: bool, bought: tuple[Purchases, ...]) -> None:
     """Hearing the same thing twice is hearing it once."""
     a, b, _ = team(bought, ledger=ledger)
     once = knowledge(join(a, b))
@@ -200,7 +200,7 @@ def test_merge_is_idempotent(ledger: bool, bought: tuple[Purchases, ...]) -> Non
 @MODES
 @examples(60)
 @given(bought=TEAM_PURCHASES)
-def test_merge_is_commutative(ledger: bool, bought: tuple[Purchases, ...]) -> None:
+def test_merge_is_commutative(*, ledger: bool, bought: tuple[Purchases, ...]) -> None:
     """The order in which a robot hears the others does not matter."""
     a, b, c = team(bought, ledger=ledger)
     forth = knowledge(join(replica(0, 3, ledger=ledger), b, c))
@@ -213,7 +213,7 @@ def test_merge_is_commutative(ledger: bool, bought: tuple[Purchases, ...]) -> No
 @MODES
 @examples(60)
 @given(bought=TEAM_PURCHASES)
-def test_merge_is_associative(ledger: bool, bought: tuple[Purchases, ...]) -> None:
+def test_merge_is_associative(*, ledger: bool, bought: tuple[Purchases, ...]) -> None:
     """Hearing B, then C, is hearing B who has heard C: news may travel over others."""
     a, b, c = team(bought, ledger=ledger)
     direct = knowledge(join(a, b, c))
@@ -225,13 +225,15 @@ def test_merge_is_associative(ledger: bool, bought: tuple[Purchases, ...]) -> No
 @MODES
 @examples(60)
 @given(bought=TEAM_PURCHASES)
-def test_merge_never_raises_a_weight(ledger: bool, bought: tuple[Purchases, ...]) -> None:
+def test_merge_never_raises_a_weight(*, ledger: bool, bought: tuple[Purchases, ...]) -> None:
     """Weights only ever fall, and come to the truth when all is heard."""
     a, b, c = team(bought, ledger=ledger)
     expected = truth([a, b, c])
     seen = [vector(a), vector(join(a, b)), vector(join(a, c))]
 
-    assert all(x >= y for before, after in zip(seen, seen[1:], strict=False) for x, y in zip(before, after, strict=True))
+    assert all(
+        x >= y for before, after in pairwise(seen) for x, y in zip(before, after, strict=True)
+    )
     assert seen[-1] == expected
 
 
@@ -252,7 +254,7 @@ def test_both_rules_agree_when_no_sample_was_bought_twice(bought: tuple[Purchase
 
 
 @pytest.mark.parametrize(("ledger", "left"), [(True, 0), (False, 2)])
-def test_spending_of_two_on_one_sample(ledger: bool, left: int) -> None:
+def test_spending_of_two_on_one_sample(*, ledger: bool, left: int) -> None:
     """The ledger counts both; the minimum, as printed (eq. 8-10), counts one."""
     a, b = team([[(3, 2)], [(3, 2)]], ledger=ledger)
 
@@ -271,7 +273,7 @@ def test_overspent_sample_stops_at_zero() -> None:
 
 
 @MODES
-def test_suffix_that_leaves_a_gap_waits(ledger: bool) -> None:
+def test_suffix_that_leaves_a_gap_waits(*, ledger: bool) -> None:
     """A log is held as a prefix: what lies beyond a gap is not acknowledged."""
     held = replica(0, 2, ledger=ledger)
     message = (have(2), suffix(1, 2, [(0, 1)]), b"")
@@ -310,7 +312,7 @@ def test_minimum_is_not_forwarded_for_others() -> None:
 
 
 @MODES
-def test_message_to_one_participant_needs_no_answer_first(ledger: bool) -> None:
+def test_message_to_one_participant_needs_no_answer_first(*, ledger: bool) -> None:
     """A robot that reports to the supervisor sends new entries before it has ever heard it."""
     robot, supervisor = (replica(i, 2, ledger=ledger, relay=i == 1) for i in range(2))
     buy(robot, [(0, 1), (1, 2)])
@@ -322,10 +324,11 @@ def test_message_to_one_participant_needs_no_answer_first(ledger: bool) -> None:
 @MODES
 @pytest.mark.parametrize(("beacon", "informed"), [(True, True), (False, False)])
 def test_beacon_of_state_informs_with_one_message(
-    ledger: bool, beacon: bool, informed: bool
+    *, ledger: bool, beacon: bool, informed: bool
 ) -> None:
-    """beacon = state: whoever comes into range knows at once (Algorithm 3, line 5); with versions
-    it takes an answer."""
+    """Beacon `state`: whoever comes into range knows at once (Algorithm 3, line 5); with versions
+    it takes an answer.
+    """
     lonely, passing = (replica(i, 2, ledger=ledger, beacon=beacon) for i in range(2))
     for _ in range(20):
         buy(lonely, [(0, 1)])
@@ -339,7 +342,7 @@ def test_beacon_of_state_informs_with_one_message(
 
 
 @pytest.mark.parametrize(("relay", "waits"), [(True, 0), (False, 2)])
-def test_relay_forwards_at_once_and_a_robot_after_its_patience(relay: bool, waits: int) -> None:
+def test_relay_forwards_at_once_and_a_robot_after_its_patience(*, relay: bool, waits: int) -> None:
     """A robot's neighbours most likely heard the news themselves; a supervisor's never do."""
     middle = replica(1, 3, ledger=True, relay=relay, patience=2)
     author, reader = replica(0, 3, ledger=True), replica(2, 3, ledger=True)
@@ -374,10 +377,11 @@ def test_what_is_acknowledged_is_not_sent_again() -> None:
 @examples(40)
 @given(bought=st.tuples(PURCHASES, PURCHASES, PURCHASES, PURCHASES), patience=st.integers(1, 4))
 def test_news_travels_along_a_chain(
-    ledger: bool, bought: tuple[Purchases, ...], patience: int
+    *, ledger: bool, bought: tuple[Purchases, ...], patience: int
 ) -> None:
     """Four robots in a row, only neighbours hear each other: everybody comes to the same truth, in
-    a few rounds a hop."""
+    a few rounds a hop.
+    """
     made = [replica(i, 4, ledger=ledger, patience=patience) for i in range(4)]
     for held, purchases in zip(made, bought, strict=True):
         buy(held, purchases)
@@ -388,9 +392,13 @@ def test_news_travels_along_a_chain(
 @MODES
 @examples(40)
 @given(
-    bought=TEAM_PURCHASES, later=TEAM_PURCHASES, silence=st.integers(0, 40), patience=st.integers(1, 4)
+    bought=TEAM_PURCHASES,
+    later=TEAM_PURCHASES,
+    silence=st.integers(0, 40),
+    patience=st.integers(1, 4),
 )
 def test_team_that_was_apart_agrees_when_it_meets(
+    *,
     ledger: bool,
     bought: tuple[Purchases, ...],
     later: tuple[Purchases, ...],
@@ -411,7 +419,7 @@ def test_team_that_was_apart_agrees_when_it_meets(
 
 
 @MODES
-def test_long_log_is_sent_in_parts_and_converges(ledger: bool) -> None:
+def test_long_log_is_sent_in_parts_and_converges(*, ledger: bool) -> None:
     """A message holds 4096 entries at most; the rest follows."""
     samples = 6000
     units = Units.of(2 * samples, samples)
@@ -442,7 +450,7 @@ def test_log_outgrows_its_first_room() -> None:
 
 
 @MODES
-def test_what_fell_in_a_step_is_told_once(ledger: bool) -> None:
+def test_what_fell_in_a_step_is_told_once(*, ledger: bool) -> None:
     """`lowered` names each sample once, whether it fell by spending or by news, until the step ends."""
     a, b = team([[(0, 1), (0, 1), (2, 1)], [(2, 2), (5, 1)]], ledger=ledger)
     join(a, b)
@@ -478,7 +486,7 @@ def meeting(*, ledger: bool, claims: bool) -> tuple[Replica, Message]:
 @examples(150)
 @given(data=st.data())
 def test_malformed_message_changes_nothing_at_all(
-    ledger: bool, claims: bool, data: st.DataObject
+    *, ledger: bool, claims: bool, data: st.DataObject
 ) -> None:
     """A message is checked whole before any of it is applied; any bytes are survived."""
     held, sound = meeting(ledger=ledger, claims=claims)
@@ -498,7 +506,7 @@ def test_malformed_message_changes_nothing_at_all(
 @examples(150)
 @given(part=st.integers(0, 2), at=st.integers(0, 100), byte=st.integers(0, 255))
 def test_damaged_message_is_taken_whole_or_not_at_all(
-    ledger: bool, claims: bool, part: int, at: int, byte: int
+    *, ledger: bool, claims: bool, part: int, at: int, byte: int
 ) -> None:
     """One byte changed: if the message is refused, no other part of it was applied."""
     held, sound = meeting(ledger=ledger, claims=claims)
@@ -512,7 +520,7 @@ def test_damaged_message_is_taken_whole_or_not_at_all(
 
 @pytest.mark.parametrize("part", [0, 1, 2])
 @MODES
-def test_cut_message_changes_nothing_at_all(ledger: bool, part: int) -> None:
+def test_cut_message_changes_nothing_at_all(*, ledger: bool, part: int) -> None:
     """The last byte of any part is missing: the whole message is refused."""
     held, sound = meeting(ledger=ledger, claims=True)
     parts = [content[:-1] if i == part else content for i, content in enumerate(sound)]
@@ -537,7 +545,7 @@ MALFORMED_LOGS = {
 
 @pytest.mark.parametrize("name", MALFORMED_LOGS)
 @MODES
-def test_malformed_suffix_is_refused(ledger: bool, name: str) -> None:
+def test_malformed_suffix_is_refused(*, ledger: bool, name: str) -> None:
     """Every number in a suffix is checked against what can be."""
     held = replica(0, 3, ledger=ledger)
     before = snapshot(held)
@@ -576,7 +584,7 @@ def test_version_vector_of_another_length_is_refused(content: bytes) -> None:
 
 
 @MODES
-def test_malformed_message_takes_no_room(ledger: bool) -> None:
+def test_malformed_message_takes_no_room(*, ledger: bool) -> None:
     """A long refused message leaves no more behind than a short one."""
     held = replica(0, 3, ledger=ledger)
     before = snapshot(held)
@@ -675,7 +683,7 @@ def test_claim_reaches_the_neighbour_s_neighbour() -> None:
 
 
 def test_without_claims_nothing_is_taken() -> None:
-    """claims = false: the paper's robots do not tell where they head."""
+    """Without claims: the paper's robots do not tell where they head."""
     a, b = (replica(i, 2, ledger=True, claims=False) for i in range(2))
     b.claim(3, 100)
     a.learn(1, *b.compose())
@@ -688,7 +696,7 @@ def test_without_claims_nothing_is_taken() -> None:
 
 
 @MODES
-def test_compact_words_are_what_the_protocol_says(ledger: bool) -> None:
+def test_compact_words_are_what_the_protocol_says(*, ledger: bool) -> None:
     """have, logs and claims, byte by byte; the minimum leaves out entries that a newer one covers."""
     held = replica(0, 2, ledger=ledger, beacon=True)
     buy(held, [(3, 1), (5, 2), (3, 1)])

@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kantor_protocol.keyed import Purpose, philox_plain
 from kantor_protocol.walk import Walk
-
-from tests.strategies import SEEDS, examples, scattered
+from strategies import SEEDS, examples, scattered
 
 PERIOD_NS = 100_000_000
 DIFFUSIONS_M = st.floats(1e-3, 1e3)
@@ -80,7 +79,7 @@ def test_points_move_once_a_period_and_say_so() -> None:
 
 
 def test_without_diffusion_points_stand() -> None:
-    """v = 0: time-invariant."""
+    """Time-invariant: v = 0."""
     points = walk(0.0, 1)
 
     assert not points.advance(1000 * PERIOD_NS)

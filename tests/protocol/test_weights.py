@@ -10,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kantor_protocol.packing import Pairs
 from kantor_protocol.weights import Units, Weights, WeightsPublisher, WeightsSubscriber
-
-from tests.strategies import examples
+from strategies import examples
 
 Fall = tuple[int, int]
 """(sample, units) by which it falls."""
 
-STEPS = st.lists(st.lists(st.tuples(st.integers(0, 9), st.integers(1, 400)), max_size=4), max_size=60)
+STEPS = st.lists(
+    st.lists(st.tuples(st.integers(0, 9), st.integers(1, 400)), max_size=4), max_size=60
+)
 
 
 def publish(

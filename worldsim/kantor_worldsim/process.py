@@ -109,12 +109,14 @@ class _Doorway:
         self._samples = Array.of(plan.site.samples_m)
 
     def gather(self) -> None:
-        """Wait for the whole roster, as long as the plan's patience lasts."""
+        """Wait for the whole roster, as long as the plan's patience lasts, and for one robot."""
         roster = set(self._plan.scenario.roster)
+        robots = set(self._plan.scenario.robot_ids)
         patience_s = self._plan.patience_s
         give_up = None if patience_s is None else time.monotonic() + patience_s
         while set(self.ready) != roster and not self.stopped():
-            if give_up is not None and time.monotonic() >= give_up:
+            late = give_up is not None and time.monotonic() >= give_up
+            if late and robots & set(self.ready):
                 break
             self.next(_PROGRESS_S)
             missing = sorted(roster - set(self.ready), key=self._plan.scenario.roster.index)

@@ -1,0 +1,172 @@
+"""The radio cannot be gone around: real Zenoh clients that try, beside a legitimate run."""
+
+import json
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from queue import SimpleQueue
+from typing import TYPE_CHECKING
+
+import msgpack
+import pytest
+import zenoh
+from kantor_protocol.bus import free_endpoint
+
+if TYPE_CHECKING:
+    from conftest import Kantor
+
+ROOT = "kantor/v1/kantor"
+
+
+@contextmanager
+def client(endpoint: str, user: str | None, password: str = "") -> Iterator[zenoh.Session]:
+    """A plain Zenoh client, with or without an identity."""
+    config = zenoh.Config()
+    settings = {
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": 1000,
+        "scouting/multicast/enabled": False,
+    }
+    if user is not None:
+        settings["transport/auth/usrpwd"] = {"user": user, "password": password}
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    session = zenoh.open(config)
+    try:
+        yield session
+    finally:
+        session.close()
+
+
+def password_of(folder: Path, user: str) -> str:
+    """What world-sim wrote for a user."""
+    tree = tomllib.loads((folder / "credentials" / f"{user}.toml").read_text())
+    return str(tree["password"])
+
+
+def hear(session: zenoh.Session, *keys: str) -> "SimpleQueue[tuple[str, bytes]]":
+    """Everything that arrives on some keys."""
+    heard: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
+    for key in keys:
+        session.declare_subscriber(
+            key, lambda sample: heard.put((str(sample.key_expr), sample.payload.to_bytes()))
+        )
+    return heard
+
+
+def drained(heard: "SimpleQueue[tuple[str, bytes]]") -> list[tuple[str, bytes]]:
+    """What has arrived so far."""
+    return [heard.get() for _ in range(heard.qsize())]
+
+
+def malformed() -> list[bytes]:
+    """What a hostile or broken robot may put on its own tx; every one must be counted and dropped."""
+    nan_pose = [1, [float("nan"), 0.0, 0.0, 0.0], None, b"", b"", b"", [], 0, 0, 0]
+    sound_pose = [1, [0.0, 0.0, 0.0, 0.0], None, b"", b"", b"", [], 0, 0, 0]
+    return [
+        b"",
+        b"\xc1",
+        b"not msgpack at all",
+        msgpack.packb([6, 0, "nonce", sound_pose]),  # an old version
+        msgpack.packb([6, 2, "nonce", sound_pose]),  # a version to come
+        msgpack.packb([6, 1, "nonce", nan_pose]),
+        msgpack.packb([6, 1, "nonce", sound_pose]),  # sound, but from no process that plays r2
+        msgpack.packb([99, 1]),
+        b"\x91" * 100_000,  # nested too deep
+        msgpack.packb([6, 1, "nonce", [1, [0.0] * 4, None, bytes(3_000_000)]]),
+    ]
+
+
+def test_nobody_reads_or_writes_past_the_radio(kantor: "Kantor") -> None:
+    """A stranger, and a robot that misbehaves, beside a legitimate run.
+
+    Neither reads another robot's traffic, neither can publish as another, what is malformed is counted
+    and dropped, and the run is the one that it is without them.
+    """
+    alone = kantor("run", "paper-decentralized", "--seed", 3, "--exchange", "in-process")
+    assert alone.code == 0
+    endpoint = free_endpoint()
+    world = kantor.start(
+        "worldsim",
+        "paper-decentralized",
+        "--seed",
+        3,
+        "--exchange",
+        "lockstep",
+        "--listen",
+        endpoint,
+    )
+    assert world.stdout is not None
+    assert any(line.startswith("t=") for line in world.stdout)
+    r2 = password_of(kantor.folder, "r2")
+
+    for user, password in ((None, ""), ("r1", "guess"), ("r7", r2)):
+        with pytest.raises(zenoh.ZError), client(endpoint, user, password):
+            pass  # pragma: no cover
+
+    observer_password = password_of(kantor.folder, "observer")
+    with (
+        client(endpoint, "observer", observer_password) as observer,
+        client(endpoint, "observer", observer_password) as scribe,
+        client(endpoint, "r2", r2) as rogue,
+        client(endpoint, "r2", r2) as eavesdropper,  # apart, since a session hears its own puts
+    ):
+        seen = hear(observer, f"{ROOT}/**")
+        stolen = hear(
+            eavesdropper,
+            "**",
+            f"{ROOT}/**",
+            f"{ROOT}/r1/**",
+            f"{ROOT}/r1/rx",
+            f"{ROOT}/r1/tx",
+            f"{ROOT}/*/pose",
+        )
+        token = rogue.liveliness().declare_token(f"{ROOT}/r1/alive/forged")
+        robots = [kantor.start("agent", name, "--connect", endpoint) for name in ("r1", "r2")]
+        for payload in malformed():
+            for key in ("r1/tx", "r1/rx", "r1/pose", "r1/weights", "r2/rx", "world/progress"):
+                rogue.put(f"{ROOT}/{key}", b"forged" + payload[:100])
+            rogue.put(f"{ROOT}/r2/tx", payload, congestion_control=zenoh.CongestionControl.BLOCK)
+        scribe.put(f"{ROOT}/r1/tx", b"forged by an observer")
+        for robot in robots:
+            assert robot.wait(timeout=100) == 0
+        out, err = world.communicate(timeout=60)
+        traffic = drained(seen)
+        token.undeclare()
+
+        assert world.returncode == 0, out + err
+        kinds = {key.removeprefix(f"{ROOT}/") for key, _ in traffic}
+        assert {"r1/tx", "r1/rx", "r1/pose", "r1/weights", "r2/tx", "world/progress"} <= kinds
+        assert not [key for key, payload in traffic if payload.startswith(b"forged")]
+        assert drained(stolen) == []
+
+    first, second = (json.loads((run / "result.json").read_text()) for run in kantor.runs())
+    assert first["digest"] == second["digest"]
+    assert second["messages_refused"] == len(malformed())
+    assert second["violations"] == 0
+
+
+def test_an_oversized_message_does_not_reach_world_sim(kantor: "Kantor") -> None:
+    """The router drops what is larger than any message may be; the mission goes on."""
+    endpoint = free_endpoint()
+    world = kantor.start(
+        "worldsim", "paper-single", "--exchange", "lockstep", "--listen", endpoint,
+        "--set", "limit_s=20", "energy.points=150",
+    )  # fmt: skip
+    assert world.stdout is not None
+    assert any(line.startswith("t=") for line in world.stdout)
+    with client(endpoint, "r1", password_of(kantor.folder, "r1")) as rogue:
+        rogue.put(
+            f"{ROOT}/r1/tx", bytes(8_000_000), congestion_control=zenoh.CongestionControl.BLOCK
+        )
+        rogue.put(f"{ROOT}/r1/tx", b"small", congestion_control=zenoh.CongestionControl.BLOCK)
+        robot = kantor.start("agent", "r1", "--connect", endpoint)
+        out, err = world.communicate(timeout=60)
+
+    assert world.returncode == 0, out + err
+    assert robot.wait(timeout=30) == 0
+    result = json.loads((kantor.runs()[0] / "result.json").read_text())
+    assert result["messages_refused"] == 1
+    assert result["energy_spent"] == 150

@@ -1,0 +1,286 @@
+"""Real processes on the real bus: the three exchanges, and what happens to a fleet."""
+
+import json
+import os
+import signal
+import statistics
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import psutil
+import pytest
+from kantor_fleet.catalog import find
+from kantor_fleet.team import team
+from kantor_protocol.scenario import Scenario
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.metrics import Metrics
+from kantor_worldsim.stage import Stage
+from kantor_worldsim.world import Site
+
+if TYPE_CHECKING:
+    import subprocess
+
+    from conftest import Kantor
+
+LOSSY = (
+    "--set", "radio.drop=0.1", "radio.duplicate=0.1", "radio.delay_s=0.03", "radio.jitter_s=0.2",
+    "radio.reorder=0.1", "merge='ledger'", "claims=true",
+)  # fmt: skip
+
+
+def result_of(folder: Path) -> dict[str, object]:
+    """result.json of a run folder."""
+    tree = json.loads((folder / "result.json").read_text())
+    assert isinstance(tree, dict)
+    return tree
+
+
+def detection(scenario: Scenario, seed: int) -> float:
+    """The detection rate in virtual time."""
+    site, metrics = Site.of(scenario, seed), Metrics()
+    stage = Stage(scenario, seed, site, [metrics.take])
+    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    return len(metrics.finds) / len(site.targets_m)
+
+
+def await_line(process: "subprocess.Popen[str]", start: str) -> str:
+    """The first line of output that starts so; fails when the output ends before."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.startswith(start):
+            return line
+    raise AssertionError(f"no line starts with {start!r}")
+
+
+def children_named(process: "subprocess.Popen[str]", log: Path) -> int:
+    """The process id that a participant's log tells."""
+    return int(json.loads(log.read_text().splitlines()[0])["pid"])
+
+
+def test_same_seed_same_digest_in_process_and_over_the_bus(kantor: "Kantor") -> None:
+    """Five robots and the supervisor, the full run, 10 % drops, 10 % duplicates and delays; twice each
+    way, under different hash seeds; verify confirms every one.
+    """
+    for exchange in ("in-process", "lockstep"):
+        for hash_seed in ("0", "123"):
+            finished = kantor(
+                "run", "paper-centralized-concurrent", "--seed", 5, "--exchange", exchange, *LOSSY,
+                PYTHONHASHSEED=hash_seed,
+            )  # fmt: skip
+            assert finished.code == 0, finished.err
+
+    runs = kantor.runs()
+    results = [result_of(folder) for folder in runs]
+    assert len(runs) == 4
+    assert len({result["digest"] for result in results}) == 1
+    assert [result["exchange"] for result in results].count("lockstep") == 2
+    assert all(result["drops"] > 500 for result in results)
+    finished = kantor("verify", runs[-1])
+    assert finished.code == 0
+    assert "every byte the same" in finished.out
+
+
+def test_a_wall_run_finds_what_virtual_time_finds(kantor: "Kantor") -> None:
+    """Robots with different periods, drift and jitter, each on its own timer: detection within five
+    points of virtual time (median of seven seeds), every rule held, and each robot replays from its
+    recorded inbox.
+    """
+    clocks = ("clock.spread=0.1", "clock.drift_ppm=1000", "clock.jitter_s=0.01")
+    virtual = statistics.median(detection(find("fleet", clocks), seed) for seed in range(7))
+    wall = kantor("run", "fleet", "--exchange", "wall", "--speed", 8, "--set", *clocks)
+    assert wall.code == 0, wall.out + wall.err
+
+    (folder,) = kantor.runs()
+    assert abs(virtual - result_of(folder)["detection_rate"]) <= 0.05
+    finished = kantor("verify", folder)
+    assert finished.code == 0, finished.out
+    assert "replayed" in finished.out
+
+
+@pytest.mark.parametrize("exchange", ["lockstep", "wall"])
+def test_a_killed_robot_does_not_stop_the_others(kantor: "Kantor", exchange: str) -> None:
+    """SIGKILL to r3 in the middle: the others finish, the record says who was missing, exit code 3."""
+    process = kantor.start("run", "fleet", "--exchange", exchange, "--speed", 8)
+    await_line(process, "t=")
+    (folder,) = kantor.runs()
+    os.kill(children_named(process, folder / "logs" / "r3.log"), signal.SIGKILL)
+    out, err = process.communicate(timeout=100)
+
+    result = result_of(folder)
+    assert process.returncode == 3, out + err
+    assert "r3 ended with signal 9; the others go on" in out
+    assert (result["ended"], result["violations"]) == ("done", 0)
+    assert result["mass_left"] < 0.05
+    assert kantor("verify", folder).code == 0
+
+
+def test_ctrl_c_ends_every_process_and_leaves_a_valid_record(kantor: "Kantor") -> None:
+    """SIGINT to the whole group, as a terminal sends it."""
+    process = kantor.start("run", "fleet", "--exchange", "wall", "--speed", 2)
+    await_line(process, "t=")
+    family = psutil.Process(process.pid).children(recursive=True)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+
+    (folder,) = kantor.runs()
+    assert process.returncode == 130, out + err
+    assert len(family) >= 6
+    assert not [child for child in family if child.is_running() and child.status() != "zombie"]
+    assert result_of(folder)["ended"] == "interrupted"
+    assert (folder / "report.png").exists()
+    assert kantor("verify", folder).code == 0
+
+
+def test_robots_start_by_hand_in_any_order(kantor: "Kantor") -> None:
+    """r2 before world-sim, the supervisor and r1 after it; each needs an endpoint, an id and
+    credentials, and gets the mission from world-sim.
+    """
+    from kantor_protocol.bus import free_endpoint
+
+    endpoint = free_endpoint()
+    connect = ("--connect", endpoint)
+    early = kantor.start("agent", "r2", *connect)
+    world = kantor.start(
+        "worldsim", "paper-timevarying", "--listen", endpoint, "--exchange", "lockstep",
+        "--set", "limit_s=20", "energy.points=200",
+    )  # fmt: skip
+    await_line(world, "t=")
+    others = [kantor.start("supervisor", *connect), kantor.start("agent", "r1", *connect)]
+
+    out, err = world.communicate(timeout=100)
+    assert world.returncode == 0, out + err
+    for participant in (early, *others):
+        told, complaint = participant.communicate(timeout=30)
+        assert participant.returncode == 0, complaint
+        assert told.splitlines()[-1].endswith("mission over: done")
+    assert result_of(kantor.runs()[0])["energy_spent"] == 200
+
+
+def test_a_robot_may_come_late(kantor: "Kantor") -> None:
+    """World-sim starts without r5 when its patience ends; r5 joins in and works."""
+    from kantor_protocol.bus import free_endpoint
+
+    endpoint = free_endpoint()
+    world = kantor.start(
+        "worldsim", "fleet", "--listen", endpoint, "--speed", 5, "--start-after", 3,
+        "--set", "limit_s=60",
+    )  # fmt: skip
+    await_line(world, "t=")
+    robots = [kantor.start("agent", f"r{i}", "--connect", endpoint) for i in range(1, 5)]
+    while "waiting" in (line := await_line(world, "t=")) or "energy 0/" in line:
+        pass
+    robots.append(kantor.start("agent", "r5", "--connect", endpoint))
+    out, err = world.communicate(timeout=100)
+
+    for robot in robots:
+        assert robot.wait(timeout=30) == 0
+    assert "all rules held" in out, out + err
+    from kantor_worldsim.journal import read
+    from kantor_worldsim.records import Batch
+
+    (folder,) = kantor.runs()
+    acts = [
+        act
+        for _, record in read(folder / "run.mcap")
+        if isinstance(record, Batch)
+        for act in record.acts
+    ]
+    first = {name: min(act.now_ns for act in acts if act.name == name) for name in ("r1", "r5")}
+    assert first["r5"] > first["r1"] + 1_000_000_000
+
+
+def test_ids_and_credentials_are_checked(kantor: "Kantor") -> None:
+    """A doubled id, an unknown id, another's credentials, wrong credentials: one line each."""
+    from kantor_protocol.bus import free_endpoint
+
+    endpoint = free_endpoint()
+    world = kantor.start("worldsim", "paper-single", "--listen", endpoint, "--start-after", "60")
+    await_line(world, "t=")
+    connect = ("--connect", endpoint)
+    robot = kantor.start("agent", "r1", *connect)
+    await_line(robot, "r1: mission paper-single")
+    stolen = kantor.folder / "stolen.toml"
+    text = (kantor.folder / "credentials" / "r1.toml").read_text()
+    stolen.write_text(text.replace("password = ", 'password = "x" #'))
+
+    doubled = kantor("agent", "r1", *connect)
+    unknown = kantor("agent", "r9", *connect)
+    others = kantor("agent", "r2", *connect, "--credentials", "credentials/r1.toml")
+    wrong = kantor("agent", "r1", *connect, "--credentials", stolen)
+
+    assert (doubled.code, doubled.err) == (
+        2,
+        "kantor: r1: is on the bus already; stop the other process or choose another id\n",
+    )
+    assert unknown.code == 2
+    assert "no credentials for r9; known here: observer, r1, worldsim" in unknown.err
+    assert (others.code, others.err) == (
+        2,
+        "kantor: credentials/r1.toml: credentials of r1, not of r2\n",
+    )
+    assert wrong.code == 4
+    assert "refuses r1; its credentials are not this world-sim's" in wrong.err
+    assert (kantor.folder / "credentials" / "r1.toml").stat().st_mode & 0o077 == 0
+    world.send_signal(signal.SIGINT)
+    assert world.wait(timeout=30) == 130
+
+
+def test_tap_prints_the_bus_decoded(kantor: "Kantor") -> None:
+    """Poses, weights and radio, as plain msgpack says."""
+    from kantor_protocol.bus import free_endpoint
+
+    endpoint = free_endpoint()
+    world = kantor.start("worldsim", "paper-single", "--listen", endpoint, "--set", "limit_s=40")
+    await_line(world, "t=")
+    robot = kantor.start("agent", "r1", "--connect", endpoint)
+    await_line(robot, "r1: mission")
+    tapped = kantor("tap", "--connect", endpoint, "--only", "pose", "--count", 3)
+
+    assert tapped.code == 0, tapped.err
+    assert len(tapped.out.splitlines()) == 3
+    assert all("r1" in line and "[21, 1, " in line for line in tapped.out.splitlines())
+    world.send_signal(signal.SIGTERM)
+    assert world.wait(timeout=30) == 143
+    assert robot.wait(timeout=30) == 0
+
+
+def test_a_second_world_sim_on_the_port_is_refused(kantor: "Kantor") -> None:
+    """Exit code 4 and a line that says what to do; no run folder is left."""
+    from kantor_protocol.bus import free_endpoint
+
+    endpoint = free_endpoint()
+    first = kantor.start("worldsim", "paper-single", "--listen", endpoint)
+    await_line(first, "t=")
+    second = kantor("worldsim", "paper-single", "--listen", endpoint, "--out", "second")
+
+    assert second.code == 4
+    assert f"cannot listen on {endpoint}" in second.err
+    assert not (kantor.folder / "second").exists()
+    first.send_signal(signal.SIGINT)
+    assert first.wait(timeout=30) == 130
+
+
+def test_a_robot_process_imports_only_what_it_uses(kantor: "Kantor") -> None:
+    """Its entry pulls in no plotting, no statistics, no world, no recorder."""
+    import subprocess
+    import sys
+
+    script = (
+        "import sys; from kantor_fleet.__main__ import main; "
+        "import kantor_agent.process, kantor_fleet.by_hand; print('\\n'.join(sys.modules))"
+    )
+    modules = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    ).stdout.split()
+    unwanted = ("matplotlib", "mcap", "kantor_worldsim", "PIL", "pytest", "msgpack")
+
+    assert [module for module in modules if module.partition(".")[0] in unwanted] == []
+    assert not {"scipy.stats", "scipy.spatial", "scipy.optimize", "scipy.linalg"} & set(modules)
+
+
+def test_ends_within_a_minute(kantor: "Kantor") -> None:
+    """A default run of five processes takes seconds."""
+    started = time.monotonic()
+    assert kantor("run").code == 0
+    assert time.monotonic() - started < 60.0
