@@ -229,7 +229,9 @@ def _print_table(lines: Sequence[Line], seeds: int) -> None:
     widths = [max(len(row[i]) for row in (head, *rows)) for i in range(len(head))]
     print(f"{seeds} seeds; ours: median [Q1, Q3], or mean ± 95 % of paired differences\n")
     for row in (head, tuple("-" * width for width in widths), *rows):
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+        print(
+            "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        )
 
 
 def main() -> int:

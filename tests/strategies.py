@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from hypothesis import settings
 from hypothesis import strategies as st
+
 from kantor_agent.core import Agent
 from kantor_protocol.keyed import Purpose, generator
 from kantor_protocol.machine import (

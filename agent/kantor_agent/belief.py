@@ -4,14 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
+
+from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
 from kantor_protocol.messages import News
 from kantor_protocol.packing import Pairs
 from kantor_protocol.replica import Manner, Replica, Store, spend
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, Weights
-from numba import njit
-
-from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
 
 _NO_SKIP = np.zeros(0, dtype=np.int64)
 

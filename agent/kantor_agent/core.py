@@ -2,6 +2,10 @@
 
 import numpy as np
 import numpy.typing as npt
+
+from kantor_agent.belief import Belief
+from kantor_agent.planners import PLANNERS, Goal
+from kantor_agent.vehicles import VEHICLES
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import (
     EVERYBODY,
@@ -18,10 +22,6 @@ from kantor_protocol.replica import NOBODY
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, WeightsPublisher
-
-from kantor_agent.belief import Belief
-from kantor_agent.planners import PLANNERS, Goal
-from kantor_agent.vehicles import VEHICLES
 
 
 class Agent:

@@ -2,11 +2,10 @@
 
 from collections.abc import Callable
 
+from kantor_agent.core import Agent
 from kantor_protocol.credentials import Identity
 from kantor_protocol.messages import Mission
 from kantor_protocol.process import participate
-
-from kantor_agent.core import Agent
 
 
 def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str], None]) -> str:

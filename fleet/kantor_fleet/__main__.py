@@ -93,7 +93,6 @@ def agent(
         patience: Seconds to wait for world-sim to come up.
     """
     from kantor_agent.process import run as run_agent  # noqa: PLC0415
-
     from kantor_fleet.by_hand import participate_by_hand  # noqa: PLC0415
 
     if id == "supervisor":
@@ -113,9 +112,8 @@ def supervisor(
         credentials: The credentials folder, or the supervisor's file.
         patience: Seconds to wait for world-sim to come up.
     """
-    from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
-
     from kantor_fleet.by_hand import participate_by_hand  # noqa: PLC0415
+    from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
 
     return participate_by_hand(run_supervisor, "supervisor", connect, credentials, patience)
 

@@ -3,14 +3,13 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from kantor_fleet.exits import Exit, fail
+from kantor_fleet.interrupts import Interrupts
 from kantor_protocol import bus, credentials
 from kantor_protocol.credentials import FLEET_PATTERN, Identity
 from kantor_protocol.machine import ParticipantId
 from kantor_protocol.process import NotWantedError
 from kantor_protocol.scenario import Scenario
-
-from kantor_fleet.exits import Exit, fail
-from kantor_fleet.interrupts import Interrupts
 
 RunParticipant = Callable[[str, Identity, float, Callable[[str], None]], str]
 
@@ -27,13 +26,12 @@ def host_by_hand(
     out: Path,
 ) -> Exit:
     """World-sim in this terminal. Raises ScenarioError, BusError, OSError."""
-    from kantor_worldsim.process import Plan, run  # noqa: PLC0415
-    from kantor_worldsim.recording import Recording, folder_for  # noqa: PLC0415
-    from kantor_worldsim.world import Site  # noqa: PLC0415
-
     from kantor_fleet.preload import warm_up  # noqa: PLC0415  robots by hand do not need these
     from kantor_fleet.progress import ProgressView  # noqa: PLC0415
     from kantor_fleet.run import conclude, read_result, verdict  # noqa: PLC0415
+    from kantor_worldsim.process import Plan, run  # noqa: PLC0415
+    from kantor_worldsim.recording import Recording, folder_for  # noqa: PLC0415
+    from kantor_worldsim.world import Site  # noqa: PLC0415
 
     if not FLEET_PATTERN.fullmatch(fleet):
         fail(Exit.USAGE, f"--fleet {fleet}: use lower-case letters, digits and dashes")

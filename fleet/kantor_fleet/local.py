@@ -15,14 +15,13 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import NamedTuple
 
+from kantor_fleet.exits import Exit
+from kantor_fleet.interrupts import Interrupts
+from kantor_fleet.log import log_to
 from kantor_protocol import bus, credentials, keys
 from kantor_protocol.machine import SUPERVISOR, ParticipantId
 from kantor_protocol.messages import Progress, RefusedError, decode_progress
 from kantor_protocol.scenario import Scenario
-
-from kantor_fleet.exits import Exit
-from kantor_fleet.interrupts import Interrupts
-from kantor_fleet.log import log_to
 
 FLEET = "kantor"
 _START_S = 60.0

@@ -4,13 +4,12 @@ It opens nothing. Zenoh must not be open in a process that forks.
 """
 
 import kantor_worldsim.process  # noqa: F401
+from kantor_fleet.team import team
 from kantor_protocol.scenario import parse
 from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.recording import Recording
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
-
-from kantor_fleet.team import team
 
 _TINY = """
 name = "warm-up"

@@ -11,12 +11,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
-from kantor_protocol.packing import Pairs
-from kantor_protocol.walk import Walk
-from kantor_worldsim.metrics import Metrics, Row
-from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -26,6 +20,13 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
+
+from kantor_protocol.keyed import Purpose
+from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
+from kantor_protocol.packing import Pairs
+from kantor_protocol.walk import Walk
+from kantor_worldsim.metrics import Metrics, Row
+from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 
 SIZE_IN = (14.0, 8.0)
 DPI = 110

@@ -5,6 +5,13 @@ import time
 from pathlib import Path
 
 import msgspec
+
+from kantor_fleet.exits import Exit
+from kantor_fleet.interrupts import Interrupts
+from kantor_fleet.local import Order, local_fleet, watch_progress
+from kantor_fleet.preload import warm_up
+from kantor_fleet.progress import ProgressView
+from kantor_fleet.team import team
 from kantor_protocol.bus import BusError
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.journal import read
@@ -15,13 +22,6 @@ from kantor_worldsim.recording import JOURNAL, REPORT, RESULT, Recording, folder
 from kantor_worldsim.records import Record
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
-
-from kantor_fleet.exits import Exit
-from kantor_fleet.interrupts import Interrupts
-from kantor_fleet.local import Order, local_fleet, watch_progress
-from kantor_fleet.preload import warm_up
-from kantor_fleet.progress import ProgressView
-from kantor_fleet.team import team
 
 _GLANCE_S = 0.2
 

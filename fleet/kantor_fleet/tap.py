@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
-from kantor_protocol import bus, credentials, keys
 
 from kantor_fleet.exits import Exit, fail
 from kantor_fleet.interrupts import Interrupts
+from kantor_protocol import bus, credentials, keys
 
 KINDS = frozenset({"pose", "weights", "tx", "rx", keys.WORLD})
 _BYTES_SHOWN = 24

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from kantor_fleet.exits import Exit, fail
+from kantor_fleet.team import participant, team
 from kantor_protocol.machine import StateMachine
 from kantor_protocol.messages import RefusedError
 from kantor_worldsim.checkers import check
@@ -14,9 +16,6 @@ from kantor_worldsim.recording import JOURNAL, MANIFEST
 from kantor_worldsim.records import Batch, Ending, Mailbag, Opening, Record, encode_record
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
-
-from kantor_fleet.exits import Exit, fail
-from kantor_fleet.team import participant, team
 
 
 def verify(folder: Path) -> Exit:

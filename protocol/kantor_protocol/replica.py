@@ -430,13 +430,20 @@ class Replica:
 
     def learn(self, source: int, have: bytes, logs: bytes, claims: bytes) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
+        suffixes = np.frombuffer(logs, dtype=np.uint8)
+        room = self.store.log_index.shape[1] - int(self.store.length.max())
+        if (
+            len(logs) > 2 * room
+            and _walk_logs(self.store, self.manner, suffixes, source, False) < 0
+        ):
+            return False  # no room is made for what is malformed
         self.reserve(len(logs) // 2)
         return bool(
             _learn(
                 self.store,
                 self.manner,
                 np.frombuffer(have, dtype=np.uint8),
-                np.frombuffer(logs, dtype=np.uint8),
+                suffixes,
                 np.frombuffer(claims, dtype=np.uint8),
                 source,
             )

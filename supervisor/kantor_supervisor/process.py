@@ -5,7 +5,6 @@ from collections.abc import Callable
 from kantor_protocol.credentials import Identity
 from kantor_protocol.messages import Mission
 from kantor_protocol.process import participate
-
 from kantor_supervisor.core import Supervisor
 
 

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import linprog
+
 from kantor_agent.belief import Belief
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.messages import News
@@ -13,7 +15,6 @@ from kantor_protocol.packing import Pairs
 from kantor_protocol.replica import Replica
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units
-from scipy.optimize import linprog
 from strategies import Points, crowds, examples, scattered
 
 Plan = list[tuple[int, int]]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
 from strategies import METRES, Points, crowds, examples, scattered
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kantor_agent.core import Agent
 from kantor_protocol.machine import (
     EVERYBODY,

@@ -8,6 +8,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kantor_agent.belief import Belief
 from kantor_agent.planners import PLANNERS
 from kantor_agent.planners.transport import Transport, first_of_best_order

@@ -6,6 +6,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kantor_agent.vehicles import VEHICLES, Vehicle
 from kantor_protocol.machine import Pose
 from kantor_protocol.scenario import Vehicle as Parameters

@@ -5,9 +5,10 @@ from typing import Literal
 
 import msgspec
 import pytest
+from rich.console import Console
+
 from kantor_fleet.progress import ProgressView, line_of
 from kantor_protocol.messages import VERSION, Progress
-from rich.console import Console
 
 UNDER_WAY = Progress(
     version=VERSION,

@@ -11,6 +11,8 @@ import matplotlib as mpl
 import msgspec
 import numpy as np
 import pytest
+from PIL import Image
+
 from kantor_fleet.report import Run, Trail, draw, team_colours
 from kantor_fleet.team import team
 from kantor_protocol.keyed import Purpose
@@ -20,7 +22,6 @@ from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Ruling, Site
-from PIL import Image
 
 MISSION = """
 name = "small"

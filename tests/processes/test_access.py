@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import msgpack
 import pytest
 import zenoh
+
 from kantor_protocol.bus import free_endpoint
 
 if TYPE_CHECKING:

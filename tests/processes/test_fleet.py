@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import psutil
 import pytest
+
 from kantor_fleet.catalog import find
 from kantor_fleet.team import team
 from kantor_protocol.scenario import Scenario

@@ -5,6 +5,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+
 from kantor_protocol.clock import clocks
 from kantor_protocol.machine import SUPERVISOR
 from kantor_protocol.scenario import Scenario, ScenarioError

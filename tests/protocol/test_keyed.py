@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 from hypothesis import given
+
 from kantor_protocol.keyed import Purpose, generator, philox, philox_plain, to_unit, uniform
 from strategies import SEEDS, WORDS, examples
 

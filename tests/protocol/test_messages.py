@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kantor_protocol.machine import Envelope, Inputs, Observation, Outputs, Pose, State
 from kantor_protocol.messages import (
     BODY_BYTES_MAX,

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kantor_protocol.packing import MALFORMED, Pairs, put_int, put_uint, take_int, take_uint
 from strategies import COUNTS, examples
 

@@ -1,6 +1,7 @@
 """A participant's end of the radio: what is taken in, what is counted, what is said."""
 
 import pytest
+
 from kantor_protocol.machine import SUPERVISOR, Envelope, Pose
 from kantor_protocol.messages import News, decode_news, encode
 from kantor_protocol.radio import Radio, patience_steps, replica_of

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kantor_protocol.replica import NOBODY, Replica, spend
 from kantor_protocol.weights import Units
 from strategies import examples

@@ -11,6 +11,7 @@ from typing import Any
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
 from kantor_protocol.replica import NOBODY, Replica, spend
 from kantor_protocol.weights import Units
 

@@ -10,6 +10,7 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kantor_protocol.clock import clocks
 from kantor_protocol.machine import SUPERVISOR
 from kantor_protocol.scenario import (

@@ -3,6 +3,7 @@
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kantor_protocol.keyed import Purpose, philox_plain
 from kantor_protocol.walk import Walk
 from strategies import SEEDS, examples, scattered

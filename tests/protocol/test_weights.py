@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from kantor_protocol.packing import Pairs
 from kantor_protocol.weights import Units, Weights, WeightsPublisher, WeightsSubscriber
 from strategies import examples

@@ -2,6 +2,7 @@
 
 import msgspec
 import pytest
+
 from kantor_protocol.machine import (
     EVERYBODY,
     SUPERVISOR,

@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from numba import njit
+
 from kantor_protocol.keyed import Purpose, uniform
 from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.scenario import Scenario
-from numba import njit
 
 _LINK_WIDTH = 4096
 """Links are numbered source * width + target; the roster is smaller."""

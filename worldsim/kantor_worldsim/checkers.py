@@ -7,11 +7,11 @@ import math
 from collections.abc import Iterable
 
 import numpy as np
+
 from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.messages import RefusedError, decode_news
 from kantor_protocol.packing import Pairs
 from kantor_protocol.replica import read_have, read_logs
-
 from kantor_worldsim.channel import DROPPED, Verdict
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 from kantor_worldsim.world import SPEED_TOLERANCE

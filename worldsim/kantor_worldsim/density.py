@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+
 from kantor_protocol.keyed import Purpose, generator
 from kantor_protocol.scenario import Domain, Gaussian, Scenario, ScenarioError, is_image
 
@@ -137,9 +138,17 @@ def _points(key: str, file: str) -> Points:
 
 def _csv(path: Path) -> Points:
     first = path.read_text(encoding="utf-8-sig").lstrip().partition("\n")[0]
-    header = 1 if any(character.isalpha() for character in first.replace("e", "")) else 0
     with path.open(encoding="utf-8-sig") as lines:
-        return np.loadtxt(lines, delimiter=",", ndmin=2, skiprows=header)
+        return np.loadtxt(lines, delimiter=",", ndmin=2, skiprows=0 if _is_row(first) else 1)
+
+
+def _is_row(line: str) -> bool:
+    """Whether a line of CSV holds numbers; a header does not."""
+    try:
+        _ = [float(cell) for cell in line.split(",")]
+    except ValueError:
+        return False
+    return True
 
 
 def _around(points: Points, count: int, seed: int) -> Points:

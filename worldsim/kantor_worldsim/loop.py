@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from kantor_protocol.clock import Clock, clocks
 from kantor_protocol.machine import Exchange, Inputs, Outputs, ParticipantId, StateMachine
 from kantor_protocol.messages import decode_inputs, decode_outputs, encode
-
 from kantor_worldsim.stage import Stage, Step
 
 

@@ -21,12 +21,12 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from numba import njit
+
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
 from kantor_protocol.packing import Pairs
 from kantor_protocol.walk import Walk
-from numba import njit
-
 from kantor_worldsim.channel import DROPPED, links
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 

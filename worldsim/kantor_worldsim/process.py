@@ -22,7 +22,6 @@ from kantor_protocol.messages import (
     encode,
 )
 from kantor_protocol.scenario import Scenario
-
 from kantor_worldsim.loop import simulate
 from kantor_worldsim.metrics import Metrics, Result
 from kantor_worldsim.recording import Recording

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import IO, Any
 
 import msgspec
-from kantor_protocol.scenario import Scenario, to_toml
 
+from kantor_protocol.scenario import Scenario, to_toml
 from kantor_worldsim.checkers import Checker
 from kantor_worldsim.journal import Journal, file_digest
 from kantor_worldsim.metrics import Metrics, Result, Row

@@ -6,11 +6,11 @@ seed give the same bytes in process and over the bus.
 """
 
 import msgspec
+
 from kantor_protocol.machine import Envelope, Inputs, Observation, Outputs, ParticipantId
 from kantor_protocol.messages import Array
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.weights import Units
-
 from kantor_worldsim.channel import Verdict
 from kantor_worldsim.world import Found, Ruling, Site
 

@@ -9,7 +9,6 @@ from typing import NamedTuple
 from kantor_protocol.machine import Inputs, Outputs, ParticipantId, State
 from kantor_protocol.messages import RefusedError, check_outputs
 from kantor_protocol.scenario import Scenario
-
 from kantor_worldsim.channel import Channel, Sent, Verdict
 from kantor_worldsim.records import Act, Batch, Ending, Record, opening_of
 from kantor_worldsim.world import Site, World

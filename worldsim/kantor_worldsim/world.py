@@ -6,13 +6,13 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 import numpy.typing as npt
+
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import SUPERVISOR, Observation, Outputs, ParticipantId, Pose
 from kantor_protocol.packing import Pairs
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units
-
 from kantor_worldsim.density import samples_of, starts_of, targets_of
 from kantor_worldsim.sensors import sense_targets
 

@@ -2,10 +2,9 @@
 
 from collections.abc import Callable
 
-from kantor_protocol.scenario import Scenario
-
 from kantor_agent.planners.base import Goal, Planner
 from kantor_agent.planners.transport import Transport
+from kantor_protocol.scenario import Scenario
 
 PLANNERS: dict[str, Callable[[Scenario], Planner]] = {
     "transport": lambda scenario: Transport(scenario.planner.horizon),

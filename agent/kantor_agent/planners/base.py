@@ -3,9 +3,9 @@
 from typing import Protocol
 
 import msgspec
-from kantor_protocol.machine import Pose
 
 from kantor_agent.belief import Belief
+from kantor_protocol.machine import Pose
 
 
 class Goal(msgspec.Struct, frozen=True):

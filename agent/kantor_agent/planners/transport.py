@@ -8,13 +8,13 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from kantor_protocol.machine import Pose
-from kantor_protocol.replica import NOBODY
 from numba import njit
 
 from kantor_agent.belief import Belief
 from kantor_agent.field import Grid, nearest
 from kantor_agent.planners.base import Goal
+from kantor_protocol.machine import Pose
+from kantor_protocol.replica import NOBODY
 
 
 @njit(cache=True)
