@@ -81,6 +81,12 @@ class Belief:
         """Whether no sample has weight left."""
         return bool(self.grid.alive[0] == 0)
 
+    def nearest(self, x_m: float, y_m: float, count: int) -> npt.NDArray[np.int64]:
+        """The samples with weight that are nearest to a place, nearest first; at most `count`."""
+        near = np.zeros(count, dtype=np.int64)
+        found = nearest(self.grid, x_m, y_m, _NO_SKIP, np.zeros(count), near)
+        return near[:found]
+
     def learn(self, source: int, news: News) -> bool:
         """Take in what another participant sent; False when it is malformed."""
         return self.replica.learn(source, news.have, news.logs, news.claims)

@@ -102,6 +102,8 @@ class _Doorway:
         self._metrics = metrics
         self._show = show
         self._nonces: dict[ParticipantId, str] = {}
+        self._briefed: set[str] = set()
+        """Nonces of the processes that have been given the mission."""
         self._started = False
         self._told = 0.0
         self._starts = Array.of(plan.site.starts_m)
@@ -147,27 +149,36 @@ class _Doorway:
         name, nonce = event
         if name not in self._plan.scenario.roster:
             self.refused += 1
+        elif nonce in self._briefed:  # it was frozen or cut off for a while and has its mission
+            self._nonces[name] = self.ready[name] = nonce
+            self.mark_gone()
         elif name in self._nonces:
-            reason = "is on the bus already; stop the other process or choose another id"
-            self.host.send(name, encode(Refusal(VERSION, nonce, reason)), patiently=True)
-        elif self._started and self._plan.exchange == "lockstep" and not self._may_join_late(name):
-            reason = "was here before and has lost its mission; a restarted robot cannot rejoin"
-            self.host.send(name, encode(Refusal(VERSION, nonce, reason)), patiently=True)
-        else:
-            self._nonces[name] = nonce
-            mission = Mission(
-                VERSION,
-                nonce,
-                self._plan.scenario,
-                self._plan.seed,
-                self._starts,
-                self._samples,
-                self._plan.exchange,
+            self._refuse(
+                event, "is on the bus already; stop the other process or choose another id"
             )
-            self.host.send(name, encode(mission), patiently=True)
+        elif self.stage is not None and self.stage.acted(name):
+            self._refuse(event, "has acted before; a restarted robot would forget what it spent")
+        else:
+            self._brief(event)
 
-    def _may_join_late(self, name: ParticipantId) -> bool:
-        return self.stage is None or not self.stage.acted(name)
+    def _refuse(self, event: Joined, reason: str) -> None:
+        refusal = Refusal(VERSION, event.nonce, reason)
+        self.host.send(event.name, encode(refusal), patiently=True)
+
+    def _brief(self, event: Joined) -> None:
+        plan = self._plan
+        self._nonces[event.name] = event.nonce
+        self._briefed.add(event.nonce)
+        mission = Mission(
+            VERSION,
+            event.nonce,
+            plan.scenario,
+            plan.seed,
+            self._starts,
+            self._samples,
+            plan.exchange,
+        )
+        self.host.send(event.name, encode(mission), patiently=True)
 
     def _leave(self, event: Left) -> None:
         if self._nonces.get(event.name) == event.nonce:
