@@ -17,6 +17,11 @@ settings.load_profile("kantor")
 COMMAND_S = 120.0
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--rewrite` brings the transcripts up to date."""
+    parser.addoption("--rewrite", action="store_true", help="rewrite transcripts of robots")
+
+
 class Finished(NamedTuple):
     """How a command ended."""
 

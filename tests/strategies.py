@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from kantor_agent.core import Agent
@@ -59,8 +59,11 @@ MINIMUM = ("merge=min", "claims=false")
 
 
 def examples(count: int) -> settings:
-    """How many examples a property is tried on. No deadline: the first call may compile kernels."""
-    return settings(max_examples=count, deadline=None)
+    """How many examples a property is tried on.
+
+    Nothing is timed: the first call may compile kernels, and the machine may have other work.
+    """
+    return settings(max_examples=count, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 def mission(*overrides: str) -> Scenario:

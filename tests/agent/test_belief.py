@@ -203,6 +203,18 @@ def test_exactly_the_samples_with_weight_can_be_found(
         other.replica.end_step()
 
 
+def test_nearest_samples_are_those_with_weight() -> None:
+    """Nearest first, at most as many as asked for, and none that is used up."""
+    samples_m = np.array([[float(x), 0.0] for x in range(6)])
+    belief = belief_over(samples_m, 6)
+    before = belief.nearest(2.1, 0.0, 3).tolist()
+    spend(belief, 2.1, 0.0)
+
+    assert before == [2, 3, 1]
+    assert belief.nearest(2.1, 0.0, 3).tolist() == [3, 1, 4]
+    assert belief.nearest(2.1, 0.0, 9).tolist() == [3, 1, 4, 0, 5]
+
+
 def test_search_follows_samples_that_walk() -> None:
     """Eq. 14: weight is spent where samples are now, not where they were."""
     walk = Walk(scattered(50), 30.0, 1, 1, Purpose.SAMPLE_WALK)

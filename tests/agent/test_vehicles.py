@@ -213,7 +213,8 @@ def test_dubins_never_turns_tighter_than_its_radius(
     after = VEHICLES["dubins"](parameters).drive(pose, x_m, y_m, dt_s)
     turn = math.remainder(after.heading_rad - pose.heading_rad, math.tau)
     length_m = parameters.speed_m_s * dt_s
-    chord_m = length_m * (math.sin(turn / 2.0) / (turn / 2.0) if turn else 1.0)
+    half = turn / 2.0
+    chord_m = length_m * (math.sin(half) / half if half else 1.0)
 
     assert after.speed_m_s == parameters.speed_m_s
     if length_m / parameters.turn_radius_m < math.pi:

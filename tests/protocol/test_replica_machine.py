@@ -14,6 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from kantor_protocol.replica import NOBODY, Replica, spend
 from kantor_protocol.weights import Units
+from strategies import examples
 
 N = 6
 UNITS = Units.of(8, N)
@@ -216,5 +217,5 @@ class Replicas(RuleBasedStateMachine):
         return [(array.shape, array.tolist()) for array in self.made[who].store]
 
 
-Replicas.TestCase.settings = settings(max_examples=80, stateful_step_count=40, deadline=None)
+Replicas.TestCase.settings = settings(examples(80), stateful_step_count=40)
 TestReplicas = Replicas.TestCase

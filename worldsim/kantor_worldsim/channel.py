@@ -17,7 +17,7 @@ from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, Participant
 from kantor_protocol.scenario import Scenario
 
 _LINK_WIDTH = 4096
-"""Links are numbered source * width + target; the roster is smaller."""
+"""Links are numbered source * width + target; the roster is smaller, the supervisor comes last."""
 DROPPED = -1
 
 
@@ -94,7 +94,9 @@ def _transmit(
             if dx * dx + dy * dy > range_m * range_m:
                 out_of_range += 1
                 continue
-            link = source * _LINK_WIDTH + other
+            here = _LINK_WIDTH - 1 if source == supervisor else source
+            there = _LINK_WIDTH - 1 if other == supervisor else other
+            link = here * _LINK_WIDTH + there
             copies = 1
             if law.duplicate > 0.0:
                 draw = uniform(law.seed, Purpose.DUPLICATE.value, link, sequence, 0)

@@ -130,8 +130,8 @@ class Checker:
             self._complain("order", act.name, f"step {outputs.step}, expected {expected}")
         self._check_speed(act.name, act.now_ns, ruling.pose)
         self._check_goal(act.name, outputs.goal)
-        self._check_weights(act.name, outputs.lowered)
         self._check_energy(act.name, outputs.spent, outputs.energy_spent)
+        self._check_weights(act.name, outputs.lowered)
         self._steps[act.name], self._absences[act.name] = outputs.step, 0
         self._moved_ns[act.name] = act.now_ns
         self._poses[act.name] = ruling.pose
@@ -159,6 +159,8 @@ class Checker:
                     "weights", name, f"sample {sample} from {view[sample]} to {left} units"
                 )
             view[sample] = left
+            if left < self._units.sample - self._consumed[sample]:
+                self._complain("credit", name, f"its view of sample {sample} is below the truth")
 
     def _check_goal(self, name: ParticipantId, goal: tuple[float, float] | None) -> None:
         if goal is None or self._scenario.samples.diffusion_m > 0.0:
@@ -245,11 +247,6 @@ class Checker:
         self._in_flight.setdefault(key, []).append(verdict.due_ns)
 
     def _end(self) -> None:
-        left = np.maximum(self._units.sample - self._consumed, 0)
-        for name, place in self._places.items():
-            below = np.flatnonzero(self._views[place] < left)
-            if below.size:
-                self._complain("credit", name, f"its view of sample {below[0]} is below the truth")
         if self._scenario.merge == "ledger":
             for name, have in self._have.items():
                 self._check_view(name, have)

@@ -37,7 +37,7 @@ class Agenda:
     def batch(self, lookahead_ns: int) -> list[tuple[int, ParticipantId]]:
         """Everybody due before a message sent at the earliest of them could arrive, by (time, roster).
 
-        A participant appears once, however short its period.
+        The batch ends before a participant's second step, so that time never runs back.
         """
         until_ns = self._due[0][0] + lookahead_ns
         batch: list[tuple[int, ParticipantId]] = []
@@ -48,6 +48,7 @@ class Agenda:
             due_ns, order, step, name = heapq.heappop(self._due)
             batch.append((due_ns, name))
             again.append((self._clocks[name].due_ns(step + 1), order, step + 1, name))
+            until_ns = min(until_ns, again[-1][0])
         for item in again:
             heapq.heappush(self._due, item)
         return batch

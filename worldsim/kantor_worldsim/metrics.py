@@ -8,6 +8,9 @@ paper
     supervisor every robot counts the common weights; without one each counts its own vector, over the
     whole team (what the paper's figure 7f can only be, since Theorem 3 taken over neighbours rises
     when neighbours meet).
+local
+    Theorem 3 to the letter: robot k counts itself and whoever is in its range now, with its own vector.
+    It rises when robots meet, since neighbours join the sum; the rows give the least and the largest.
 tight
     Each remainder shared evenly by the robots: the pending term divided by their number, on the true
     remaining weights. A bound only while no sample was filled twice, else None.
@@ -49,6 +52,8 @@ class Row(NamedTuple):
     links: int
     deliveries: int
     drops: int
+    w_ub_local_min: float | None
+    w_ub_local_max: float | None
 
 
 class Glance(NamedTuple):
@@ -186,6 +191,7 @@ class Metrics:
         size = samples * robots // _PAIRS_PER_ROW
         self._every = scenario.metrics.every or max(1, size)
         self._shipped = 0.0
+        self._shipped_by = [0.0] * robots
         self._shipped_now = 0.0
         self._spent_units = 0
         self._energy_spent = 0
@@ -255,6 +261,7 @@ class Metrics:
             cost = units * way_m / self._units.whole
             self._shipped += cost
             self._shipped_now += cost
+            self._shipped_by[place] += cost
             self._spent_units += units
             self._true_left[sample] -= units
 
@@ -280,6 +287,7 @@ class Metrics:
             tight = self._shipped + sum(
                 _pending(xy_m, x, y, self._true_left) / whole / robots for _, x, y in places
             )
+        local = [] if self._scenario.centralized else self._local_bounds()
         self.rows.append(
             Row(
                 tick=self._tick,
@@ -294,8 +302,23 @@ class Metrics:
                 links=links(self._xy_m, self._scenario.radio.range_m),
                 deliveries=self._deliveries,
                 drops=self._drops,
+                w_ub_local_min=min(local, default=None),
+                w_ub_local_max=max(local, default=None),
             )
         )
+
+    def _local_bounds(self) -> list[float]:
+        """Eq. 12 for every robot."""
+        range_m, xy_m = self._scenario.radio.range_m, self._xy_m
+        bounds = []
+        for k in range(len(xy_m)):
+            team = np.flatnonzero(np.hypot(*(xy_m - xy_m[k]).T) <= range_m).tolist()
+            pending = sum(
+                _pending(self._walk.xy_m, *xy_m[q].tolist(), self._views[k]) for q in team
+            )
+            shipped = sum(self._shipped_by[q] for q in team)
+            bounds.append(shipped + pending / self._units.whole)
+        return bounds
 
     def glance(self) -> Glance:
         """How the run stands, by the last row."""

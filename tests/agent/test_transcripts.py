@@ -1,0 +1,141 @@
+"""Transcripts of robots: what they were given, line by line, and what they did about it.
+
+A line that begins with `>` is a command, the lines below it are what follows from it. After a wanted
+change of behaviour run `pytest tests/agent/test_transcripts.py --rewrite` and read the difference: commit
+it only if you understand what caused it.
+
+    > fleet N KEY=VALUE …     N robots that start at the origin, with overrides of the scenario
+    > samples X,Y X,Y …       where the samples are
+    > step NAME [SECONDS]     the robot steps, a period (or that long) after its step before
+    > deliver FROM TO [k]     its k-th envelope (by default the last) goes into the other's inbox
+    > garble FROM TO          the last envelope arrives cut in half
+    > shove NAME X,Y          the world says that the robot is elsewhere
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from kantor_agent.core import Agent
+from kantor_protocol.machine import Envelope, Inputs, Observation, Outputs, Pose
+from kantor_protocol.messages import decode_news
+from kantor_protocol.packing import Pairs
+from kantor_protocol.replica import read_have, read_logs
+from kantor_protocol.scenario import Scenario, parse
+
+FOLDER = Path(__file__).parent / "transcripts"
+BASE = """
+name = "transcript"
+domain = { min_m = [-1000, -1000], max_m = [1000, 1000] }
+robots = { count = 1 }
+starts = { poses_m = [[0, 0]] }
+energy = { points = 8 }
+samples = { count = 1 }
+density = [{ mean_m = [0, 0], variance_m2 = [1, 1] }]
+"""
+
+
+class Stage:
+    """Robots under the pen of a transcript."""
+
+    def __init__(self) -> None:
+        self.scenario: Scenario
+        self.points = np.zeros((0, 2))
+        self.robots: dict[str, Agent] = {}
+        self.now_ns: dict[str, int] = {}
+        self.observed: dict[str, Observation] = {}
+        self.inbox: dict[str, list[Envelope]] = {}
+        self.sent: dict[str, list[Envelope]] = {}
+
+    def run(self, line: str) -> list[str]:
+        """What follows from a command."""
+        verb, *words = line.split()
+        told = getattr(self, verb)(*words)
+        return [] if told is None else list(told)
+
+    def fleet(self, count: str, *overrides: str) -> None:
+        """> fleet"""
+        places = ", ".join(["[0, 0]"] * int(count))
+        self.scenario = parse(
+            BASE, "transcript", [f"robots.count={count}", f"starts.poses_m=[{places}]", *overrides]
+        )
+
+    def samples(self, *points: str) -> None:
+        """> samples"""
+        self.points = np.array([[float(v) for v in point.split(",")] for point in points])
+        for name in self.scenario.robot_ids:
+            self.robots[name] = Agent(name, self.scenario, 0, (0.0, 0.0), self.points)
+            self.now_ns[name], self.inbox[name], self.sent[name] = 0, [], []
+            self.observed[name] = Observation(0, Pose(0.0, 0.0))
+
+    def step(self, name: str, seconds: str = "") -> list[str]:
+        """> step"""
+        elapsed_ns = round(float(seconds) * 1e9) if seconds else self.scenario.period_ns
+        self.now_ns[name] += elapsed_ns
+        inbox, self.inbox[name] = tuple(self.inbox[name]), []
+        outputs = self.robots[name].step(Inputs(self.now_ns[name], self.observed[name], inbox))
+        self.observed[name] = Observation(outputs.step, outputs.pose)
+        self.sent[name] += outputs.outbox
+        return self._told(outputs)
+
+    def deliver(self, source: str, target: str, which: str = "") -> None:
+        """> deliver"""
+        envelope = self.sent[source][int(which) - 1 if which else -1]
+        self.inbox[target].append(envelope)
+
+    def garble(self, source: str, target: str) -> None:
+        """> garble"""
+        last = self.sent[source][-1]
+        half = last.body[: len(last.body) // 2]
+        self.inbox[target].append(Envelope(last.source, last.sequence, last.target, half))
+
+    def shove(self, name: str, place: str) -> None:
+        """> shove"""
+        x, y = (float(v) for v in place.split(","))
+        self.observed[name] = Observation(self.observed[name].step, Pose(x, y))
+
+    def _told(self, outputs: Outputs) -> list[str]:
+        pose, goal = outputs.pose, outputs.goal
+        lines = [
+            f"step {outputs.step} at ({pose.x_m:.4g}, {pose.y_m:.4g}), "
+            f"goal {'none' if goal is None else f'({goal[0]:g}, {goal[1]:g})'}, "
+            f"energy {outputs.energy_spent}, {outputs.state.name.lower()}"
+            + (f", refused {outputs.refused}" if outputs.refused else "")
+        ]
+        for label, packed in (("spent", outputs.spent), ("left", outputs.lowered)):
+            if packed:
+                lines.append(f"{label} {self._pairs(packed)}")
+        lines += [self._says(envelope) for envelope in outputs.outbox]
+        return lines
+
+    def _pairs(self, packed: bytes) -> str:
+        pairs = Pairs().decode(packed, len(self.points))
+        assert pairs is not None
+        return " ".join(f"{j}:{u}" for j, u in zip(*map(np.ndarray.tolist, pairs), strict=True))
+
+    def _says(self, envelope: Envelope) -> str:
+        news = decode_news(envelope.body)
+        logs = read_logs(news.logs)
+        have = read_have(news.have, len(self.scenario.roster))
+        assert logs is not None
+        entries = " ".join(f"r{o + 1}#{at}={j}:{u}" for o, at, j, u in logs.tolist())
+        claims = "claims " if news.claims else ""
+        to = envelope.target or "everybody"
+        return f"to {to}: {claims}has {have}, tells {entries or 'nothing'}"
+
+
+@pytest.mark.parametrize("path", sorted(FOLDER.glob("*.txt")), ids=lambda path: path.stem)
+def test_transcript(path: Path, request: pytest.FixtureRequest) -> None:
+    """Robots do what the transcript says, to the letter."""
+    stage, lines = Stage(), []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if line.startswith("> "):
+            lines += [line, *(f"  {told}" for told in stage.run(line[2:]))]
+        elif not line.startswith("  "):
+            lines.append(line)
+    text = "\n".join(lines) + "\n"
+    if request.config.getoption("--rewrite"):
+        path.write_text(text, encoding="utf-8")
+
+    assert path.read_text(encoding="utf-8") == text

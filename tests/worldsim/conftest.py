@@ -1,0 +1,36 @@
+"""What tests of the world share: missions that were played in process, as records."""
+
+import functools
+from collections.abc import Callable
+
+import pytest
+from strategies import mission
+
+from kantor_fleet.team import team
+from kantor_protocol.scenario import Scenario
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.records import Record
+from kantor_worldsim.stage import Stage
+from kantor_worldsim.world import Site
+
+ROOMY = ("samples.count=60", "energy.points=90", "energy.steps=60", "targets.count=40")
+"""L = 180: three units a sample, two a point; twice the energy that is needed."""
+
+
+@functools.cache
+def _played(scenario: Scenario, seed: int) -> tuple[Record, ...]:
+    site = Site.of(scenario, seed)
+    records: list[Record] = []
+    stage = Stage(scenario, seed, site, [records.append])
+    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    return tuple(records)
+
+
+@pytest.fixture(scope="session")
+def played() -> Callable[..., tuple[Record, ...]]:
+    """The records of a small mission with overrides, played to its end."""
+
+    def play(*overrides: str, seed: int = 1) -> tuple[Record, ...]:
+        return _played(mission(*ROOMY, *overrides), seed)
+
+    return play

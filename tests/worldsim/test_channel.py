@@ -1,0 +1,350 @@
+"""The radio: who hears what, when, and what gets lost."""
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import examples, mission
+
+from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
+from kantor_protocol.scenario import Scenario
+from kantor_worldsim.channel import DROPPED, Channel, Sent, Verdict, links
+
+MS = 1_000_000
+CENTRALIZED = "coordination=centralized"
+LOSSY = (
+    "radio.drop=0.3",
+    "radio.duplicate=0.4",
+    "radio.delay_s=0.02",
+    "radio.jitter_s=0.1",
+    "radio.reorder=0.25",
+    "radio.reorder_s=0.3",
+)
+FOUR = (
+    "robots.count=4",
+    "starts.poses_m=[[10.0, 10.0], [90.0, 20.0], [50.0, 80.0], [50.0, 50.0]]",
+)
+
+
+def said(
+    source: ParticipantId, sequence: int, target: ParticipantId = EVERYBODY, now_ns: int = 0
+) -> Sent:
+    """An envelope on the air."""
+    return Sent(now_ns, Envelope(source, sequence, target, b""))
+
+
+def channel(*overrides: str, seed: int = 1, at: dict[str, tuple[float, float]] | None = None) -> Channel:
+    """A channel with everybody in one place, unless told otherwise."""
+    scenario = mission(*overrides)
+    made = Channel(scenario, seed)
+    for name in scenario.roster:
+        made.place(name, Pose(*(at or {}).get(name, (0.0, 0.0))))
+    return made
+
+
+def receivers(verdicts: Iterable[Verdict]) -> list[ParticipantId]:
+    return [verdict.target for verdict in verdicts]
+
+
+def chatter(scenario: Scenario, count: int) -> list[Sent]:
+    """Everybody speaks to everybody `count` times, 100 ms apart."""
+    return [
+        said(name, sequence, now_ns=100 * MS * sequence)
+        for sequence in range(1, count + 1)
+        for name in scenario.roster
+    ]
+
+
+# Range.
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "hears"),
+    [(3.0, 4.0, True), (5.0, 0.0, True), (3.0, math.nextafter(4.0, 5.0), False), (0.0, 0.0, True)],
+)
+def test_range_is_inclusive(x_m: float, y_m: float, hears: bool) -> None:
+    """At exactly the range a receiver hears; any further it does not, and that is counted."""
+    radio = channel("radio.range_m=5", at={"r2": (x_m, y_m), "r3": (99.0, 0.0)})
+    verdicts, out_of_range = radio.transmit([said("r1", 1)])
+
+    assert receivers(verdicts) == (["r2"] if hears else [])
+    assert out_of_range == (1 if hears else 2)
+
+
+@examples(100)
+@given(
+    places=st.lists(
+        st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)), min_size=3, max_size=3
+    ),
+    range_m=st.floats(0.0, 2e3),
+)
+def test_hearing_is_mutual(places: list[tuple[float, float]], range_m: float) -> None:
+    """Of two robots either both are in range of each other or none."""
+    at = dict(zip(("r1", "r2", "r3"), places, strict=True))
+    radio = channel(f"radio.range_m={range_m}", at=at)
+    verdicts, out_of_range = radio.transmit([said(name, 1) for name in at])
+    pairs = {(verdict.source, verdict.target) for verdict in verdicts}
+
+    assert {(target, source) for source, target in pairs} == pairs
+    assert len(pairs) + out_of_range == 6
+    assert links(np.array(places), range_m) == len(pairs) / 2
+
+
+def test_places_count_at_the_time_of_sending() -> None:
+    """What is on the air reaches a robot that has left; what was out of range never does."""
+    radio = channel("radio.range_m=5", "radio.delay_s=1.0", at={"r3": (50.0, 0.0)})
+    radio.transmit([said("r1", 1, now_ns=0)])
+    radio.place("r2", Pose(99.0, 0.0))
+    radio.place("r3", Pose(0.0, 0.0))
+
+    assert [envelope.sequence for envelope in radio.take("r2", 1000 * MS)] == [1]
+    assert radio.take("r3", 1000 * MS) == ()
+
+
+def test_nobody_hears_before_anybody_is_placed() -> None:
+    """A participant without a place is out of range of all."""
+    verdicts, out_of_range = Channel(mission("radio.range_m=5"), 1).transmit([said("r1", 1)])
+
+    assert (verdicts, out_of_range) == ([], 2)
+
+
+def test_supervisor_has_a_range_of_its_own() -> None:
+    """Its range holds both ways and for it alone."""
+    at = {"r1": (30.0, 0.0), "r2": (30.0, 0.0), "r3": (50.0, 0.0)}
+    radio = channel(CENTRALIZED, "radio.range_m=0.0", "supervisor.range_m=30", at=at)
+    spoken, too_far = radio.transmit([said(SUPERVISOR, 1)])
+    answered, _ = radio.transmit([said(name, 1, SUPERVISOR) for name in at])
+    robots, _ = radio.transmit([said("r3", 2)])
+
+    assert (receivers(spoken), too_far) == (["r1", "r2"], 1)
+    assert [verdict.source for verdict in answered] == ["r1", "r2"]
+    assert robots == []
+
+
+# Targets.
+
+
+@pytest.mark.parametrize(
+    ("target", "hear", "out_of_range"),
+    [
+        (EVERYBODY, ["r2", "r3", SUPERVISOR], 0),
+        ("r3", ["r3"], 0),
+        (SUPERVISOR, [SUPERVISOR], 0),
+        ("r1", [], 0),
+        ("r99", [], 0),
+    ],
+)
+def test_envelope_goes_to_its_target(
+    target: ParticipantId, hear: list[ParticipantId], out_of_range: int
+) -> None:
+    """Everybody, or the one who is meant; never the sender; a stranger is nobody."""
+    verdicts = channel(CENTRALIZED).transmit([said("r1", 1, target)])
+
+    assert (receivers(verdicts[0]), verdicts[1]) == (hear, out_of_range)
+
+
+def test_only_the_target_can_be_out_of_range() -> None:
+    """Those who are not meant are not counted."""
+    at = {"r2": (9.0, 0.0), "r3": (9.0, 0.0)}
+
+    assert channel("radio.range_m=5", at=at).transmit([said("r1", 1, "r3")]) == ([], 1)
+
+
+# Draws.
+
+
+@examples(50)
+@given(st.data())
+def test_draws_depend_on_the_link_and_the_sequence_alone(data: st.DataObject) -> None:
+    """In any order, in any portions, with others in between or not: every verdict is the same."""
+    overrides = (CENTRALIZED, *LOSSY)
+    everything = chatter(mission(*overrides), 6)
+    whole = set(channel(*overrides).transmit(everything)[0])
+    some = data.draw(st.permutations(everything))[: data.draw(st.integers(1, len(everything)))]
+    cut = data.draw(st.integers(0, len(some)))
+    radio = channel(*overrides)
+    told = [*radio.transmit(some[:cut])[0], *radio.transmit(some[cut:])[0]]
+    spoken = {(sent.envelope.source, sent.envelope.sequence) for sent in some}
+
+    assert set(told) == {verdict for verdict in whole if verdict[:2] in spoken}
+
+
+@pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
+def test_one_more_robot_changes_no_other_draw(coordination: str) -> None:
+    """What was ruled on the links of three robots is ruled on them among four."""
+    overrides = (f"coordination={coordination}", *LOSSY)
+    three = channel(*overrides).transmit(chatter(mission(*overrides), 50))[0]
+    four = channel(*overrides, *FOUR).transmit(chatter(mission(*overrides, *FOUR), 50))[0]
+    old = [verdict for verdict in four if "r4" not in (verdict.source, verdict.target)]
+
+    assert set(old) == set(three)
+    assert len(old) < len(four)
+
+
+def test_draws_differ_between_links_sequences_and_seeds() -> None:
+    """No two links share their luck, nor do two runs."""
+
+    def luck(seed: int) -> dict[tuple[str, str], tuple[bool, ...]]:
+        verdicts = channel("radio.drop=0.5", seed=seed).transmit(chatter(mission(), 64))[0]
+        fates: dict[tuple[str, str], tuple[bool, ...]] = {}
+        for source, _, target, due_ns in map(_fields, verdicts):
+            fates[source, target] = (*fates.get((source, target), ()), due_ns == DROPPED)
+        return fates
+
+    fates = [*luck(1).values(), *luck(2).values()]
+
+    assert len(set(fates)) == len(fates) == 12
+    assert all(0 < sum(fate) < 64 for fate in fates)
+
+
+def _fields(verdict: Verdict) -> tuple[str, int, str, int]:
+    return verdict.source, verdict.sequence, verdict.target, verdict.due_ns
+
+
+def _copies(verdicts: Sequence[Verdict]) -> dict[tuple[str, int, str], list[int]]:
+    """When each copy arrives, by (source, sequence, target)."""
+    copies: dict[tuple[str, int, str], list[int]] = {}
+    for verdict in verdicts:
+        copies.setdefault(_fields(verdict)[:3], []).append(verdict.due_ns)
+    return copies
+
+
+def within_luck(hits: int, trials: int, rate: float) -> bool:
+    """Whether a count is within five standard deviations of a binomial one."""
+    return abs(hits - trials * rate) <= 5.0 * math.sqrt(trials * rate * (1.0 - rate)) + 0.5
+
+
+@examples(10)
+@given(
+    drop=st.sampled_from([0.0, 0.01, 0.3, 0.9]),
+    duplicate=st.sampled_from([0.0, 0.05, 0.5]),
+    seed=st.integers(0, 2**63),
+)
+def test_drops_and_duplicates_come_at_their_rate(drop: float, duplicate: float, seed: int) -> None:
+    """Per receiver and copy; a copy's loss does not depend on its twin's."""
+    radio = channel(f"radio.drop={drop}", f"radio.duplicate={duplicate}", seed=seed)
+    verdicts = radio.transmit(chatter(mission(), 1500))[0]
+    copies = _copies(verdicts)
+    twins = [due for due in copies.values() if len(due) == 2]
+    both = sum(due == [DROPPED, DROPPED] for due in twins)
+
+    assert len(copies) == 3 * 2 * 1500
+    assert within_luck(len(twins), len(copies), duplicate)
+    assert within_luck(sum(v.due_ns == DROPPED for v in verdicts), len(verdicts), drop)
+    assert within_luck(both, len(twins), drop * drop)
+
+
+@examples(40)
+@given(
+    delay_ms=st.integers(0, 500),
+    jitter_ms=st.integers(0, 500),
+    reorder=st.sampled_from([0.0, 0.3]),
+    reorder_ms=st.integers(1, 500),
+    duplicate=st.sampled_from([0.0, 0.5]),
+    seed=st.integers(0, 2**63),
+)
+def test_delay_lies_between_its_bounds(
+    delay_ms: int, jitter_ms: int, reorder: float, reorder_ms: int, duplicate: float, seed: int
+) -> None:
+    """Never sooner than the delay; never later than delay, jitter and hold-back together."""
+    radio = channel(
+        f"radio.delay_s={delay_ms / 1000}",
+        f"radio.jitter_s={jitter_ms / 1000}",
+        f"radio.reorder={reorder}",
+        f"radio.reorder_s={reorder_ms / 1000}",
+        f"radio.duplicate={duplicate}",
+        seed=seed,
+    )
+    verdicts = radio.transmit(chatter(mission(), 40))[0]
+    delays_ms = [verdict.due_ns / MS - 100 * verdict.sequence for verdict in verdicts]
+    latest_ms = delay_ms + jitter_ms + (reorder_ms if reorder else 0)
+
+    assert radio.lookahead_ns == delay_ms * MS
+    assert min(delays_ms) >= delay_ms
+    assert max(delays_ms) <= latest_ms
+    assert max(delays_ms) >= delay_ms + 0.6 * (latest_ms - delay_ms)
+
+
+def test_held_back_messages_are_overtaken() -> None:
+    """A share `reorder` of the messages waits up to reorder_s, so that later ones pass them."""
+    overrides = ("radio.reorder=0.25", "radio.reorder_s=0.5")
+    verdicts = channel(*overrides).transmit(chatter(mission(), 1500))[0]
+    held = sum(verdict.due_ns > 100 * MS * verdict.sequence for verdict in verdicts)
+    radio = channel(*overrides)
+    radio.transmit([sent for sent in chatter(mission(), 20) if sent.envelope.source == "r1"])
+    arrived = [envelope.sequence for envelope in radio.take("r2", 10_000 * MS)]
+
+    assert within_luck(held, len(verdicts), 0.25)
+    assert sorted(arrived) == list(range(1, 21))
+    assert arrived != sorted(arrived)
+
+
+def test_a_steady_delay_keeps_the_order() -> None:
+    """Without jitter and hold-back nothing is overtaken."""
+    radio = channel("radio.delay_s=0.25", "radio.drop=0.3", "radio.duplicate=0.3")
+    radio.transmit([sent for sent in chatter(mission(), 50) if sent.envelope.source == "r1"])
+    arrived = [envelope.sequence for envelope in radio.take("r2", 10_000 * MS)]
+
+    assert len(arrived) > 30
+    assert arrived == sorted(arrived)
+
+
+# What is under way.
+
+
+def test_inbox_is_in_order_of_arrival_then_source_then_sequence() -> None:
+    """Ties are broken by roster and sequence, whatever the order of sending."""
+    radio = channel(CENTRALIZED, "radio.delay_s=0.01")
+    sent = [
+        said(SUPERVISOR, 1),
+        said("r3", 2),
+        said("r2", 9),
+        said("r2", 8),
+        said("r3", 1, now_ns=5 * MS),
+        said("r2", 10, now_ns=-1 * MS),
+    ]
+    radio.transmit(sent)
+    inbox = radio.take("r1", 15 * MS)
+
+    assert [(envelope.source, envelope.sequence) for envelope in inbox] == [
+        ("r2", 10),
+        ("r2", 8),
+        ("r2", 9),
+        ("r3", 2),
+        (SUPERVISOR, 1),
+        ("r3", 1),
+    ]
+
+
+def test_taken_once_and_not_before_it_is_due() -> None:
+    """A delivery waits until its time, goes out once, and is known to wait."""
+    radio = channel("radio.delay_s=0.05")
+    radio.transmit([said("r1", 1, "r2"), said("r1", 2, "r2", now_ns=10 * MS)])
+
+    assert radio.next_due_ns() == 50 * MS
+    assert radio.take("r2", 50 * MS - 1) == ()
+    assert not radio.waits("r2", 50 * MS - 1)
+    assert radio.waits("r2", 50 * MS)
+    assert [envelope.sequence for envelope in radio.take("r2", 50 * MS)] == [1]
+    assert not radio.waits("r2", 50 * MS)
+    assert radio.next_due_ns() == 60 * MS
+    assert [envelope.sequence for envelope in radio.take("r2", 10**12)] == [2]
+    assert radio.next_due_ns() is None
+    assert radio.take("r2", 10**12) == ()
+
+
+def test_dropped_is_ruled_on_but_never_under_way() -> None:
+    """What is lost is in the record, and in nobody's inbox."""
+    radio = channel("radio.drop=0.999999")
+    verdicts, _ = radio.transmit([said("r1", 1)])
+
+    assert verdicts == [Verdict("r1", 1, "r2", DROPPED), Verdict("r1", 1, "r3", DROPPED)]
+    assert radio.next_due_ns() is None
+
+
+def test_silence_is_no_verdict() -> None:
+    """Nothing sent, nothing ruled."""
+    assert channel().transmit([]) == ([], 0)

@@ -1,0 +1,601 @@
+"""The referees: silent on a good record, and each rule noticed when it alone is broken."""
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import pairwise, product
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import examples
+
+from kantor_protocol.machine import SUPERVISOR, ParticipantId, Pose
+from kantor_protocol.messages import News, decode_news, encode
+from kantor_protocol.packing import Pairs, put_uint
+from kantor_protocol.replica import read_have, read_logs
+from kantor_protocol.weights import WeightsMessage, WeightsSubscriber
+from kantor_worldsim.channel import DROPPED, Verdict
+from kantor_worldsim.checkers import Checker, check
+from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
+
+Play = Callable[..., tuple[Record, ...]]
+Records = Sequence[Record]
+
+MERGES = {"ledger": ("merge=ledger",), "min": ("merge=min", "claims=false")}
+RADIOS = {
+    "perfect": (),
+    "short": ("radio.range_m=30", "supervisor.range_m=50"),
+    "slow": ("radio.delay_s=0.25",),
+    "lossy": (
+        "radio.drop=0.3",
+        "radio.duplicate=0.3",
+        "radio.delay_s=0.03",
+        "radio.jitter_s=0.2",
+        "radio.reorder=0.3",
+    ),
+}
+DEAF = ("radio.range_m=0", "supervisor.range_m=0")
+"""Nobody hears anybody, so that nothing but the broken rule is touched."""
+
+
+def rules(records: Iterable[Record]) -> set[str]:
+    """The rules that a record breaks."""
+    return {complaint.partition(":")[0] for complaint in check(records).complaints}
+
+
+# Ways to change a record.
+
+Change = Callable[[Act], Act]
+
+
+def batches(records: Records) -> list[Batch]:
+    return [record for record in records if isinstance(record, Batch)]
+
+
+def acts(records: Records, name: ParticipantId) -> list[Act]:
+    """What a participant did, in order."""
+    return [act for batch in batches(records) for act in batch.acts if act.name == name]
+
+
+def opening(records: Records) -> Opening:
+    assert isinstance(records[0], Opening)
+    return records[0]
+
+
+def put(records: Records, old: Any, new: Any) -> list[Record]:
+    """The records with one of them in place of another."""
+    return [new if record is old else record for record in records]
+
+
+def put_act(records: Records, old: Act, change: Change) -> list[Record]:
+    """The records with one act changed."""
+
+    def changed(batch: Batch) -> Batch:
+        told = tuple(change(act) if act is old else act for act in batch.acts)
+        return msgspec.structs.replace(batch, acts=told)
+
+    return [changed(record) if isinstance(record, Batch) else record for record in records]
+
+
+def outputs(**values: Any) -> Change:
+    """A change of some of what a participant returned."""
+    return lambda act: msgspec.structs.replace(
+        act, outputs=msgspec.structs.replace(act.outputs, **values)
+    )
+
+
+def ruling(**values: Any) -> Change:
+    """A change of what the world made of it."""
+    return lambda act: msgspec.structs.replace(
+        act, ruling=msgspec.structs.replace(act.ruling, **values)
+    )
+
+
+def heard(*references: tuple[ParticipantId, int]) -> Change:
+    """A change of the inbox."""
+    return lambda act: msgspec.structs.replace(act, heard=references)
+
+
+def news(act: Act, change: Callable[[News], News]) -> Change:
+    """A change of the message that a participant sent."""
+    (envelope,) = act.outputs.outbox
+    body = encode(change(decode_news(envelope.body)))
+    return outputs(outbox=(msgspec.structs.replace(envelope, body=body),))
+
+
+def add_verdict(records: Records, batch: Batch, verdict: Verdict) -> list[Record]:
+    """The records with one more verdict of the radio."""
+    told = msgspec.structs.replace(batch, verdicts=(*batch.verdicts, verdict))
+    return put(records, batch, told)
+
+
+def with_scenario(records: Records, **tables: dict[str, Any]) -> list[Record]:
+    """The records with another scenario in the opening."""
+    first = opening(records)
+    scenario = msgspec.structs.replace(
+        first.scenario,
+        **{
+            key: msgspec.structs.replace(getattr(first.scenario, key), **values)
+            for key, values in tables.items()
+        },
+    )
+    return put(records, first, msgspec.structs.replace(first, scenario=scenario))
+
+
+def pairs(*entries: tuple[int, int]) -> bytes:
+    index = np.array([i for i, _ in entries], dtype=np.int64)
+    value = np.array([v for _, v in entries], dtype=np.int64)
+    return Pairs().encode(index, value, len(entries))
+
+
+def entries(packed: bytes) -> list[tuple[int, int]]:
+    decoded = Pairs().decode(packed, 60)
+    assert decoded is not None
+    return list(zip(decoded[0].tolist(), decoded[1].tolist(), strict=True))
+
+
+def uints(*values: int) -> bytes:
+    buffer = np.zeros(20 * len(values), dtype=np.uint8)
+    at = 0
+    for value in values:
+        at = put_uint(buffer, at, value)
+    return buffer[:at].tobytes()
+
+
+def consumed(records: Records, until_ns: int) -> npt.NDArray[np.int64]:
+    """Units that all participants together have shipped to each sample by then."""
+    total = np.zeros(60, dtype=np.int64)
+    for batch in batches(records):
+        for act in batch.acts if batch.now_ns <= until_ns else ():
+            for sample, units in entries(act.outputs.spent):
+                total[sample] += units
+    return total
+
+
+# A good record.
+
+
+@pytest.mark.parametrize(
+    ("merge", "coordination", "order", "radio"),
+    list(product(MERGES, ("decentralized", "centralized"), ("turn", "concurrent"), RADIOS)),
+)
+def test_no_complaint_about_a_sound_run(
+    played: Play, merge: str, coordination: str, order: str, radio: str
+) -> None:
+    """Whatever the merge, the coordination, the order and the radio: the rules hold."""
+    overrides = (f"coordination={coordination}", f"clock.order={order}")
+    records = played(*MERGES[merge], *RADIOS[radio], *overrides)
+
+    assert check(records).complaints == []
+    assert isinstance(records[-1], Ending)
+    assert records[-1].reason == "done"
+
+
+@examples(25)
+@given(
+    merge=st.sampled_from(list(MERGES.values())),
+    coordination=st.sampled_from(["decentralized", "centralized"]),
+    order=st.sampled_from(["turn", "concurrent"]),
+    range_m=st.sampled_from([0, 25, 60, 200]),
+    drop=st.sampled_from([0.0, 0.3, 0.7]),
+    duplicate=st.sampled_from([0.0, 0.5]),
+    delay_s=st.sampled_from([0.0, 0.02, 0.1, 0.35]),
+    jitter_s=st.sampled_from([0.0, 0.05, 0.4]),
+    reorder=st.sampled_from([0.0, 0.4]),
+    spread=st.sampled_from([0.0, 0.4]),
+    late_s=st.sampled_from([0.0, 0.04]),
+    seed=st.integers(0, 2**32),
+)
+def test_no_complaint_whatever_the_radio_and_the_clocks(
+    played: Play,
+    merge: tuple[str, ...],
+    coordination: str,
+    order: str,
+    range_m: int,
+    drop: float,
+    duplicate: float,
+    delay_s: float,
+    jitter_s: float,
+    reorder: float,
+    spread: float,
+    late_s: float,
+    seed: int,
+) -> None:
+    """No loss, delay or clock makes a sound robot break a rule."""
+    records = played(
+        *merge,
+        f"coordination={coordination}",
+        f"clock.order={order}",
+        f"clock.spread={spread}",
+        f"clock.jitter_s={late_s}",
+        f"radio.range_m={range_m}",
+        f"radio.drop={drop}",
+        f"radio.duplicate={duplicate}",
+        f"radio.delay_s={delay_s}",
+        f"radio.jitter_s={jitter_s}",
+        f"radio.reorder={reorder}",
+        seed=seed,
+    )
+
+    assert check(records).complaints == []
+
+
+# Broken records: the overrides of the run, what is done to it, and the rules that must be named.
+
+Break = Callable[[Records], list[Record]]
+BROKEN: dict[str, tuple[tuple[str, ...], Break, set[str]]] = {}
+
+
+def breaks(*broken: str, run: tuple[str, ...] = ()) -> Callable[[Break], Break]:
+    """Register a way to break a record of a run, with the rules that it breaks."""
+
+    def register(broken_record: Break) -> Break:
+        name = broken_record.__name__.strip("_").replace("_", "-")
+        BROKEN[f"{broken[0]}-{name}"] = (run, broken_record, set(broken))
+        return broken_record
+
+    return register
+
+
+@breaks("range", run=RADIOS["short"])
+def _delivered_over_the_hills(records: Records) -> list[Record]:
+    first = batches(records)[0]
+    return add_verdict(records, first, Verdict("r1", 1, "r2", first.now_ns))
+
+
+@breaks("range", run=("coordination=centralized", "supervisor.range_m=20"))
+def _delivered_to_a_far_supervisor(records: Records) -> list[Record]:
+    first = batches(records)[0]
+    return add_verdict(records, first, Verdict("r1", 1, SUPERVISOR, first.now_ns))
+
+
+@breaks("range")
+def _range_was_shorter_than_the_radio(records: Records) -> list[Record]:
+    return with_scenario(records, radio={"range_m": 50.0})
+
+
+@breaks("range", run=("coordination=centralized",))
+def _supervisors_range_was_shorter(records: Records) -> list[Record]:
+    return with_scenario(records, supervisor={"range_m": 5.0})
+
+
+@breaks("delivery", run=DEAF)
+def _heard_what_the_radio_did_not_deliver(records: Records) -> list[Record]:
+    return put_act(records, acts(records, "r1")[5], heard(("r2", 5)))
+
+
+@breaks("delivery")
+def _heard_twice(records: Records) -> list[Record]:
+    act = acts(records, "r1")[5]
+    return put_act(records, act, heard(*act.heard, act.heard[0]))
+
+
+@breaks("delivery")
+def _heard_again_later(records: Records) -> list[Record]:
+    early, late = acts(records, "r1")[5:7]
+    return put_act(records, late, heard(*late.heard, *early.heard))
+
+
+@breaks("delivery", run=("radio.delay_s=0.25",))
+def _heard_before_it_was_due(records: Records) -> list[Record]:
+    early, late = acts(records, "r1")[3:5]
+    swapped = put_act(records, early, heard(*early.heard, late.heard[0]))
+    return put_act(swapped, late, heard(*late.heard[1:]))
+
+
+@breaks("delivery")
+def _heard_what_was_dropped(records: Records) -> list[Record]:
+    batch = batches(records)[3]
+    lost = (msgspec.structs.replace(batch.verdicts[0], due_ns=DROPPED), *batch.verdicts[1:])
+    return put(records, batch, msgspec.structs.replace(batch, verdicts=lost))
+
+
+@breaks("delivery", run=("radio.duplicate=0.999",))
+def _heard_more_copies_than_were_ruled(records: Records) -> list[Record]:
+    batch = batches(records)[3]
+    return put(records, batch, msgspec.structs.replace(batch, verdicts=batch.verdicts[1:]))
+
+
+@breaks("delivery")
+def _delivered_what_was_never_sent(records: Records) -> list[Record]:
+    first = batches(records)[0]
+    return add_verdict(records, first, Verdict("r1", 77, "r2", first.now_ns))
+
+
+@breaks("delivery")
+def _delivered_to_a_stranger(records: Records) -> list[Record]:
+    first = batches(records)[0]
+    return add_verdict(records, first, Verdict("r1", 1, "r9", first.now_ns))
+
+
+@breaks("delivery", run=("coordination=centralized",))
+def _delivered_to_somebody_else(records: Records) -> list[Record]:
+    first = batches(records)[0]
+    return add_verdict(records, first, Verdict("r1", 1, "r2", first.now_ns))
+
+
+@breaks("weights", run=MERGES["min"])
+def _weight_rises(records: Records) -> list[Record]:
+    last = acts(records, "r1")[-1]
+    spent_first = entries(acts(records, "r1")[0].outputs.lowered)[0][0]
+    return put_act(records, last, outputs(lowered=pairs((spent_first, 3))))
+
+
+@breaks("weights", run=MERGES["min"])
+def _weight_falls_to_what_it_was(records: Records) -> list[Record]:
+    act = acts(records, "r1")[3]
+    fallen = entries(act.outputs.lowered)
+    return put_act(records, act, outputs(lowered=pairs(*fallen, fallen[0])))
+
+
+@breaks("weights", run=(*MERGES["min"], *DEAF))
+def _lowered_does_not_decode(records: Records) -> list[Record]:
+    return put_act(records, acts(records, "r1")[-1], outputs(lowered=b"\x80"))
+
+
+@breaks("weights", run=MERGES["min"])
+def _published_vector_is_not_the_robots(records: Records) -> list[Record]:
+    act = acts(records, "r1")[10]
+    message = msgspec.msgpack.decode(act.outputs.weights, type=WeightsMessage)
+    assert message.base > 0
+    risen = msgspec.structs.replace(message, content=b"")
+    return put_act(records, act, outputs(weights=msgspec.msgpack.encode(risen)))
+
+
+@breaks("weights", run=MERGES["min"])
+def _published_vector_cannot_be_rebuilt(records: Records) -> list[Record]:
+    act = acts(records, "r1")[10]
+    return put_act(records, act, outputs(weights=act.outputs.weights[:-1]))
+
+
+@breaks("energy")
+def _budget_was_smaller(records: Records) -> list[Record]:
+    return with_scenario(records, energy={"steps": 20})
+
+
+@breaks("energy", run=MERGES["min"])
+def _point_holds_more_than_it_can(records: Records) -> list[Record]:
+    act = acts(records, "r1")[3]
+    (sample, units), *rest = entries(act.outputs.spent)
+    return put_act(records, act, outputs(spent=pairs((sample, units + 1), *rest)))
+
+
+@breaks("energy")
+def _counts_less_than_it_shipped(records: Records) -> list[Record]:
+    return put_act(records, acts(records, "r1")[3], outputs(energy_spent=3))
+
+
+@breaks("energy", "credit", run=MERGES["min"])
+def _spending_does_not_decode(records: Records) -> list[Record]:
+    return put_act(records, acts(records, "r1")[3], outputs(spent=b"\x80"))
+
+
+@breaks("ledger")
+def _sends_another_log_than_it_consumed(records: Records) -> list[Record]:
+    act = acts(records, "r1")[0]
+    (sample, units), *_ = entries(act.outputs.spent)
+    log = uints(0, 0, 1, 1) + pairs((sample, units % 2 + 1))
+    change = news(act, lambda said: msgspec.structs.replace(said, logs=log))
+    return put_act(records, act, change)
+
+
+@breaks("ledger")
+def _sends_entries_that_it_never_made(records: Records) -> list[Record]:
+    act = acts(records, "r1")[0]
+    log = uints(0, 500, 1, 1) + pairs((0, 1))
+    change = news(act, lambda said: msgspec.structs.replace(said, logs=log))
+    return put_act(records, act, change)
+
+
+@breaks("ledger")
+def _sends_what_is_no_message(records: Records) -> list[Record]:
+    act = acts(records, "r1")[3]
+    (envelope,) = act.outputs.outbox
+    garbled = msgspec.structs.replace(envelope, body=b"\xc1")
+    return put_act(records, act, outputs(outbox=(garbled,)))
+
+
+@breaks("ledger")
+def _sends_logs_that_do_not_decode(records: Records) -> list[Record]:
+    act = acts(records, "r1")[3]
+    change = news(act, lambda said: msgspec.structs.replace(said, logs=b"\x80"))
+    return put_act(records, act, change)
+
+
+@breaks("ledger")
+def _holds_more_of_a_log_than_there_is(records: Records) -> list[Record]:
+    last = acts(records, "r1")[-1]
+
+    def boast(said: News) -> News:
+        own, *others = read_have(said.have, 3) or []
+        stamps = said.have[len(uints(own, *others)) :]
+        return msgspec.structs.replace(said, have=uints(own, others[0] + 1, others[1]) + stamps)
+
+    return put_act(records, last, news(last, boast))
+
+
+@breaks("ledger")
+def _ends_with_more_than_its_logs_leave(records: Records) -> list[Record]:
+    act = [act for act in acts(records, "r1") if act.outputs.lowered][-1]
+    return put_act(records, act, outputs(lowered=b""))
+
+
+@breaks("ledger", "credit")
+def _consumes_another_sample_than_it_says(records: Records) -> list[Record]:
+    act = acts(records, "r1")[0]
+    other = int(np.argmin(consumed(records, act.now_ns)))
+    (_, units), *rest = entries(act.outputs.spent)
+    return put_act(records, act, outputs(spent=pairs((other, units), *rest)))
+
+
+@breaks("credit", run=(*MERGES["min"], *DEAF, "energy.steps=10"))
+def _view_falls_below_the_truth(records: Records) -> list[Record]:
+    last = acts(records, "r1")[-1]
+    untouched = int(np.argmin(consumed(records, last.now_ns)))
+    return put_act(records, last, outputs(lowered=pairs((untouched, 0))))
+
+
+@breaks("credit", run=MERGES["min"])
+def _view_falls_before_the_truth_does(records: Records) -> list[Record]:
+    """r1 lowers a sample one step before another robot consumes it, which ends in the same views."""
+    for early, late in pairwise(acts(records, "r1")):
+        before, fallen = entries(early.outputs.lowered), entries(late.outputs.lowered)
+        truth = opening(records).units.sample - consumed(records, early.now_ns - 1)
+        ahead = [(sample, left) for sample, left in fallen if left < truth[sample]]
+        own = {sample for sample, _ in [*before, *entries(late.outputs.spent)]}
+        if ahead and ahead[0][0] not in own:
+            later = [entry for entry in fallen if entry != ahead[0]]
+            told = put_act(records, early, outputs(lowered=pairs(*before, ahead[0])))
+            return put_act(told, late, outputs(lowered=pairs(*later)))
+    raise AssertionError("r1 never learns anything")
+
+
+@breaks("speed")
+def _jumps(records: Records) -> list[Record]:
+    act = acts(records, "r1")[3]
+    pose = act.ruling.pose
+    return put_act(records, act, ruling(pose=Pose(pose.x_m + 30.0, pose.y_m)))
+
+
+@breaks("speed", run=("coordination=centralized",))
+def _supervisor_moves(records: Records) -> list[Record]:
+    act = acts(records, SUPERVISOR)[-1]
+    return put_act(records, act, ruling(pose=Pose(50.0, 50.1)))
+
+
+@breaks("speed")
+def _nowhere(records: Records) -> list[Record]:
+    return put_act(records, acts(records, "r1")[-1], ruling(pose=Pose(float("nan"), 0.0)))
+
+
+@breaks("speed")
+def _vehicle_was_slower(records: Records) -> list[Record]:
+    return with_scenario(records, vehicle={"speed_m_s": 50.0})
+
+
+@breaks("goal")
+def _goal_is_no_sample(records: Records) -> list[Record]:
+    return put_act(records, acts(records, "r1")[3], outputs(goal=(1.0, 2.0)))
+
+
+@breaks("goal")
+def _goal_is_used_up(records: Records) -> list[Record]:
+    mine = acts(records, "r1")
+    empty = next(
+        sample for act in mine for sample, left in entries(act.outputs.lowered) if left == 0
+    )
+    place = opening(records).site.samples_m[empty].tolist()
+    return put_act(records, mine[-2], outputs(goal=tuple(place)))
+
+
+@breaks("order")
+def _step_is_left_out(records: Records) -> list[Record]:
+    act = acts(records, "r1")[-1]
+    return put_act(records, act, outputs(step=act.outputs.step + 1))
+
+
+@breaks("order")
+def _step_is_repeated(records: Records) -> list[Record]:
+    act = acts(records, "r1")[-1]
+    return put_act(records, act, outputs(step=act.outputs.step - 1))
+
+
+@breaks("order", run=DEAF)
+def _time_runs_back(records: Records) -> list[Record]:
+    batch = batches(records)[4]
+    return put(records, batch, msgspec.structs.replace(batch, now_ns=batch.now_ns - 300_000_000))
+
+
+@breaks("order")
+def _no_opening(records: Records) -> list[Record]:
+    return list(records[1:])
+
+
+@breaks("order")
+def _second_opening(records: Records) -> list[Record]:
+    return [records[0], *records]
+
+
+@breaks("order")
+def _batch_after_the_ending(records: Records) -> list[Record]:
+    return [*records, records[-2]]
+
+
+@breaks("order")
+def _second_ending(records: Records) -> list[Record]:
+    return [*records, records[-1]]
+
+
+@breaks("order")
+def _stranger_acts(records: Records) -> list[Record]:
+    first = batches(records)[0]
+    stranger = msgspec.structs.replace(first.acts[0], name="r9")
+    return put(records, first, msgspec.structs.replace(first, acts=(*first.acts, stranger)))
+
+
+@breaks("ruling")
+def _world_refused_something(records: Records) -> list[Record]:
+    return put_act(records, acts(records, "r1")[3], ruling(violations=("speed",)))
+
+
+@pytest.mark.parametrize("name", list(BROKEN))
+def test_broken_rule_is_named(played: Play, name: str) -> None:
+    """A record that breaks a rule brings complaints that name this rule, and no other."""
+    run, broken_record, expected = BROKEN[name]
+    records = played(*run)
+
+    assert rules(records) == set()
+    assert rules(broken_record(records)) == expected
+
+
+def test_every_rule_can_be_broken() -> None:
+    """No rule of the checker is without a record that breaks it."""
+    assert Checker.__doc__ is not None
+    listed = Checker.__doc__.partition("-----\n")[2].splitlines()
+    names = {line.split()[0] for line in listed if line[4:5].isalpha()}
+
+    assert names == {name.partition("-")[0] for name in BROKEN}
+
+
+def test_complaint_says_when_who_and_what(played: Play) -> None:
+    """A complaint is one line: rule, time, who, what."""
+    records = _jumps(played(*DEAF))
+
+    assert check(records).complaints[0].startswith("speed: t=0.400 s: r1: moved ")
+
+
+def test_broken_record_is_counted_to_its_end(played: Play) -> None:
+    """A hundred complaints are kept, all are counted."""
+    records = played()
+    checker = check([*records, *(records[-1] for _ in range(150))])
+
+    assert (len(checker.complaints), checker.count) == (100, 150)
+
+
+def test_subscriber_sees_what_the_checker_follows(played: Play) -> None:
+    """What observers rebuild from the weights key is what the robots hold at the end."""
+    for merge in MERGES.values():
+        records = played(*merge)
+        for name in ("r1", "r2", "r3"):
+            subscriber = WeightsSubscriber()
+            view = np.full(60, opening(records).units.sample)
+            for act in acts(records, name):
+                for sample, left in entries(act.outputs.lowered):
+                    view[sample] = left
+                if act.outputs.weights:
+                    assert subscriber.take(act.outputs.weights)
+
+            assert subscriber.weights is not None
+            assert view.tolist() == subscriber.weights.tolist()
+
+
+def test_logs_in_messages_are_read_as_rows() -> None:
+    """A suffix is origin, start, span, count and packed pairs."""
+    log = uints(1, 7, 2, 2) + pairs((3, 2), (1, 1))
+    rows = read_logs(log)
+
+    assert rows is not None
+    assert rows.tolist() == [[1, 7, 3, 2], [1, 8, 1, 1]]
