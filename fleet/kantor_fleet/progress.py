@@ -97,7 +97,7 @@ def line_of(progress: Progress) -> str:
     parts = [_time(progress)]
     if progress.phase == "waiting":
         return f"{parts[0]}  {_phase(progress)}"
-    parts.append(f"energy {progress.energy_spent}/{progress.energy_total}")
+    parts.append(f"explored {_explored(progress)}")
     parts += [f"{name} {value}" for name, value in _figures(progress)]
     if progress.phase != "running" or progress.detail:
         parts.append(_phase(progress))
@@ -106,17 +106,17 @@ def line_of(progress: Progress) -> str:
 
 def panel_of(scenario: str, progress: Progress) -> RenderableType:
     """Progress as a small panel: how far, how well, and what is going on."""
-    energy = Table.grid(padding=(0, 1), expand=True)
-    energy.add_column()
-    energy.add_column(ratio=1)
-    energy.add_column(justify="right")
-    bar = ProgressBar(total=max(1, progress.energy_total), completed=progress.energy_spent)
-    energy.add_row("energy", bar, f"{progress.energy_spent}/{progress.energy_total}")
+    explored = Table.grid(padding=(0, 1), expand=True)
+    explored.add_column()
+    explored.add_column(ratio=1)
+    explored.add_column(justify="right")
+    bar = ProgressBar(total=1.0, completed=1.0 - progress.mass_left)
+    explored.add_row("explored", bar, _explored(progress))
 
     rows: list[RenderableType] = [Text(_phase(progress), style=_STYLES.get(progress.phase, ""))]
     if progress.phase != "waiting":
         figures = [Text.assemble((f"{name} ", "dim"), value) for name, value in _figures(progress)]
-        rows = [energy, Columns(figures, padding=(0, 3)), *rows]
+        rows = [explored, Columns(figures, padding=(0, 3)), *rows]
     title = Text.assemble((printable(scenario), "bold"), f"  {_time(progress)}")
     return Constrain(Panel(Group(*rows), title=title, title_align="left"), _PANEL_COLUMNS)
 
@@ -129,11 +129,17 @@ def printable(text: str) -> str:
 _STYLES = {"waiting": "yellow", "running": "green", "over": "cyan"}
 
 
+def _explored(progress: Progress) -> str:
+    """Share of the mass that is used up."""
+    return f"{100.0 * (1.0 - progress.mass_left):.0f} %"
+
+
 def _figures(progress: Progress) -> list[tuple[str, str]]:
     """Names and values, in the order in which they are shown."""
     bound = progress.w_ub
     detected = [("detected", f"{progress.detected}/{progress.targets}")] if progress.targets else []
     return [
+        ("energy", f"{progress.energy_spent}/{progress.energy_total}"),
         *detected,
         ("W_UB", f"{bound:.1f}" if bound >= 100.0 else f"{bound:.4g}"),
         ("links", f"{progress.links}"),

@@ -163,6 +163,8 @@ class Progress(_Message, frozen=True, array_like=True, tag=22):
     """Deliveries a second of simulated time."""
     robots_done: int
     robots: int
+    mass_left: float = 1.0
+    """Share of the mass that the common weights still hold."""
 
 
 FromParticipant = Report | Ready

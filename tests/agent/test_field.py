@@ -12,6 +12,12 @@ Answer = list[tuple[float, int]]
 """(squared distance, sample), nearest first."""
 
 
+FAR_OFF_M = st.sampled_from([0.0, 1e9, 1e13, 1e17, 1e40]).flatmap(
+    lambda bound: st.floats(bound / 2.0, bound) | st.floats(-bound, -bound / 2.0)
+)
+"""From where rounding makes near samples equally far, and ties have to be kept."""
+
+
 def scan(xy_m: Points, alive: set[int], x: float, y: float, skip: list[int], k: int) -> Answer:
     """The reference: all samples with weight, by (squared distance, index)."""
     answer = []
@@ -85,7 +91,7 @@ def test_nearest_equals_a_full_scan(data: st.DataObject, xy_m: Points, k: int) -
         st.tuples(METRES, METRES)
         | st.just((float(xy_m[at, 0]), float(xy_m[at, 1])))
         | st.just((float(xy_m[at, 0]) + 0.5, float(xy_m[at, 1])))
-        | st.tuples(st.floats(-1e12, 1e12), st.floats(-1e12, 1e12))
+        | st.tuples(FAR_OFF_M, FAR_OFF_M)
     )
 
     assert ask(grid, x, y, skip, k) == scan(xy_m, set(range(count)) - dead, x, y, skip, k)
@@ -170,6 +176,34 @@ def test_grid_built_again_after_a_move_equals_a_new_one(
     assert ask(grid, x, y, [], k) == ask(fresh, x, y, [], k)
     assert ask(grid, x, y, [], k) == scan(xy_m, set(range(count)) - dead, x, y, [], k)
     check_pyramid(grid, set(range(count)) - dead)
+
+
+@pytest.mark.parametrize("stride_m", [1.0, 50.0, 500.0, 5000.0])
+def test_samples_may_walk_far_out_of_the_first_frame(stride_m: float) -> None:
+    """The grid keeps its frame; samples beyond it belong to the cells at its border."""
+    count = 300
+    xy_m = scattered(count)
+    grid = grid_over(xy_m, weights_of(count, set()))
+    steps_m = 2.0 * scattered(count, seed=2, extent_m=stride_m) - stride_m
+    for walked in range(4):
+        xy_m += np.roll(steps_m, walked, axis=0)
+        build(grid, weights_of(count, set()))
+        places_m = 6.0 * scattered(60, seed=3, extent_m=stride_m + 50.0) - 3.0 * stride_m
+        for x, y in places_m.tolist():
+            expected = scan(xy_m, set(range(count)), x, y, [], 4)
+
+            assert ask(grid, x, y, [], 4) == expected
+
+
+@pytest.mark.parametrize("far_m", [1e9, 1e13, 1e17, 1e40])
+def test_from_far_off_equally_far_samples_come_by_index(far_m: float) -> None:
+    """Where distances round to the same number, the lower index is nearer, in whatever cell."""
+    xy_m = scattered(200)
+    grid = grid_over(xy_m, weights_of(200, set()))
+    for x, y in ((far_m, 0.0), (-far_m, far_m), (50.0, -far_m), (far_m, far_m)):
+        expected = scan(xy_m, set(range(200)), x, y, [], 7)
+
+        assert ask(grid, x, y, [], 7) == expected
 
 
 def test_ties_go_to_the_lower_index() -> None:

@@ -36,6 +36,12 @@ def poses(parameters: Parameters) -> st.SearchStrategy[Pose]:
     )
 
 
+def speeding(parameters: Parameters) -> st.SearchStrategy[Pose]:
+    """The same, but some are faster than the vehicle can be."""
+    faster = st.floats(parameters.speed_m_s, 10.0 * parameters.speed_m_s)
+    return poses(parameters) | st.builds(Pose, METRES, METRES, ANGLES, faster)
+
+
 def moved(before: Pose, after: Pose) -> float:
     """How far a step went."""
     return math.hypot(after.x_m - before.x_m, after.y_m - before.y_m)
@@ -61,13 +67,14 @@ def test_step_is_finite_and_within_the_speed(
     name: str, data: st.DataObject, parameters: Parameters, x_m: float, y_m: float, dt_s: float
 ) -> None:
     """Whatever the goal: a finite pose, no further than speed * dt, and no faster than the speed."""
-    pose = data.draw(poses(parameters))
+    pose = data.draw(speeding(parameters))
     after = VEHICLES[name](parameters).drive(pose, x_m, y_m, dt_s)
     limit_m = parameters.speed_m_s * dt_s
+    fastest_m_s = parameters.speed_m_s if dt_s > 0.0 else max(parameters.speed_m_s, pose.speed_m_s)
 
     assert all(map(math.isfinite, (after.x_m, after.y_m, after.heading_rad, after.speed_m_s)))
     assert moved(pose, after) <= limit_m * (1.0 + 1e-9) + rounding(pose) + rounding(after)
-    assert 0.0 <= after.speed_m_s <= parameters.speed_m_s * (1.0 + 1e-9)
+    assert 0.0 <= after.speed_m_s <= fastest_m_s * (1.0 + 1e-9)
 
 
 @NAMES
@@ -245,12 +252,15 @@ def test_dubins_passes_its_goal(
     assert not outside or min(math.hypot(pose.x_m, pose.y_m) for pose in way) < radius_m
 
 
-def test_dubins_goes_straight_while_the_goal_is_inside_a_circle() -> None:
-    """A goal beside the vehicle cannot be turned to; it is left behind first and then passed."""
+@pytest.mark.parametrize(("beside_m", "straight"), [(20.0, True), (59.0, True), (61.0, False)])
+def test_dubins_goes_straight_while_the_goal_is_inside_a_circle(
+    *, beside_m: float, straight: bool
+) -> None:
+    """A goal less than two radii beside it cannot be turned to; it is left behind first."""
     vehicle = VEHICLES["dubins"](Parameters(turn_radius_m=30.0))
-    way = track(vehicle, Pose(0.0, 0.0, 0.0, 100.0), (0.0, 20.0), 60)
+    way = track(vehicle, Pose(0.0, 0.0, 0.0, 100.0), (0.0, beside_m), 60)
     turns = [after.heading_rad - before.heading_rad for before, after in pairwise(way)]
 
-    assert turns[0] == 0.0
+    assert (turns[0] == 0.0) == straight
     assert any(turn != 0.0 for turn in turns)
-    assert min(math.hypot(pose.x_m, pose.y_m - 20.0) for pose in way[1:]) < 6.0
+    assert min(math.hypot(pose.x_m, pose.y_m - beside_m) for pose in way[1:]) < 6.0

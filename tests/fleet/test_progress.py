@@ -24,8 +24,9 @@ UNDER_WAY = Progress(
     messages_per_s=41.7,
     robots_done=0,
     robots=5,
+    mass_left=0.43,
 )
-LINE = "t=  12.3 s  energy 615/5000  detected 47/300  W_UB 2311.4  links 3  msg/s 42  done 0/5"
+LINE = "t=  12.3 s  explored 57 %  energy 615/5000  detected 47/300  W_UB 2311.4  links 3  msg/s 42  done 0/5"
 
 
 class Watch:

@@ -4,7 +4,6 @@ import functools
 from collections.abc import Callable
 
 import pytest
-from strategies import mission
 
 from kantor_fleet.team import team
 from kantor_protocol.scenario import Scenario
@@ -12,6 +11,7 @@ from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.records import Record
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
+from strategies import mission
 
 ROOMY = ("samples.count=60", "energy.points=90", "energy.steps=60", "targets.count=40")
 """L = 180: three units a sample, two a point; twice the energy that is needed."""

@@ -91,7 +91,7 @@ def _transmit(
             range_m = law.supervisor_range_m if by_supervisor else law.range_m
             dx = xy_m[other, 0] - xy_m[source, 0]
             dy = xy_m[other, 1] - xy_m[source, 1]
-            if dx * dx + dy * dy > range_m * range_m:
+            if not dx * dx + dy * dy <= range_m * range_m:  # nor when a place is unknown
                 out_of_range += 1
                 continue
             here = _LINK_WIDTH - 1 if source == supervisor else source

@@ -237,7 +237,7 @@ class Checker:
         range_m = scenario.supervisor.range_m if by_supervisor else scenario.radio.range_m
         here, there = self._poses[verdict.source], self._poses[verdict.target]
         dx, dy = there.x_m - here.x_m, there.y_m - here.y_m
-        if dx * dx + dy * dy > range_m * range_m:
+        if not dx * dx + dy * dy <= range_m * range_m:
             self._complain(
                 "range",
                 verdict.target,

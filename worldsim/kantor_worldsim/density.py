@@ -5,6 +5,7 @@ what is sent.
 """
 
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 import numpy.typing as npt
@@ -94,14 +95,14 @@ def _from_image(
     key: str, file: str, domain: Domain, count: int, random: np.random.Generator
 ) -> Points:
     """Pixels by their brightness, uniform within a pixel; the image spans the domain, top row up."""
-    from PIL import Image, UnidentifiedImageError  # noqa: PLC0415  only where an image is used
+    from PIL import Image  # noqa: PLC0415  only where an image is used
 
     try:
         with Image.open(file) as image:
             grey = np.asarray(image.convert("F"), dtype=np.float64)
     except FileNotFoundError:
         raise ScenarioError(f"{key}.file: {file}: no such file") from None
-    except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise ScenarioError(f"{key}.file: {file}: not a readable image: {error}") from None
     if not np.isfinite(grey).all() or grey.min() < 0.0 or grey.sum() <= 0.0:
         raise ScenarioError(f"{key}.file: {file}: no bright pixel; white is dense, black is empty")
@@ -117,10 +118,10 @@ def _points(key: str, file: str) -> Points:
     """Rows of x, y in metres from CSV (a header is allowed) or NPY."""
     path = Path(file)
     try:
-        points = _csv(path) if path.suffix.lower() == ".csv" else np.load(path, allow_pickle=False)
+        points = _csv(path) if path.suffix.lower() == ".csv" else _npy(path)
     except FileNotFoundError:
         raise ScenarioError(f"{key}.file: {file}: no such file") from None
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, SyntaxError, TokenError, MemoryError) as error:
         problem = str(error).splitlines()[0]
         raise ScenarioError(f"{key}.file: {file}: not a table of x, y: {problem}") from None
     if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind not in "fiu":
@@ -137,9 +138,15 @@ def _points(key: str, file: str) -> Points:
 
 
 def _csv(path: Path) -> Points:
-    first = path.read_text(encoding="utf-8-sig").lstrip().partition("\n")[0]
-    with path.open(encoding="utf-8-sig") as lines:
-        return np.loadtxt(lines, delimiter=",", ndmin=2, skiprows=0 if _is_row(first) else 1)
+    text = (line.partition("#")[0] for line in path.read_text(encoding="utf-8-sig").splitlines())
+    lines = [line for line in text if line.strip()]
+    rows = lines if lines and _is_row(lines[0]) else lines[1:]
+    return np.loadtxt(rows, delimiter=",", ndmin=2) if rows else np.zeros((0, 2))
+
+
+def _npy(path: Path) -> Points:
+    with path.open("rb") as file:  # np.load would also open archives
+        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
 
 
 def _is_row(line: str) -> bool:

@@ -107,17 +107,16 @@ class Journal:
         self._write(METRICS_TOPIC, json.dumps(row._asdict()).encode())
 
     def close(self) -> None:
-        """Finish the file."""
-        if self._file is None:
-            return
-        if self.cut is None:
+        """Finish the file, and give the reserve back, so that the result finds room."""
+        if self._file is not None:
             try:
                 self._writer.finish()  # type: ignore[no-untyped-call]
                 self._file.flush()
             except OSError as error:
                 self._give_up(error)
         self._drop_file()
-        self._reserve.unlink(missing_ok=True)
+        if self._path is not None:
+            self._reserve.unlink(missing_ok=True)
 
     def _write(self, topic: str, payload: bytes) -> None:
         if self._file is None or self.cut is not None:
@@ -134,10 +133,9 @@ class Journal:
             self._give_up(error)
 
     def _give_up(self, error: OSError) -> None:
-        """Stop writing and give the reserve back, so that the result still finds room."""
+        """Stop writing."""
         self.cut = f"cut at t={self._time_ns * 1e-9:.3f} s: {error.strerror or error}"
         self._drop_file()
-        self._reserve.unlink(missing_ok=True)
 
     def _drop_file(self) -> None:
         file, self._file = self._file, None
@@ -152,7 +150,7 @@ def read(path: Path) -> Iterator[tuple[bytes, Record]]:
         if topic == RECORD_TOPIC:
             try:
                 yield message.data, decode_record(message.data)
-            except (msgspec.MsgspecError, RecursionError):
+            except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
                 return
 
 

@@ -68,6 +68,7 @@ class Glance(NamedTuple):
     messages_per_s: float
     """Deliveries a simulated second over the last ten rows."""
     robots_done: int
+    mass_left: float
 
 
 class Bounds(msgspec.Struct, frozen=True):
@@ -323,7 +324,7 @@ class Metrics:
     def glance(self) -> Glance:
         """How the run stands, by the last row."""
         if not self.rows:
-            return Glance(0, 0, 0, 0, 0.0, 0, 0.0, 0)
+            return Glance(0, 0, 0, 0, 0.0, 0, 0.0, 0, 1.0)
         last = self.rows[-1]
         before = self.rows[max(0, len(self.rows) - 11)]
         elapsed_s = last.time_s - before.time_s
@@ -337,6 +338,7 @@ class Metrics:
             links=last.links,
             messages_per_s=rate,
             robots_done=len(self._resting),
+            mass_left=last.mass_left,
         )
 
     def result(

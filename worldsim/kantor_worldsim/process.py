@@ -371,4 +371,5 @@ def progress(metrics: Metrics, scenario: Scenario, phase: str, detail: str) -> P
         messages_per_s=glance.messages_per_s,
         robots_done=glance.robots_done,
         robots=scenario.robots.count,
+        mass_left=glance.mass_left,
     )
