@@ -107,6 +107,11 @@ class Unicycle:
         heading = _wrapped(pose.heading_rad + turn)
         braking = _stopping(distance, self._acceleration_m_s2, dt_s)
         wanted = min(self._speed_m_s, braking, distance / dt_s) * max(0.0, math.cos(error - turn))
+        # On a circle through the goal the bearing turns at 2 v sin(error) / distance; faster than the
+        # vehicle can turn, it would orbit the goal for ever.
+        off = 2.0 * abs(math.sin(error - turn))
+        if off * wanted > self._turn_rate_rad_s * distance:
+            wanted = self._turn_rate_rad_s * distance / off
         bound = self._acceleration_m_s2 * dt_s
         speed = pose.speed_m_s + _clamped(wanted - pose.speed_m_s, bound)
         speed = max(0.0, min(speed, self._speed_m_s))

@@ -375,6 +375,9 @@ def _override(tree: dict[str, Any], override: str) -> None:
         table[path[-1]] = text.strip()
 
 
+_PERIODS_UNDER_WAY = 1000
+"""Robots remember what they sent for as long as an answer may take."""
+
 _KNOWN: dict[str, tuple[str, ...]] = {
     "": Scenario.__struct_fields__,
     "domain": Domain.__struct_fields__,
@@ -443,6 +446,8 @@ def _complaints(scenario: Scenario) -> Iterable[str]:
     shortest_s = clock.period_s * (1.0 - clock.spread) * (1.0 - clock.drift_ppm * 1e-6)
     if clock.jitter_s + 1e-9 >= shortest_s:  # a step must not overtake the next one
         yield f"clock.jitter_s: must be below the shortest period after spread and drift, {shortest_s:g} s"
+    if scenario.radio.delay_s + scenario.radio.jitter_s > _PERIODS_UNDER_WAY * shortest_s:
+        yield f"radio.delay_s: with the jitter over {_PERIODS_UNDER_WAY} periods; make it shorter"
     if scenario.claims and scenario.planner.name != "transport":
         yield "claims: only the transport planner has them; set claims=false"
 

@@ -137,7 +137,9 @@ def test_point_ships_all_it_has_and_no_sample_gives_more_than_it_has(
         ]
 
 
-@pytest.mark.parametrize(("points", "count"), [(5, 2), (12, 30), (30, 12), (7, 7), (1, 9), (9, 1)])
+@pytest.mark.parametrize(
+    ("points", "count"), [(5, 2), (12, 30), (30, 12), (7, 7), (1, 9), (9, 1), (1500, 7)]
+)
 @pytest.mark.parametrize("ledger", [True, False], ids=["ledger", "min"])
 def test_energy_exhausts_the_mass_exactly(*, points: int, count: int, ledger: bool) -> None:
     """M points ship the whole mass, each its full 1/M, and then nothing is left; no residue."""
@@ -167,6 +169,33 @@ def test_last_point_ships_what_is_left() -> None:
     assert one.weights.tolist() == [1]
     assert spend(one, 0.0, 0.0) == [(0, 1)]
     assert one.empty
+
+
+@pytest.mark.parametrize("ledger", [True, False], ids=["ledger", "min"])
+def test_belief_holds_when_logs_outgrow_their_room(*, ledger: bool) -> None:
+    """A long log of one's own and a long one that comes in at once: nothing is lost of either."""
+    one, other = (
+        belief_over(scattered(5), 2000, me=me, origins=2, ledger=ledger) for me in range(2)
+    )
+    shipped: list[Plan] = [[], []]
+    for x_m, y_m in scattered(700, seed=3).tolist():
+        for plan, belief in zip(shipped, (one, other), strict=True):
+            plan.extend(spend(belief, x_m if belief is one else 100.0 - x_m, y_m))
+            belief.advance(0)
+            belief.replica.end_step()
+    have, logs, claims = other.replica.compose(0)
+    assert one.learn(1, News(1, 1, 0.0, 0.0, have, logs, claims))
+    one.advance(0)
+    left = [min(a, b) for a, b in zip(one.weights.tolist(), other.weights.tolist(), strict=True)]
+    if ledger:
+        left = [400] * 5
+        for sample, units in shipped[0] + shipped[1]:
+            left[sample] -= units
+
+    assert one.weights.tolist() == [max(0, weight) for weight in left]
+    plan = spend(one, 50.0, 50.0)
+    assert one.replica.entries(0)[-1][0] == plan[-1][0]
+    assert sum(one.weights.tolist()) == sum(max(0, weight) for weight in left) - 1
 
 
 @examples(60)
