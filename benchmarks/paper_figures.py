@@ -12,9 +12,11 @@ import multiprocessing
 import os
 import statistics
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
+
+from scipy.stats import t as student
 
 from kantor_fleet.catalog import find
 from kantor_fleet.team import team
@@ -29,8 +31,6 @@ MINIMUM = ("merge=min", "claims=false")
 CONCURRENT = ("clock.order=concurrent",)
 SPEEDS_M = (3, 5, 7, 9, 12, 15)
 """Diffusions v of section VI-D at which the time-varying form is clearly ahead."""
-STUDENT_975 = {9: 2.262, 19: 2.093, 29: 2.045, 39: 2.023, 49: 2.010, 99: 1.984}
-"""97.5 % quantiles of Student's t by degrees of freedom."""
 
 
 class Setting(NamedTuple):
@@ -214,13 +214,23 @@ def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _interval(values: Sequence[float]) -> tuple[float, float]:
-    """Mean and half width of its 95 % interval."""
-    mean, freedom = statistics.fmean(values), len(values) - 1
-    if freedom < 1:
-        return mean, math.inf
-    known = max((known for known in STUDENT_975 if known <= freedom), default=0)
-    student = STUDENT_975.get(known, 12.71)  # from above where the table has no line
-    return mean, student * statistics.stdev(values) / math.sqrt(len(values))
+    """Mean and half width of its 95 % interval by Student's t."""
+    if len(values) == 1:
+        return values[0], math.inf
+    error = statistics.stdev(values) / math.sqrt(len(values))
+    return statistics.fmean(values), float(student.ppf(0.975, len(values) - 1)) * error
+
+
+def _run_all(orders: Sequence[tuple[Setting, int]], jobs: int) -> Iterator[Result]:
+    """The runs in order, with a count for whoever watches."""
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=spawn) as pool:
+        done = pool.map(fly, *zip(*orders, strict=True), chunksize=2)
+        for number, result in enumerate(done, 1):
+            if sys.stderr.isatty():
+                end = "\n" if number == len(orders) else ""
+                print(f"\r{number}/{len(orders)} runs", end=end, file=sys.stderr, flush=True)
+            yield result
 
 
 def _print_table(lines: Sequence[Line], seeds: int) -> None:
@@ -244,11 +254,8 @@ def main() -> int:
         parser.error("--seeds and --jobs must be at least 1")
     settings = list(dict.fromkeys(setting for claim in CLAIMS for setting in claim.settings))
     orders = [(setting, seed) for setting in settings for seed in range(options.seeds)]
-    spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(options.jobs, mp_context=spawn) as pool:
-        results = list(pool.map(fly, *zip(*orders, strict=True), chunksize=2))
     runs: dict[Setting, list[Result]] = {setting: [] for setting in settings}
-    for (setting, _seed), result in zip(orders, results, strict=True):
+    for (setting, _seed), result in zip(orders, _run_all(orders, options.jobs), strict=True):
         runs[setting].append(result)
     lines = [claim.line(runs) for claim in CLAIMS]
     _print_table(lines, options.seeds)

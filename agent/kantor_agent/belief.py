@@ -1,14 +1,13 @@
 """What a robot believes: how much weight is left on which sample, and where the samples are."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
+from kantor_agent.field import Grid, build, grid_over, kernel, nearest, remove, remove_empty
 from kantor_protocol.messages import News
-from kantor_protocol.packing import Pairs
+from kantor_protocol.packing import Pairs, pack_pairs
 from kantor_protocol.replica import Manner, Replica, Store, spend
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, Weights
@@ -25,7 +24,7 @@ class _Room(NamedTuple):
     units: npt.NDArray[np.int64]
 
 
-@njit(cache=True)
+@kernel
 def ship(
     grid: Grid, store: Store, manner: Manner, x: float, y: float, point: int, room: _Room
 ) -> int:
@@ -49,6 +48,62 @@ def ship(
     return count
 
 
+@kernel
+def _ship_packed(
+    xy_m: np.ndarray,
+    order: np.ndarray,
+    slot: np.ndarray,
+    cell: np.ndarray,
+    first: np.ndarray,
+    alive: np.ndarray,
+    frame: np.ndarray,
+    levels: int,
+    weights: np.ndarray,
+    spent: np.ndarray,
+    log_index: np.ndarray,
+    log_value: np.ndarray,
+    length: np.ndarray,
+    known: np.ndarray,
+    sending: np.ndarray,
+    claims: np.ndarray,
+    lowered: np.ndarray,
+    mark: np.ndarray,
+    counters: np.ndarray,
+    best: np.ndarray,
+    near: np.ndarray,
+    sample: np.ndarray,
+    units: np.ndarray,
+    out: np.ndarray,
+    me: int,
+    ledger: int,
+    point: int,
+    x: float,
+    y: float,
+) -> int:
+    """`ship` for calls from Python: bytes of packed pairs in `out`, or -1 if the log has no room."""
+    if length[me] + sample.shape[0] > log_index.shape[1]:
+        return -1
+    grid = Grid(xy_m, order, slot, cell, first, alive, frame, levels)
+    store = Store(
+        weights,
+        spent,
+        log_index,
+        log_value,
+        length,
+        known,
+        sending,
+        claims,
+        lowered,
+        mark,
+        counters,
+    )
+    # Of the manner, spending reads only whose log it is and what an entry means.
+    manner = Manner(me, ledger != 0, False, False, False, 0, 0, 0)
+    count = ship(grid, store, manner, x, y, point, _Room(best, near, sample, units))
+    used: int = pack_pairs(sample, units, count, out)
+    return used
+
+
 class Belief:
     """The replica of everybody's spending, with the samples in space.
 
@@ -69,7 +124,12 @@ class Belief:
             sample=np.zeros(most, dtype=np.int64),
             units=np.zeros(most, dtype=np.int64),
         )
+        self._packed = np.zeros(20 * most, dtype=np.uint8)
         self._pairs = Pairs()
+        self.to_search: tuple[Any, ...] = (*self.grid, replica.weights)
+        """Grid and weights as arguments of a kernel; see `field.kernel`."""
+        self._store = replica.store
+        self._to_ship = self._arguments()
 
     @property
     def weights(self) -> Weights:
@@ -95,22 +155,30 @@ class Belief:
         """Bring walking samples to `now_ns` and drop those that messages have emptied."""
         if self._walk.advance(now_ns):
             build(self.grid, self.weights)
-        else:
-            remove_empty(self.grid, self.weights, self.replica.lowered())
+            return
+        lowered = self.replica.lowered()
+        if lowered.size:
+            remove_empty(self.grid, self.weights, lowered)
 
     def spend(self, x_m: float, y_m: float) -> bytes:
         """Ship one robot point from here (Prop. 1); packed pairs (sample, units), nearest first."""
-        self.replica.reserve(self._room.sample.shape[0])
-        count = ship(
-            self.grid,
-            self.replica.store,
-            self.replica.manner,
-            x_m,
-            y_m,
-            self._units.point,
-            self._room,
-        )
-        return self._pairs.encode(self._room.sample, self._room.units, count)
+        used = self._ship(x_m, y_m)
+        if used < 0:
+            self.replica.reserve(self._room.sample.shape[0])
+            used = self._ship(x_m, y_m)
+        return self._packed[:used].tobytes()
+
+    def _ship(self, x_m: float, y_m: float) -> int:
+        if self._store is not self.replica.store:
+            self._store = self.replica.store
+            self._to_ship = self._arguments()
+        used: int = _ship_packed(*self._to_ship, x_m, y_m)
+        return used
+
+    def _arguments(self) -> tuple[Any, ...]:
+        manner = self.replica.manner
+        law = (manner.me, int(manner.ledger), self._units.point)
+        return (*self.grid, *self._store, *self._room, self._packed, *law)
 
     def lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""

@@ -1,9 +1,10 @@
 """Samples in space: the nearest ones that still have weight, found and used up in microseconds.
 
 A bucket grid holds the samples of each cell, those with weight in front; above it a pyramid counts
-them, so that a search skips what is empty. A query looks at the 3 x 3 cells around the point first.
-Where those do not settle it, it descends the pyramid and prunes by distance: the cost stays flat in N
-and does not grow when most samples are used up.
+them, so that a search skips what is empty. A query begins in the cell of the point and climbs the
+pyramid: on every level it searches the three siblings, each from the nearest cell on, unless they are
+empty or further away than what it has, and it ends when nothing outside can be nearer. The cost stays
+flat in N and does not grow when most samples are used up.
 
 All orders are by (squared distance, index), which makes every answer unique: it equals a full scan.
 """
@@ -14,6 +15,11 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+
+kernel = njit(cache=True, error_model="numpy", _nrt=False)
+"""Compiles a function that allocates nothing. Numba then counts no references to its arrays, which
+would cost more than the work itself; at the border to Python an array costs 0.02 us. A NamedTuple of
+arrays costs a whole one there, so what is called in every step takes the fields one by one."""
 
 _PER_CELL = 2.0
 """Samples in a cell on average."""
@@ -45,12 +51,12 @@ class Grid(NamedTuple):
     levels: int
 
 
-@njit(cache=True)
+@kernel
 def _level_start(level: int) -> int:
     return ((1 << (2 * level)) - 1) // 3
 
 
-@njit(cache=True)
+@kernel
 def _cell_of(grid: Grid, x: float, y: float) -> tuple[int, int]:
     side = 1 << (grid.levels - 1)
     column = int((x - grid.frame[_X]) / grid.frame[_CELL_M])
@@ -58,7 +64,7 @@ def _cell_of(grid: Grid, x: float, y: float) -> tuple[int, int]:
     return min(max(column, 0), side - 1), min(max(row, 0), side - 1)
 
 
-@njit(cache=True)
+@kernel
 def build(grid: Grid, weights: np.ndarray) -> None:
     """Sort all samples into cells by their present places, and count those with weight."""
     side = 1 << (grid.levels - 1)
@@ -71,20 +77,17 @@ def build(grid: Grid, weights: np.ndarray) -> None:
         grid.first[grid.cell[j] + 1] += 1
     for c in range(side * side):
         grid.first[c + 1] += grid.first[c]
-    # Two passes keep the samples with weight in front: alive counts from the start, dead from the end.
-    for j in range(grid.xy_m.shape[0]):
-        if weights[j] > 0:
-            c = grid.cell[j]
-            grid.order[grid.first[c] + grid.alive[leaves + c]] = j
-            grid.slot[j] = grid.first[c] + grid.alive[leaves + c]
-            grid.alive[leaves + c] += 1
-    dead = np.zeros(side * side, dtype=np.int32)
+    # Those with weight first, so that they are in front. The dead count only while they are placed.
+    for with_weight in (True, False):
+        for j in range(grid.xy_m.shape[0]):
+            if (weights[j] > 0) == with_weight:
+                c = grid.cell[j]
+                grid.slot[j] = grid.first[c] + grid.alive[leaves + c]
+                grid.order[grid.slot[j]] = j
+                grid.alive[leaves + c] += 1
     for j in range(grid.xy_m.shape[0]):
         if weights[j] <= 0:
-            c = grid.cell[j]
-            dead[c] += 1
-            grid.order[grid.first[c + 1] - dead[c]] = j
-            grid.slot[j] = grid.first[c + 1] - dead[c]
+            grid.alive[leaves + grid.cell[j]] -= 1
     for level in range(grid.levels - 2, -1, -1):
         width = 1 << level
         here, below = _level_start(level), _level_start(level + 1)
@@ -99,7 +102,7 @@ def build(grid: Grid, weights: np.ndarray) -> None:
                 )
 
 
-@njit(cache=True)
+@kernel
 def remove(grid: Grid, j: int) -> None:
     """Take a sample out of the search. A sample that is out already stays out."""
     c = grid.cell[j]
@@ -118,7 +121,7 @@ def remove(grid: Grid, j: int) -> None:
         column >>= 1
 
 
-@njit(cache=True)
+@kernel
 def remove_empty(grid: Grid, weights: np.ndarray, lowered: np.ndarray) -> None:
     """Take those of the lowered samples out that have no weight left."""
     for i in range(lowered.shape[0]):
@@ -126,7 +129,7 @@ def remove_empty(grid: Grid, weights: np.ndarray, lowered: np.ndarray) -> None:
             remove(grid, lowered[i])
 
 
-@njit(cache=True)
+@kernel
 def _scan_cell(
     grid: Grid, c: int, x: float, y: float, skip: np.ndarray, best: np.ndarray, near: np.ndarray
 ) -> None:
@@ -154,7 +157,7 @@ def _scan_cell(
         near[at] = j
 
 
-@njit(cache=True)
+@kernel
 def _box_d2(grid: Grid, level: int, row: int, column: int, x: float, y: float) -> float:
     """No sample of the node is nearer than this, squared. Border cells reach to infinity."""
     width = 1 << level
@@ -176,7 +179,36 @@ def _box_d2(grid: Grid, level: int, row: int, column: int, x: float, y: float) -
     return dx * dx + dy * dy
 
 
-@njit(cache=True)
+@kernel
+def _reach_d2(grid: Grid, level: int, row: int, column: int, x: float, y: float) -> float:
+    """From (x, y) in a node, all that is nearer than this, squared, lies in the node too."""
+    width = 1 << level
+    edge = grid.frame[_CELL_M] * (1 << (grid.levels - 1 - level))
+    reach: float = math.inf
+    if column > 0:
+        reach = min(reach, x - (grid.frame[_X] + column * edge))
+    if column < width - 1:
+        reach = min(reach, grid.frame[_X] + (column + 1) * edge - x)
+    if row > 0:
+        reach = min(reach, y - (grid.frame[_Y] + row * edge))
+    if row < width - 1:
+        reach = min(reach, grid.frame[_Y] + (row + 1) * edge - y)
+    reach = max(reach - grid.frame[_MARGIN_M], 0.0)
+    return reach * reach
+
+
+@kernel
+def _nearest_quarter(below: int, row: int, column: int, home_row: int, home_column: int) -> int:
+    """Which quarter of a node, 2 * upper + right, lies towards the home cell.
+
+    below: levels from the quarters down to the cells.
+    """
+    upper = home_row >= (2 * row + 1) << below
+    right = home_column >= (2 * column + 1) << below
+    return 2 * upper + right
+
+
+@kernel
 def nearest(
     grid: Grid, x: float, y: float, skip: np.ndarray, best: np.ndarray, near: np.ndarray
 ) -> int:
@@ -188,91 +220,37 @@ def nearest(
     k = near.shape[0]
     best[:] = np.inf
     near[:] = -1
-    leaf_level = grid.levels - 1
-    side = 1 << leaf_level
-    leaves = _level_start(leaf_level)
+    leaf = grid.levels - 1
     home_column, home_row = _cell_of(grid, x, y)
-    low_row, high_row = max(home_row - 1, 0), min(home_row + 1, side - 1)
-    low_column, high_column = max(home_column - 1, 0), min(home_column + 1, side - 1)
-    for row in range(low_row, high_row + 1):
-        for column in range(low_column, high_column + 1):
-            if grid.alive[leaves + row * side + column] > 0:
-                _scan_cell(grid, row * side + column, x, y, skip, best, near)
-    # Distance to what lies outside the block: no cell beyond a border.
-    reach = np.inf
-    edge = grid.frame[_CELL_M]
-    if low_column > 0:
-        reach = min(reach, x - (grid.frame[_X] + low_column * edge))
-    if high_column < side - 1:
-        reach = min(reach, grid.frame[_X] + (high_column + 1) * edge - x)
-    if low_row > 0:
-        reach = min(reach, y - (grid.frame[_Y] + low_row * edge))
-    if high_row < side - 1:
-        reach = min(reach, grid.frame[_Y] + (high_row + 1) * edge - y)
-    reach -= grid.frame[_MARGIN_M]
-    if not (near[k - 1] >= 0 and reach > 0.0 and best[k - 1] < reach * reach):
-        _descend(grid, x, y, skip, best, near, low_row, high_row, low_column, high_column)
+    level, row, column = leaf, home_row, home_column
+    _scan_cell(grid, (row << leaf) + column, x, y, skip, best, near)
+    while level > 0:
+        below = leaf - level
+        at_home = home_row >> below == row and home_column >> below == column
+        if at_home and best[k - 1] < _reach_d2(grid, level, row, column, x, y):
+            break
+        # Four siblings in turn: the one towards home, the two beside it, the one opposite. Then up.
+        home = _nearest_quarter(below, row >> 1, column >> 1, home_row, home_column)
+        turn = (2 * (row & 1) + (column & 1)) ^ home
+        if turn == 3:
+            level, row, column = level - 1, row >> 1, column >> 1
+            continue
+        quarter = (turn + 1) ^ home
+        row, column = (row & ~1) + (quarter >> 1), (column & ~1) + (quarter & 1)
+        # Down to the nearest cell of the sibling, while there can be something in it.
+        while (
+            grid.alive[_level_start(level) + (row << level) + column] > 0
+            and _box_d2(grid, level, row, column, x, y) <= best[k - 1]
+        ):
+            if level == leaf:
+                _scan_cell(grid, (row << leaf) + column, x, y, skip, best, near)
+                break
+            quarter = _nearest_quarter(leaf - level - 1, row, column, home_row, home_column)
+            level, row, column = level + 1, 2 * row + (quarter >> 1), 2 * column + (quarter & 1)
     found = 0
     while found < k and near[found] >= 0:
         found += 1
     return found
-
-
-@njit(cache=True)
-def _descend(
-    grid: Grid,
-    x: float,
-    y: float,
-    skip: np.ndarray,
-    best: np.ndarray,
-    near: np.ndarray,
-    low_row: int,
-    high_row: int,
-    low_column: int,
-    high_column: int,
-) -> None:
-    """Search the whole pyramid, nearest node first, but for the block of leaves already seen."""
-    k = near.shape[0]
-    stack = np.empty(4 * _LEVELS_MAX, dtype=np.int64)
-    bounds = np.empty(4 * _LEVELS_MAX, dtype=np.float64)
-    stack[0] = 0
-    bounds[0] = 0.0
-    top = 1
-    child_d2 = np.empty(4, dtype=np.float64)
-    child_node = np.empty(4, dtype=np.int64)
-    while top > 0:
-        top -= 1
-        if bounds[top] > best[k - 1]:
-            continue
-        level = stack[top] >> 48
-        row = (stack[top] >> 24) & 0xFFFFFF
-        column = stack[top] & 0xFFFFFF
-        if level == grid.levels - 1:
-            if not (low_row <= row <= high_row and low_column <= column <= high_column):
-                _scan_cell(grid, row * (1 << level) + column, x, y, skip, best, near)
-            continue
-        below = level + 1
-        start = _level_start(below)
-        count = 0
-        for q in range(4):
-            child_row, child_column = 2 * row + (q >> 1), 2 * column + (q & 1)
-            if grid.alive[start + child_row * (1 << below) + child_column] <= 0:
-                continue
-            d2 = _box_d2(grid, below, child_row, child_column, x, y)
-            if d2 > best[k - 1]:
-                continue
-            at = count
-            while at > 0 and child_d2[at - 1] < d2:
-                child_d2[at] = child_d2[at - 1]
-                child_node[at] = child_node[at - 1]
-                at -= 1
-            child_d2[at] = d2
-            child_node[at] = (below << 48) | (child_row << 24) | child_column
-            count += 1
-        for i in range(count):
-            bounds[top] = child_d2[i]
-            stack[top] = child_node[i]
-            top += 1
 
 
 def grid_over(xy_m: npt.NDArray[np.float64], weights: npt.NDArray[np.int64]) -> Grid:

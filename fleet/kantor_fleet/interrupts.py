@@ -10,7 +10,9 @@ from kantor_fleet.exits import Exit
 class Interrupts:
     """Notes SIGINT and SIGTERM while the context is open; the second SIGINT interrupts for good."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, patient: bool = False) -> None:
+        """patient: no number of signals interrupts; somebody else sees to it that this ends."""
+        self._patient = patient
         self.code: Exit | None = None
         """What to exit with, once a signal has come."""
 
@@ -29,6 +31,6 @@ class Interrupts:
         return self.code is not None
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
-        if self.code is not None and number == signal.SIGINT:
+        if self.code is not None and number == signal.SIGINT and not self._patient:
             raise KeyboardInterrupt
         self.code = Exit.INTERRUPTED if number == signal.SIGINT else Exit.TERMINATED

@@ -142,7 +142,8 @@ def _be_world_sim(order: Order, listen: str, secrets: Path, log: Path) -> None:
     plan = Plan(scenario, seed, Site.of(scenario, seed), order.exchange, order.speed)
     identity = credentials.find(secrets, credentials.HOST)
     users = credentials.users_file(secrets)
-    with Interrupts() as interrupts:
+    # The terminal and the parent may both say so: one Ctrl-C must not count as two.
+    with Interrupts(patient=True) as interrupts:
         try:
             with bus.Host(identity, listen, users, scenario.roster) as host:
                 recording = Recording(scenario, seed, order.exchange, order.folder)

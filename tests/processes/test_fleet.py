@@ -45,13 +45,13 @@ def detection(scenario: Scenario, seed: int) -> float:
     return len(metrics.finds) / len(site.targets_m)
 
 
-def await_line(process: "subprocess.Popen[str]", start: str) -> str:
-    """The first line of output that starts so; fails when the output ends before."""
+def await_line(process: "subprocess.Popen[str]", start: str, part: str = "") -> str:
+    """The first line of output that starts so and has that part; fails when the output ends before."""
     assert process.stdout is not None
     for line in process.stdout:
-        if line.startswith(start):
+        if line.startswith(start) and part in line:
             return line
-    raise AssertionError(f"no line starts with {start!r}")
+    raise AssertionError(f"no line starts with {start!r} and has {part!r}")
 
 
 def children_named(process: "subprocess.Popen[str]", log: Path) -> int:
@@ -103,7 +103,7 @@ def test_a_wall_run_finds_what_virtual_time_finds(kantor: "Kantor") -> None:
 def test_a_killed_robot_does_not_stop_the_others(kantor: "Kantor", exchange: str) -> None:
     """SIGKILL to r3 in the middle: the others finish, the record says who was missing, exit code 3."""
     process = kantor.start("run", "fleet", "--exchange", exchange, "--speed", 8)
-    await_line(process, "t=")
+    await_line(process, "t=", "energy")
     (folder,) = kantor.runs()
     os.kill(children_named(process, folder / "logs" / "r3.log"), signal.SIGKILL)
     out, err = process.communicate(timeout=100)
@@ -119,7 +119,7 @@ def test_a_killed_robot_does_not_stop_the_others(kantor: "Kantor", exchange: str
 def test_ctrl_c_ends_every_process_and_leaves_a_valid_record(kantor: "Kantor") -> None:
     """SIGINT to the whole group, as a terminal sends it."""
     process = kantor.start("run", "fleet", "--exchange", "wall", "--speed", 2)
-    await_line(process, "t=")
+    await_line(process, "t=", "energy")
     family = psutil.Process(process.pid).children(recursive=True)
     os.killpg(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=60)
@@ -127,7 +127,7 @@ def test_ctrl_c_ends_every_process_and_leaves_a_valid_record(kantor: "Kantor") -
     (folder,) = kantor.runs()
     assert process.returncode == 130, out + err
     assert len(family) >= 6
-    assert not [child for child in family if child.is_running() and child.status() != "zombie"]
+    assert psutil.wait_procs(family, timeout=10)[1] == []
     assert result_of(folder)["ended"] == "interrupted"
     assert (folder / "report.png").exists()
     assert kantor("verify", folder).code == 0
@@ -169,7 +169,7 @@ def test_a_robot_may_come_late(kantor: "Kantor") -> None:
     )  # fmt: skip
     await_line(world, "t=")
     robots = [kantor.start("agent", f"r{i}", "--connect", endpoint) for i in range(1, 5)]
-    while "waiting" in (line := await_line(world, "t=")) or "energy 0/" in line:
+    while "energy 0/" in await_line(world, "t=", "energy"):
         pass
     robots.append(kantor.start("agent", "r5", "--connect", endpoint))
     out, err = world.communicate(timeout=100)

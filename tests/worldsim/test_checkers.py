@@ -417,7 +417,7 @@ def _holds_more_of_a_log_than_there_is(records: Records) -> list[Record]:
     return put_act(records, last, news(last, boast))
 
 
-@breaks("ledger")
+@breaks("ledger", "weights")
 def _ends_with_more_than_its_logs_leave(records: Records) -> list[Record]:
     act = [act for act in acts(records, "r1") if act.outputs.lowered][-1]
     return put_act(records, act, outputs(lowered=b""))
@@ -431,7 +431,7 @@ def _consumes_another_sample_than_it_says(records: Records) -> list[Record]:
     return put_act(records, act, outputs(spent=pairs((other, units), *rest)))
 
 
-@breaks("credit", run=(*MERGES["min"], *DEAF, "energy.steps=10"))
+@breaks("credit", "weights", run=(*MERGES["min"], *DEAF, "energy.steps=10"))
 def _view_falls_below_the_truth(records: Records) -> list[Record]:
     last = acts(records, "r1")[-1]
     untouched = int(np.argmin(consumed(records, last.now_ns)))
@@ -489,6 +489,17 @@ def _goal_is_used_up(records: Records) -> list[Record]:
     )
     place = opening(records).site.samples_m[empty].tolist()
     return put_act(records, mine[-2], outputs(goal=tuple(place)))
+
+
+@breaks("goal", run=MERGES["min"])
+def _goal_was_emptied_by_news(records: Records) -> list[Record]:
+    places_m = opening(records).site.samples_m.tolist()
+    for act in acts(records, "r1"):
+        shipped = {sample for sample, _ in entries(act.outputs.spent)}
+        for sample, left in entries(act.outputs.lowered):
+            if left == 0 and sample not in shipped and act.outputs.goal is not None:
+                return put_act(records, act, outputs(goal=tuple(places_m[sample])))
+    raise AssertionError("no news empties a sample")
 
 
 @breaks("order")

@@ -42,6 +42,8 @@ from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 from strategies import examples, mission
 
+pytestmark = pytest.mark.xdist_group("journal")
+
 Play = Callable[..., tuple[Record, ...]]
 
 LONG = ("robots.count=3", "energy.points=9000", "samples.count=4000", "metrics.every=1")
@@ -268,12 +270,10 @@ def test_full_disk_cuts_the_record_not_the_mission(
 
 
 LIMITED = """
-import json, resource, sys
+import resource, sys
 from pathlib import Path
-import msgspec
 from kantor_worldsim.journal import read
-from kantor_worldsim.recording import Recording, JOURNAL
-from kantor_worldsim.records import Ending
+from kantor_worldsim.recording import Recording
 
 source, folder, limit = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
 records = [record for _, record in read(source)]
@@ -307,9 +307,7 @@ def test_file_size_limit_cuts_the_record(whole_run: tuple[Path, Result], tmp_pat
 ENDLESS = """
 import sys, time
 from pathlib import Path
-import msgspec
 from kantor_worldsim.journal import Journal, read
-from kantor_worldsim.records import Ending
 
 records = [record for _, record in read(Path(sys.argv[1]))]
 journal = Journal(Path(sys.argv[2]))

@@ -12,6 +12,7 @@ from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, Participant
 from kantor_protocol.messages import RefusedError, decode_news
 from kantor_protocol.packing import Pairs
 from kantor_protocol.replica import read_have, read_logs
+from kantor_protocol.weights import WeightsSubscriber
 from kantor_worldsim.channel import DROPPED, Verdict
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 from kantor_worldsim.world import SPEED_TOLERANCE
@@ -27,7 +28,8 @@ class Checker:
     -----
     range       no envelope is delivered to anybody beyond the range at the time of sending
     delivery    what is in an inbox was delivered to it, is due, and came as often as ruled
-    weights     no entry of a published weight vector ever rises or is negative
+    weights     no entry of a weight vector ever rises or is negative, and what is published on the
+                weights key rebuilds exactly this vector
     energy      nobody ships more points than its budget, or more units than a point holds
     ledger      consumed = sum of the ledgers: what a participant sends of its log is what it consumed,
                 entry for entry, and at the end its vector is exactly what the logs it holds leave
@@ -83,6 +85,7 @@ class Checker:
         self._points = dict.fromkeys(names, 0)
         self._views = np.full((len(names), self._samples), self._units.sample, dtype=np.int64)
         self._own_spent: dict[ParticipantId, list[list[int]]] = {name: [] for name in names}
+        self._subscribers = {name: WeightsSubscriber() for name in names}
         self._have: dict[ParticipantId, list[int]] = {}
         self._consumed = np.zeros(self._samples, dtype=np.int64)
         self._absences = dict.fromkeys(names, 0)
@@ -129,9 +132,10 @@ class Checker:
         if not expected <= outputs.step <= expected + self._absences[act.name]:
             self._complain("order", act.name, f"step {outputs.step}, expected {expected}")
         self._check_speed(act.name, act.now_ns, ruling.pose)
-        self._check_goal(act.name, outputs.goal)
-        self._check_energy(act.name, outputs.spent, outputs.energy_spent)
+        spent = self._check_energy(act.name, outputs.spent, outputs.energy_spent)
         self._check_weights(act.name, outputs.lowered)
+        self._check_published(act.name, outputs.weights)
+        self._check_goal(act.name, outputs.goal, spent)
         self._steps[act.name], self._absences[act.name] = outputs.step, 0
         self._moved_ns[act.name] = act.now_ns
         self._poses[act.name] = ruling.pose
@@ -162,7 +166,19 @@ class Checker:
             if left < self._units.sample - self._consumed[sample]:
                 self._complain("credit", name, f"its view of sample {sample} is below the truth")
 
-    def _check_goal(self, name: ParticipantId, goal: tuple[float, float] | None) -> None:
+    def _check_published(self, name: ParticipantId, weights: bytes) -> None:
+        if not weights:
+            return
+        subscriber, view = self._subscribers[name], self._views[self._places[name]]
+        if not subscriber.take(weights):
+            self._complain("weights", name, "publishes a vector that cannot be rebuilt")
+        elif subscriber.weights is None or not np.array_equal(subscriber.weights, view):
+            self._complain("weights", name, "publishes a vector that is not its own")
+
+    def _check_goal(
+        self, name: ParticipantId, goal: tuple[float, float] | None, spent: dict[int, int]
+    ) -> None:
+        """The weight at the time of choosing: what is left now, and what it has shipped since."""
         if goal is None or self._scenario.samples.diffusion_m > 0.0:
             return
         if self._samples_by_place is None:
@@ -170,7 +186,7 @@ class Checker:
         samples = self._samples_by_place.get(goal)
         if samples is None:
             self._complain("goal", name, f"{goal} is no sample")
-        elif not any(self._views[self._places[name], j] > 0 for j in samples):
+        elif not any(self._views[self._places[name], j] + spent.get(j, 0) > 0 for j in samples):
             self._complain("goal", name, f"{goal} has no weight left in its view")
 
     _samples_by_place: dict[tuple[float, float], list[int]] | None = None
@@ -182,11 +198,13 @@ class Checker:
             places.setdefault((x, y), []).append(j)
         return places
 
-    def _check_energy(self, name: ParticipantId, spent: bytes, energy_spent: int) -> None:
+    def _check_energy(self, name: ParticipantId, spent: bytes, energy_spent: int) -> dict[int, int]:
+        """Check what a step shipped; it comes back as units by sample."""
         pairs = self._pairs.decode(spent, self._samples)
         if pairs is None:
             self._complain("energy", name, "spending that does not decode")
-            return
+            return {}
+        shipped = dict(zip(pairs[0].tolist(), pairs[1].tolist(), strict=True))
         if pairs[0].size:
             self._points[name] += 1
             units = int(pairs[1].sum())
@@ -199,6 +217,7 @@ class Checker:
             self._complain("energy", name, f"{self._points[name]} points shipped")
         if energy_spent < self._points[name] and name != SUPERVISOR:
             self._complain("energy", name, f"counts {energy_spent} of {self._points[name]} points")
+        return shipped
 
     def _check_ledger(self, name: ParticipantId, envelope: Envelope) -> None:
         """Own entries that a participant sends are the ones it consumed, one for one."""

@@ -62,6 +62,8 @@ def simulate(stage: Stage, exchange: Exchange, seed: int, stopped: Callable[[], 
         inputs = {name: stage.inputs(name, due_ns) for due_ns, name in batch}
         outputs = exchange(inputs)
         for moment_ns in sorted({due_ns for due_ns, _ in batch}):
+            if _reason(stage, moment_ns, stopped):  # what was looked ahead to does not happen
+                break
             steps = [
                 Step(name, inputs[name], outputs.get(name))
                 for due_ns, name in batch
@@ -75,6 +77,6 @@ def simulate(stage: Stage, exchange: Exchange, seed: int, stopped: Callable[[], 
 def _reason(stage: Stage, next_ns: int, stopped: Callable[[], bool]) -> str | None:
     if stage.over:
         return stage.over
-    if stopped():
-        return "interrupted"
-    return "limit" if next_ns > stage.scenario.limit_ns else None
+    if next_ns > stage.scenario.limit_ns:
+        return "limit"
+    return "interrupted" if stopped() else None

@@ -118,7 +118,7 @@ class World:
     def _moves(self, name: ParticipantId, body: _Body, now_ns: int, pose: Pose) -> bool:
         limit_m = 0.0 if name == SUPERVISOR else self._speed_m_s * (now_ns - body.moved_ns) * 1e-9
         way_m = math.hypot(pose.x_m - body.pose.x_m, pose.y_m - body.pose.y_m)
-        if way_m > limit_m * (1.0 + SPEED_TOLERANCE):
+        if not way_m <= limit_m * (1.0 + SPEED_TOLERANCE):  # nor to nowhere
             return False
         body.pose = pose
         return True

@@ -1,23 +1,22 @@
 """Optimal-transport exploration (Kabir & Lee, eq. 2-3).
 
-The goal is the first sample of the best order through the h nearest that still have weight. The paper walks through all h! orders. Held and Karp's recursion over subsets finds the same optimum:
-the cost of a step into a sample depends on where it comes from and on that sample alone.
+The goal is the first sample of the best order through the h nearest that still have weight. The paper
+walks through all h! orders. Held and Karp's recursion over subsets finds the same optimum: the cost of
+a step into a sample depends on where it comes from and on that sample alone.
 """
 
 import math
 
 import numpy as np
-import numpy.typing as npt
-from numba import njit
 
 from kantor_agent.belief import Belief
-from kantor_agent.field import Grid, nearest
+from kantor_agent.field import Grid, kernel, nearest
 from kantor_agent.planners.base import Goal
 from kantor_protocol.machine import Pose
 from kantor_protocol.replica import NOBODY
 
 
-@njit(cache=True)
+@kernel
 def first_of_best_order(
     xy_m: np.ndarray,
     weights: np.ndarray,
@@ -56,7 +55,7 @@ def first_of_best_order(
     return first
 
 
-@njit(cache=True)
+@kernel
 def choose_sample(
     grid: Grid,
     weights: np.ndarray,
@@ -74,41 +73,51 @@ def choose_sample(
     return near[first_of_best_order(grid.xy_m, weights, x, y, near, count, cost_to_go)]
 
 
+@kernel
+def _choose(
+    xy_m: np.ndarray,
+    order: np.ndarray,
+    slot: np.ndarray,
+    cell: np.ndarray,
+    first: np.ndarray,
+    alive: np.ndarray,
+    frame: np.ndarray,
+    levels: int,
+    weights: np.ndarray,
+    taken: np.ndarray,
+    best: np.ndarray,
+    near: np.ndarray,
+    cost_to_go: np.ndarray,
+    x: float,
+    y: float,
+) -> tuple[int, float, float]:
+    """The goal and its place, for calls from Python; a sample in `taken` only if there is no other."""
+    grid = Grid(xy_m, order, slot, cell, first, alive, frame, levels)
+    sample = choose_sample(grid, weights, x, y, taken, best, near, cost_to_go)
+    if sample == NOBODY and taken.shape[0] > 0:
+        sample = choose_sample(grid, weights, x, y, taken[:0], best, near, cost_to_go)
+    if sample == NOBODY:
+        return NOBODY, x, y
+    return sample, xy_m[sample, 0], xy_m[sample, 1]
+
+
 class Transport:
     """The planner of Algorithms 1-3, with claims if the mission has them."""
 
     def __init__(self, horizon: int) -> None:
         """horizon: h, samples in one plan."""
-        self._best = np.zeros(horizon, dtype=np.float64)
-        self._near = np.zeros(horizon, dtype=np.int64)
-        self._cost_to_go = np.zeros((1 << horizon, horizon), dtype=np.float64)
+        self._room = (
+            np.zeros(horizon, dtype=np.float64),
+            np.zeros(horizon, dtype=np.int64),
+            np.zeros((1 << horizon, horizon), dtype=np.float64),
+        )
 
     def choose(self, belief: Belief, pose: Pose, now_ns: int, /) -> Goal | None:
         """The first sample of the best order; one that another robot holds only if all are held."""
-        taken = belief.replica.taken()
-        sample = self._first(belief, pose, taken)
-        if sample == NOBODY and taken.size:
-            sample = self._first(belief, pose, taken[:0])
-        if belief.replica.manner.claims:
-            belief.replica.claim(sample, now_ns)
-        if sample == NOBODY:
-            return None
-        return Goal(
-            x_m=float(belief.grid.xy_m[sample, 0]),
-            y_m=float(belief.grid.xy_m[sample, 1]),
-            sample=sample,
+        replica = belief.replica
+        sample, x_m, y_m = _choose(
+            *belief.to_search, replica.taken(), *self._room, pose.x_m, pose.y_m
         )
-
-    def _first(self, belief: Belief, pose: Pose, skip: npt.NDArray[np.int64]) -> int:
-        return int(
-            choose_sample(
-                belief.grid,
-                belief.weights,
-                pose.x_m,
-                pose.y_m,
-                skip,
-                self._best,
-                self._near,
-                self._cost_to_go,
-            )
-        )
+        if replica.manner.claims:
+            replica.claim(sample, now_ns)
+        return None if sample == NOBODY else Goal(x_m, y_m, sample)

@@ -1,0 +1,227 @@
+"""Ticks a second in lockstep with a process for every robot, beside a bare Zenoh barrier.
+
+The barrier is the least that any lockstep over Zenoh must do, in the same topology: a router that puts
+64 bytes to each client and goes on when each has answered with 64 bytes; no access control, no codec,
+no robots. Clients start from the same fork server with the same light runtime, and as in kantor a
+callback only enqueues. Both are measured for the same number of seconds, one after the other.
+"""
+
+import json
+import os
+import queue
+import statistics
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+from typing import NamedTuple
+
+import zenoh
+from tables import Table
+
+from kantor_fleet.catalog import find
+from kantor_fleet.local import _LIGHT_RUNTIME, Order, local_fleet, watch_progress
+from kantor_fleet.preload import warm_up
+from kantor_protocol.bus import free_endpoint
+from kantor_protocol.scenario import Scenario
+
+COUNTS = (5, 20, 100)
+COUNTS_QUICK = (5, 20)
+PAYLOAD = bytes(64)
+START_S = 90.0
+"""Within which everybody must be there."""
+MISSION_S = 120.0
+"""After which a mission that has not ended is an error."""
+
+
+class Pace(NamedTuple):
+    """What was reached."""
+
+    rounds_per_s: float
+    rounds: int
+
+
+def measure(*, quick: bool) -> Table:
+    """Ticks and rounds a second; the median of the repetitions, taken in turn."""
+    warm_up()
+    seconds, repeats = (3.0, 1) if quick else (6.0, 3)
+    rows = []
+    for count in COUNTS_QUICK if quick else COUNTS:
+        bare, ours = [], []
+        for _ in range(repeats):
+            bare.append(_barrier(count, seconds))
+            ours.append(_mission(count, seconds))
+        barrier = statistics.median(pace.rounds_per_s for pace in bare)
+        ticks = statistics.median(pace.rounds_per_s for pace in ours)
+        ratio = statistics.median(
+            one.rounds_per_s / other.rounds_per_s for one, other in zip(ours, bare, strict=True)
+        )
+        rows.append(
+            (
+                f"{count}",
+                f"{ticks:,.0f}",
+                f"{barrier:,.0f}",
+                f"{ratio:.2f}",
+                f"{ticks * count:,.0f}",
+                f"{1e6 / (ticks * count):.0f}",
+                f"{min(pace.rounds for pace in ours)}",
+            )
+        )
+    return Table(
+        "lockstep: a process for every robot, wall time",
+        (
+            "robots",
+            "ticks/s",
+            "bare barrier, rounds/s",
+            "ratio",
+            "robot-steps/s",
+            "us/robot-step",
+            "ticks measured",
+        ),
+        rows,
+        (
+            "kantor with access control, record on disk, metrics and checker; robots hear whom they meet",
+        ),
+    )
+
+
+def _scenario(count: int) -> Scenario:
+    """The default world with so many robots, too much to do for the time that is measured."""
+    overrides = (
+        f"robots.count={count}",
+        "starts.random=true",
+        "samples.count=20000",
+        "energy.points=50000",
+        "energy.steps=50000",
+        "metrics.every=10",
+        "limit_s=100000",
+    )
+    return find("fleet", overrides)
+
+
+def _mission(count: int, seconds: float) -> Pace:
+    """Ticks a second of a mission under way, from what it tells observers."""
+    scenario = _scenario(count)
+    marks: list[tuple[float, int]] = []
+    with tempfile.TemporaryDirectory(prefix="kantor-speed-") as folder:
+        order = Order(scenario, 0, "lockstep", 1.0, Path(folder))
+        with local_fleet(order) as fleet:
+            give_up = time.monotonic() + MISSION_S
+            for progress in watch_progress(fleet):
+                now = time.monotonic()
+                if progress is not None and progress.phase == "running" and progress.now_ns > 0:
+                    marks.append((now, progress.now_ns))
+                if now > give_up or (marks and now - marks[0][0] >= seconds):
+                    break
+    if len(marks) < 2:
+        raise RuntimeError(f"{count} robots: the mission was not under way within {MISSION_S} s")
+    (start, start_ns), (end, end_ns) = marks[0], marks[-1]
+    ticks = (end_ns - start_ns) // scenario.period_ns
+    return Pace(ticks / (end - start), ticks)
+
+
+def _barrier(count: int, seconds: float) -> Pace:
+    """Rounds a second of the bare barrier."""
+    endpoint = free_endpoint()
+    context = get_context("forkserver")
+    receive, send = context.Pipe(duplex=False)
+    hub = context.Process(target=_be_hub, args=(endpoint, count, seconds, send))
+    clients = [context.Process(target=_be_client, args=(endpoint, i)) for i in range(count)]
+    with _running([hub, *clients]):
+        if not receive.poll(START_S + 2.0 * seconds):
+            raise RuntimeError(f"{count} clients: the barrier did not end")
+        return Pace(*json.loads(receive.recv_bytes()))
+
+
+@contextmanager
+def _running(processes: list[ForkServerProcess]) -> Iterator[None]:
+    """Start processes; on leaving, none of them is left."""
+    try:
+        for process in processes:
+            process.start()
+        yield
+    finally:
+        for process in processes:
+            if process.pid is not None:
+                process.kill()
+                process.join()
+
+
+def _be_hub(endpoint: str, count: int, seconds: float, send: Connection) -> None:
+    answers: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def on_answer(sample: zenoh.Sample) -> None:
+        answers.put(str(sample.key_expr))
+
+    session = zenoh.open(_config("router", endpoint))
+    subscriber = session.declare_subscriber("bench/*/tx", on_answer)
+    # Everybody says a first word when it listens.
+    for _ in range(count):
+        answers.get(timeout=START_S)
+    keys = [f"bench/{i}/rx" for i in range(count)]
+    rounds, start = 0, time.monotonic()
+    while time.monotonic() - start < seconds:
+        for key in keys:
+            session.put(
+                key, PAYLOAD, congestion_control=zenoh.CongestionControl.BLOCK, express=True
+            )
+        for _ in range(count):
+            answers.get(timeout=START_S)
+        rounds += 1
+    elapsed_s = time.monotonic() - start
+    send.send_bytes(json.dumps((rounds / elapsed_s, rounds)).encode())
+    send.close()
+    subscriber.undeclare()
+
+
+def _be_client(endpoint: str, number: int) -> None:
+    os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
+    turns: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def on_turn(sample: zenoh.Sample) -> None:
+        turns.put(sample.payload.to_bytes())
+
+    session = _patient_open(_config("client", endpoint))
+    subscriber = session.declare_subscriber(f"bench/{number}/rx", on_turn)
+    key = f"bench/{number}/tx"
+    while True:
+        session.put(key, PAYLOAD, congestion_control=zenoh.CongestionControl.BLOCK, express=True)
+        turns.get(timeout=START_S)
+    subscriber.undeclare()
+
+
+def _patient_open(config: zenoh.Config) -> zenoh.Session:
+    """A client's session as soon as the router is there."""
+    give_up = time.monotonic() + START_S
+    while True:
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError:
+            if time.monotonic() >= give_up:
+                raise
+        time.sleep(0.1)
+
+
+def _config(mode: str, endpoint: str) -> zenoh.Config:
+    """The settings of kantor's bus that concern speed."""
+    config = zenoh.Config()
+    settings = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "listen/endpoints": [endpoint] if mode == "router" else [],
+        "connect/endpoints": [endpoint] if mode == "client" else [],
+    }
+    if mode == "router":
+        settings |= {
+            "scouting/delay": 0,
+            "open/return_conditions": {"connect_scouted": False, "declares": False},
+        }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config

@@ -1,0 +1,244 @@
+"""Truth, radio and record together: one moment of a mission at a time."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from kantor_protocol.machine import (
+    EVERYBODY,
+    Envelope,
+    Inputs,
+    Outputs,
+    ParticipantId,
+    Pose,
+    State,
+)
+from kantor_protocol.messages import BODY_BYTES_MAX
+from kantor_worldsim.records import Act, Batch, Ending, Mailbag, Opening, Record
+from kantor_worldsim.stage import Stage, Step
+from kantor_worldsim.world import Site
+from strategies import mission
+
+PERIOD_NS = 100_000_000
+STARTS = {"r1": (0.0, 0.0), "r2": (24.0, 0.0), "r3": (90.0, 0.0)}
+
+
+class Theatre:
+    """A stage with a record, and robots whose steps are made by hand."""
+
+    def __init__(self, *overrides: str) -> None:
+        scenario = mission("sensor.range_m=5", *overrides)
+        site = Site(np.zeros((12, 2)), np.array([[3.0, 0.0]]), np.array(list(STARTS.values())))
+        self.records: list[Record] = []
+        self.stage = Stage(scenario, 1, site, [self.records.append])
+        self.step = 0
+
+    def play(self, **acts: Outputs | None) -> Batch:
+        """One period in which these participants act."""
+        self.step += 1
+        now_ns = self.step * PERIOD_NS
+        given = {name: self.stage.inputs(name, now_ns) for name in acts}
+        steps = [Step(name, given[name], outputs) for name, outputs in acts.items()]
+        self.stage.settle(now_ns, steps)
+        batch = self.records[-1]
+        assert isinstance(batch, Batch)
+        return batch
+
+
+def outputs(
+    step: int,
+    place: tuple[float, float],
+    *says: str,
+    state: State = State.EXPLORING,
+    source: str = "r1",
+) -> Outputs:
+    """A step to a place, with something said to each of these targets."""
+    outbox = tuple(
+        Envelope(source, 10 * step + i, target, b"hello") for i, target in enumerate(says)
+    )
+    return Outputs(step, Pose(*place), outbox=outbox, state=state)
+
+
+def act_of(batch: Batch, name: ParticipantId) -> Act:
+    return next(act for act in batch.acts if act.name == name)
+
+
+def test_record_opens_with_all_that_the_run_starts_from() -> None:
+    """Scenario, seed, points and the first look: what is needed to run it again."""
+    theatre = Theatre()
+    (opening,) = theatre.records
+
+    assert isinstance(opening, Opening)
+    assert opening.scenario == theatre.stage.scenario
+    assert opening.site.starts_m.tolist() == [list(place) for place in STARTS.values()]
+    assert opening.first_look == {"r1": ((0, 3.0, 0.0),), "r2": (), "r3": ()}
+    assert (opening.units.sample, opening.units.point) == (5, 2)
+
+
+def test_everybody_moves_before_anybody_is_heard() -> None:
+    """Range is between the poses at the end of the moment, not between early and late ones."""
+    theatre = Theatre("radio.range_m=5")
+    batch = theatre.play(
+        r1=outputs(1, (10.0, 0.0), EVERYBODY),
+        r2=outputs(1, (15.0, 0.0), EVERYBODY, source="r2"),
+        r3=outputs(1, (90.0, 0.0), EVERYBODY, source="r3"),
+    )
+
+    assert [(v.source, v.target) for v in batch.verdicts] == [("r1", "r2"), ("r2", "r1")]
+    assert batch.out_of_range == 4
+
+
+def test_inbox_is_handed_out_once() -> None:
+    """What has been given to a participant is not given to it again."""
+    theatre = Theatre()
+    theatre.play(r1=outputs(1, (0.0, 0.0), "r2", "r2"))
+    first = theatre.stage.inputs("r2", 2 * PERIOD_NS)
+
+    assert [envelope.sequence for envelope in first.inbox] == [10, 11]
+    assert theatre.stage.inputs("r2", 2 * PERIOD_NS).inbox == ()
+
+
+def test_act_is_recorded_with_what_led_to_it() -> None:
+    """Time, observation, inbox by reference, outputs and ruling: a step can be repeated alone."""
+    theatre = Theatre()
+    first = theatre.play(r1=outputs(1, (0.0, 0.0), EVERYBODY))
+    second = theatre.play(r2=outputs(1, (20.0, 0.0), source="r2"))
+    act = act_of(second, "r2")
+    mailbag = Mailbag()
+    mailbag.post(first)
+
+    assert act.heard == (("r1", 10),)
+    assert (act.now_ns, act.observation.pose) == (2 * PERIOD_NS, Pose(24.0, 0.0))
+    assert act.ruling is not None
+    assert act.ruling.pose == Pose(20.0, 0.0)
+    assert mailbag.inputs(act) == Inputs(
+        2 * PERIOD_NS, act.observation, (Envelope("r1", 10, EVERYBODY, b"hello"),)
+    )
+
+
+def test_reference_to_what_was_never_sent_is_noticed() -> None:
+    """An inbox that nobody filled cannot be rebuilt."""
+    theatre = Theatre()
+    theatre.play(r1=outputs(1, (0.0, 0.0), EVERYBODY))
+    second = theatre.play(r2=outputs(1, (20.0, 0.0), source="r2"))
+
+    with pytest.raises(KeyError):
+        Mailbag().inputs(act_of(second, "r2"))
+
+
+# What has no place on the stage.
+
+UNSOUND: dict[str, Callable[[], Outputs | None]] = {
+    "missing": lambda: None,
+    "false-sender": lambda: outputs(1, (1.0, 0.0), EVERYBODY, source="r2"),
+    "sender-in-part-false": lambda: Outputs(
+        1,
+        Pose(1.0, 0.0),
+        outbox=(Envelope("r1", 1, EVERYBODY, b""), Envelope("r3", 1, EVERYBODY, b"")),
+    ),
+    "nowhere": lambda: outputs(1, (math.nan, 0.0), EVERYBODY),
+    "infinitely-far": lambda: outputs(1, (0.0, math.inf), EVERYBODY),
+    "no-heading": lambda: Outputs(1, Pose(1.0, 0.0, math.nan)),
+    "goal-nowhere": lambda: Outputs(1, Pose(1.0, 0.0), goal=(0.0, math.nan)),
+    "oversized": lambda: Outputs(
+        1, Pose(1.0, 0.0), outbox=(Envelope("r1", 1, EVERYBODY, bytes(BODY_BYTES_MAX + 1)),)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", list(UNSOUND))
+def test_unsound_outputs_are_as_if_missing(name: str) -> None:
+    """Bad numbers, a false sender, nothing at all: recorded as absent, without effect on others."""
+    theatre = Theatre()
+    batch = theatre.play(r1=UNSOUND[name](), r2=outputs(1, (20.0, 0.0), "r1", source="r2"))
+    absent, present = act_of(batch, "r1"), act_of(batch, "r2")
+
+    assert batch.absent == ("r1",)
+    assert (absent.outputs, absent.ruling) == (None, None)
+    assert present.outputs is not None
+    assert [(v.source, v.target) for v in batch.verdicts] == [("r2", "r1")]
+    assert theatre.stage.inputs("r1", 2 * PERIOD_NS).observation.pose == Pose(0.0, 0.0)
+    assert not theatre.stage.acted("r1")
+    assert theatre.stage.acted("r2")
+
+
+def test_inbox_of_an_absent_participant_is_in_the_record() -> None:
+    """What it was given is gone; the record says so."""
+    theatre = Theatre()
+    theatre.play(r2=outputs(1, (20.0, 0.0), "r1", source="r2"))
+    batch = theatre.play(r1=None)
+
+    assert act_of(batch, "r1").heard == (("r2", 10),)
+    assert theatre.stage.inputs("r1", 3 * PERIOD_NS).inbox == ()
+
+
+# The end.
+
+
+def test_mission_is_done_when_everybody_rests() -> None:
+    """Finished and exhausted robots rest; one that explores keeps the mission going."""
+    theatre = Theatre()
+    theatre.play(
+        r1=outputs(1, (0.0, 0.0), state=State.FINISHED),
+        r2=outputs(1, (24.0, 0.0), state=State.EXHAUSTED, source="r2"),
+        r3=outputs(1, (90.0, 0.0), source="r3"),
+    )
+    before = theatre.stage.over
+    theatre.play(r3=outputs(2, (90.0, 0.0), state=State.FINISHED, source="r3"))
+
+    assert (before, theatre.stage.over) == (None, "done")
+
+
+@pytest.mark.parametrize(
+    ("resting", "gone", "over"),
+    [
+        ((), (), None),
+        (("r1",), ("r2",), None),
+        (("r1",), ("r2", "r3"), "done"),
+        (("r1", "r2", "r3"), ("r2",), "done"),
+        (("r1", "r2", "r3"), ("r1", "r2", "r3"), "done"),
+        ((), ("r1", "r2", "r3"), "deserted"),
+        (("r1",), ("r1", "r2", "r3"), "deserted"),
+    ],
+)
+def test_those_who_left_are_not_waited_for(
+    resting: tuple[str, ...], gone: tuple[str, ...], over: str | None
+) -> None:
+    """Done when all who are left rest; deserted when nobody is left and somebody had work."""
+    theatre = Theatre()
+    acts = {name: outputs(1, STARTS[name], state=State.FINISHED, source=name) for name in resting}
+    if acts:
+        theatre.play(**acts)
+    theatre.stage.gone = set(gone)
+
+    assert theatre.stage.over == over
+
+
+def test_supervisor_is_not_waited_for() -> None:
+    """The mission is the robots': a supervisor that still sees weight does not keep it going."""
+    theatre = Theatre("coordination=centralized")
+    for name, place in STARTS.items():
+        theatre.play(**{name: outputs(1, place, state=State.FINISHED, source=name)})
+
+    assert theatre.stage.over == "done"
+
+
+def test_record_is_closed_with_the_reason() -> None:
+    """The ending says when and why."""
+    theatre = Theatre()
+    theatre.play(r1=outputs(1, (0.0, 0.0)))
+    theatre.stage.end("interrupted")
+
+    assert theatre.records[-1] == Ending(PERIOD_NS, "interrupted")
+
+
+def test_time_of_the_stage_never_runs_back() -> None:
+    """A step that is told late does not turn the clock of the mission back."""
+    theatre = Theatre()
+    theatre.play(r1=outputs(1, (0.0, 0.0)))
+    late = theatre.stage.inputs("r2", PERIOD_NS // 2)
+    theatre.stage.settle(PERIOD_NS // 2, [Step("r2", late, outputs(1, (24.0, 0.0), source="r2"))])
+
+    assert theatre.stage.now_ns == PERIOD_NS
