@@ -124,7 +124,9 @@ def test_point_ships_all_it_has_and_no_sample_gives_more_than_it_has(
         spent = dict(plan)
         after = [weight - spent.get(sample, 0) for sample, weight in enumerate(before)]
         order = [
-            ((x - x_m) ** 2 + (y - y_m) ** 2, j) for j, (x, y) in enumerate(samples_m.tolist())
+            # Products, as the field takes them: pow() may round the last digit elsewhere.
+            ((x - x_m) * (x - x_m) + (y - y_m) * (y - y_m), j)
+            for j, (x, y) in enumerate(samples_m.tolist())
         ]
 
         assert len(spent) == len(plan)
