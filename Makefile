@@ -13,10 +13,10 @@ help:
 	@echo "make paper   the first paper's claims over 20 seeds, as a table"
 	@echo "make bench   speed, as ratios in one run"
 
-demo: $(VENV)/.installed
+demo: $(VENV)/.installed $(VENV)/.kernels
 	$(KANTOR) run fleet --exchange wall --speed 4
 
-test: $(VENV)/.developing
+test: $(VENV)/.developing $(VENV)/.kernels
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 check: lint types contracts
@@ -35,10 +35,10 @@ format: $(VENV)/.developing
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-paper: $(VENV)/.installed
+paper: $(VENV)/.installed $(VENV)/.kernels
 	$(BIN)/python benchmarks/paper_figures.py
 
-bench: $(VENV)/.installed
+bench: $(VENV)/.installed $(VENV)/.kernels
 	$(BIN)/python benchmarks/run.py
 
 $(VENV)/.installed: pyproject.toml
@@ -51,6 +51,11 @@ $(VENV)/.installed: pyproject.toml
 $(VENV)/.developing: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'
 	$(BIN)/python -m pip install --quiet --group dev
+	@touch $@
+
+# Numba keeps a kernel until its own file changes; one that has another file's code inlined goes stale.
+$(VENV)/.kernels: $(wildcard */kantor_*/*.py */kantor_*/*/*.py) | $(VENV)/.installed
+	find $(wildcard */kantor_*) -name '*.nb[ic]' -delete
 	@touch $@
 
 clean:

@@ -5,10 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kantor_agent.field import Grid, build, grid_over, kernel, nearest, remove, remove_empty
+from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
+from kantor_protocol.kernels import kernel
 from kantor_protocol.messages import News
 from kantor_protocol.packing import Pairs, pack_pairs
-from kantor_protocol.replica import Manner, Replica, Store, spend
+from kantor_protocol.replica import NOBODY, Manner, Replica, Store, spend
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, Weights
 
@@ -126,8 +127,16 @@ class Belief:
         )
         self._packed = np.zeros(20 * most, dtype=np.uint8)
         self._pairs = Pairs()
-        self.to_search: tuple[Any, ...] = (*self.grid, replica.weights)
-        """Grid and weights as arguments of a kernel; see `field.kernel`."""
+        store, manner = replica.store, replica.manner
+        self.to_choose: tuple[Any, ...] = (
+            *self.grid,
+            store.weights,
+            store.claims,
+            store.counters,
+            np.zeros(store.length.shape[0], dtype=np.int64),
+            manner.me if manner.claims else NOBODY,
+        )
+        """Grid, weights and claims as arguments of a planner's kernel; see `kernels.kernel`."""
         self._store = replica.store
         self._to_ship = self._arguments()
 

@@ -14,12 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-kernel = njit(cache=True, error_model="numpy", _nrt=False)
-"""Compiles a function that allocates nothing. Numba then counts no references to its arrays, which
-would cost more than the work itself; at the border to Python an array costs 0.02 us. A NamedTuple of
-arrays costs a whole one there, so what is called in every step takes the fields one by one."""
+from kantor_protocol.kernels import kernel
 
 _PER_CELL = 2.0
 """Samples in a cell on average."""

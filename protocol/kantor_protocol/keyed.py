@@ -10,7 +10,9 @@ The key is the run's seed; the counter is (purpose, who, step, index).
 import enum
 
 import numpy as np
-from numba import njit, uint32, uint64
+from numba import uint32, uint64
+
+from kantor_protocol.kernels import kernel
 
 _MULTIPLIER_0 = np.uint64(0xD2511F53)
 _MULTIPLIER_1 = np.uint64(0xCD9E8D57)
@@ -39,7 +41,7 @@ class Purpose(enum.IntEnum):
     SUBSET = 13
 
 
-@njit(cache=True)
+@kernel
 def philox(seed: int, purpose: int, who: int, step: int, index: int) -> tuple[int, int]:
     """One Philox4x32-10 block as two 64-bit words (uint64), from a seed below 2^63 and four 32-bit counters."""
     key_0 = uint64(seed) & _LOW
@@ -60,13 +62,13 @@ def philox(seed: int, purpose: int, who: int, step: int, index: int) -> tuple[in
     return (word_1 << _HIGH) | word_0, (word_3 << _HIGH) | word_2
 
 
-@njit(cache=True)
+@kernel
 def to_unit(word: int) -> float:
     """A 64-bit word as a float in [0, 1), from its upper 53 bits."""
     return float(uint64(word) >> uint64(11)) * _TO_UNIT
 
 
-@njit(cache=True)
+@kernel
 def uniform(seed: int, purpose: int, who: int, step: int, index: int) -> float:
     """A float in [0, 1) for this key and counter."""
     return to_unit(philox(seed, purpose, who, step, index)[0])

@@ -228,16 +228,26 @@ def decode_outputs(payload: bytes) -> Outputs:
 def check_outputs(outputs: Outputs) -> None:
     """Raise RefusedError for numbers that no participant may send."""
     pose, goal = outputs.pose, outputs.goal
-    numbers = (pose.x_m, pose.y_m, pose.heading_rad, pose.speed_m_s, *(goal or ()))
-    if not all(map(math.isfinite, numbers)):
+    finite = math.isfinite
+    if not (
+        finite(pose.x_m)
+        and finite(pose.y_m)
+        and finite(pose.heading_rad)
+        and finite(pose.speed_m_s)
+        and (goal is None or (finite(goal[0]) and finite(goal[1])))
+    ):
         raise RefusedError("outputs with a number that is not finite")
-    sequences = (envelope.sequence for envelope in outputs.outbox)
-    if not all(
-        0 <= n < 2**63 for n in (outputs.step, outputs.energy_spent, outputs.refused, *sequences)
+    if not (
+        0 <= outputs.step < 2**63
+        and 0 <= outputs.energy_spent < 2**63
+        and 0 <= outputs.refused < 2**63
     ):
         raise RefusedError("outputs with a count that is out of range")
-    if any(len(envelope.body) > BODY_BYTES_MAX for envelope in outputs.outbox):
-        raise RefusedError("outputs with an oversized body")
+    for envelope in outputs.outbox:
+        if not 0 <= envelope.sequence < 2**63:
+            raise RefusedError("outputs with a count that is out of range")
+        if len(envelope.body) > BODY_BYTES_MAX:
+            raise RefusedError("outputs with an oversized body")
 
 
 def _decoded(decoder: msgspec.msgpack.Decoder[Any], payload: bytes) -> Any:

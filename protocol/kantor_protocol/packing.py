@@ -7,14 +7,15 @@ their buffers, and a malformed input gives a negative position.
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
+
+from kantor_protocol.kernels import kernel
 
 MALFORMED = -1
 
 Buffer = npt.NDArray[np.uint8]
 
 
-@njit(cache=True)
+@kernel
 def put_uint(out: np.ndarray, at: int, value: int) -> int:
     """Write a value >= 0 at position `at`; the position after it. `out` needs 10 free bytes."""
     while value >= 128:
@@ -25,13 +26,13 @@ def put_uint(out: np.ndarray, at: int, value: int) -> int:
     return at + 1
 
 
-@njit(cache=True)
+@kernel
 def put_int(out: np.ndarray, at: int, value: int) -> int:
     """Write a signed value, zigzag-folded."""
     return put_uint(out, at, value << 1 if value >= 0 else ((-value) << 1) - 1)
 
 
-@njit(cache=True)
+@kernel
 def take_uint(buffer: np.ndarray, at: int) -> tuple[int, int]:
     """Read a value below 2**63 from `at`: (value, position after it), or (0, MALFORMED)."""
     value = 0
@@ -48,7 +49,7 @@ def take_uint(buffer: np.ndarray, at: int) -> tuple[int, int]:
     return 0, MALFORMED
 
 
-@njit(cache=True)
+@kernel
 def take_int(buffer: np.ndarray, at: int) -> tuple[int, int]:
     """Read a signed value; see `take_uint`."""
     folded, at = take_uint(buffer, at)
@@ -57,7 +58,7 @@ def take_int(buffer: np.ndarray, at: int) -> tuple[int, int]:
     return folded >> 1, at
 
 
-@njit(cache=True)
+@kernel
 def pack_pairs(index: np.ndarray, value: np.ndarray, count: int, out: np.ndarray) -> int:
     """Write `count` pairs (index as difference to the one before, value >= 0); the bytes used."""
     at = 0
@@ -69,7 +70,7 @@ def pack_pairs(index: np.ndarray, value: np.ndarray, count: int, out: np.ndarray
     return at
 
 
-@njit(cache=True)
+@kernel
 def unpack_pairs(buffer: np.ndarray, bound: int, index: np.ndarray, value: np.ndarray) -> int:
     """Read pairs until the buffer ends; their count, or MALFORMED.
 

@@ -30,12 +30,13 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from kantor_protocol.kernels import kernel
 from kantor_protocol.packing import put_int, put_uint, take_int, take_uint
 from kantor_protocol.weights import Units, Weights
 
 NOBODY = -1
+_MALFORMED, _NO_ROOM, _LEARNT = 0, 1, 2
 _ENTRIES_MAX = 4096
 """Log entries in one message; the rest follows with the next."""
 _CLAIM_LEASE_STEPS = 12
@@ -100,7 +101,7 @@ class Manner(NamedTuple):
     """The largest value of a log entry."""
 
 
-@njit(cache=True)
+@kernel
 def _lower(store: Store, index: int, value: int) -> None:
     store.weights[index] = value
     if store.mark[index] != store.counters[_STEP]:
@@ -109,14 +110,14 @@ def _lower(store: Store, index: int, value: int) -> None:
         store.counters[_LOWERED] += 1
 
 
-@njit(cache=True)
+@kernel
 def _append(store: Store, row: int, origin: int, index: int, value: int) -> None:
     store.log_index[row, store.length[origin]] = index
     store.log_value[row, store.length[origin]] = value
     store.length[origin] += 1
 
 
-@njit(cache=True)
+@kernel
 def spend(store: Store, manner: Manner, index: int, units: int) -> None:
     """Ship `units` to a sample and log it. The log must have room for one more entry."""
     _lower(store, index, store.weights[index] - units)
@@ -127,7 +128,7 @@ def spend(store: Store, manner: Manner, index: int, units: int) -> None:
         _append(store, 0, manner.me, index, store.weights[index])
 
 
-@njit(cache=True)
+@kernel
 def _merge_entry(store: Store, manner: Manner, origin: int, index: int, value: int) -> None:
     if manner.ledger:
         store.spent[index] += value
@@ -140,7 +141,7 @@ def _merge_entry(store: Store, manner: Manner, origin: int, index: int, value: i
         _append(store, 0, manner.me, index, value)
 
 
-@njit(cache=True)
+@kernel
 def _walk_logs(store: Store, manner: Manner, logs: np.ndarray, source: int, apply: bool) -> int:
     """Read all suffixes; apply what is new, or only check. The position at the end or negative."""
     ledger = manner.ledger
@@ -172,7 +173,7 @@ def _walk_logs(store: Store, manner: Manner, logs: np.ndarray, source: int, appl
     return at
 
 
-@njit(cache=True)
+@kernel
 def _walk_claims(store: Store, manner: Manner, claims: np.ndarray, apply: bool) -> int:
     at = 0
     while at < claims.shape[0]:
@@ -190,7 +191,7 @@ def _walk_claims(store: Store, manner: Manner, claims: np.ndarray, apply: bool) 
     return at
 
 
-@njit(cache=True)
+@kernel
 def _walk_have(store: Store, manner: Manner, have: np.ndarray, source: int, apply: bool) -> int:
     origins = store.length.shape[0]
     at = 0
@@ -203,54 +204,106 @@ def _walk_have(store: Store, manner: Manner, have: np.ndarray, source: int, appl
     return at if at == have.shape[0] else -1
 
 
-@njit(cache=True)
+@kernel
+def _manner(law: np.ndarray) -> Manner:
+    return Manner(
+        law[0], law[1] != 0, law[2] != 0, law[3] != 0, law[4] != 0, law[5], law[6], law[7]
+    )
+
+
+@kernel
 def _learn(
-    store: Store,
-    manner: Manner,
+    weights: np.ndarray,
+    spent: np.ndarray,
+    log_index: np.ndarray,
+    log_value: np.ndarray,
+    length: np.ndarray,
+    known: np.ndarray,
+    sending: np.ndarray,
+    claims: np.ndarray,
+    lowered: np.ndarray,
+    mark: np.ndarray,
+    counters: np.ndarray,
+    law: np.ndarray,
     have: np.ndarray,
     logs: np.ndarray,
-    claims: np.ndarray,
+    registers: np.ndarray,
     source: int,
-) -> bool:
-    """Check a message whole, then apply it whole; False and no change when it is malformed."""
+) -> int:
+    """Check a message whole, then apply it whole; no change when it is malformed or too long.
+
+    Store and Manner come field by field, see `kernels`.
+    """
+    store = Store(
+        weights,
+        spent,
+        log_index,
+        log_value,
+        length,
+        known,
+        sending,
+        claims,
+        lowered,
+        mark,
+        counters,
+    )
+    manner = _manner(law)
     if (
         _walk_have(store, manner, have, source, False) < 0
         or _walk_logs(store, manner, logs, source, False) < 0
-        or _walk_claims(store, manner, claims, False) < 0
+        or _walk_claims(store, manner, registers, False) < 0
     ):
-        return False
+        return _MALFORMED
+    longest = 0
+    for origin in range(length.shape[0]):
+        longest = max(longest, length[origin])
+    if (longest if manner.ledger else length[manner.me]) + logs.shape[0] // 2 > log_index.shape[1]:
+        return _NO_ROOM
     _walk_have(store, manner, have, source, True)
     _walk_logs(store, manner, logs, source, True)
     if manner.claims:
-        _walk_claims(store, manner, claims, True)
+        _walk_claims(store, manner, registers, True)
     store.sending[2, source] = store.counters[_STEP]
-    return True
+    return _LEARNT
 
 
-@njit(cache=True)
-def _neighbours_lack(store: Store, me: int, target: int, slot: int, patience: int) -> int:
-    """The least that anybody heard lately is known to hold in a slot of `known`; -1 if nobody is.
+@kernel
+def _find_neighbours(store: Store, manner: Manner, target: int, out: np.ndarray) -> int:
+    """Whoever was heard lately, or the target alone if it was; their number."""
+    count = 0
+    for other in range(store.length.shape[0]):
+        if other == manner.me or (target >= 0 and other != target):
+            continue
+        heard = store.sending[2, other]
+        if heard >= 0 and heard + manner.patience + _FRESH_STEPS >= store.counters[_STEP]:
+            out[count] = other
+            count += 1
+    return count
+
+
+@kernel
+def _neighbours_lack(store: Store, neighbours: np.ndarray, slot: int) -> int:
+    """The least that any of them is known to hold in a slot of `known`; -1 if there is none.
 
     The origin of the slot itself does not count: it holds its own state.
     """
-    origins = store.length.shape[0]
+    origin = slot % store.length.shape[0]
     least = -1
-    for other in range(origins):
-        if other == me or other == slot % origins or (target >= 0 and other != target):
-            continue
-        heard = store.sending[2, other]
-        if heard >= 0 and heard + patience + _FRESH_STEPS >= store.counters[_STEP]:
+    for other in neighbours:
+        if other != origin:
             held = store.known[other, slot]
             least = held if least < 0 else min(least, held)
     return least
 
 
-@njit(cache=True)
-def _start_of_suffix(store: Store, manner: Manner, target: int, origin: int, aged: int) -> int:
+@kernel
+def _start_of_suffix(
+    store: Store, manner: Manner, target: int, neighbours: np.ndarray, origin: int, aged: int
+) -> int:
     """First entry to send of an origin's log; its length when nothing is to be sent."""
     me, relay, patience = manner.me, manner.relay, manner.patience
     length = store.length[origin]
-    least = _neighbours_lack(store, me, target, origin, patience)
+    least = _neighbours_lack(store, neighbours, origin)
     if least < 0 and target < 0 and manner.beacon:
         return 0
     if least < 0:
@@ -266,7 +319,7 @@ def _start_of_suffix(store: Store, manner: Manner, target: int, origin: int, age
     return length
 
 
-@njit(cache=True)
+@kernel
 def _put_suffix(
     store: Store, out: np.ndarray, at: int, origin: int, ledger: bool, start: int, room: int
 ) -> tuple[int, int]:
@@ -295,9 +348,11 @@ def _put_suffix(
     return at, count
 
 
-@njit(cache=True)
-def _put_claims(store: Store, manner: Manner, out: np.ndarray, at: int, target: int) -> int:
-    me, relay, patience = manner.me, manner.relay, manner.patience
+@kernel
+def _put_claims(
+    store: Store, manner: Manner, out: np.ndarray, at: int, neighbours: np.ndarray
+) -> int:
+    me, relay = manner.me, manner.relay
     origins = store.length.shape[0]
     step = store.counters[_STEP]
     for origin in range(origins):
@@ -307,7 +362,7 @@ def _put_claims(store: Store, manner: Manner, out: np.ndarray, at: int, target: 
         ):
             continue
         if origin != me:
-            least = _neighbours_lack(store, me, target, origins + origin, patience)
+            least = _neighbours_lack(store, neighbours, origins + origin)
             slack = 0 if relay else _CLAIM_RENEWAL_STEPS
             if least < 0 or least + slack >= stamp:
                 continue
@@ -318,10 +373,44 @@ def _put_claims(store: Store, manner: Manner, out: np.ndarray, at: int, target: 
     return at
 
 
-@njit(cache=True)
-def _compose(store: Store, manner: Manner, out: np.ndarray, target: int) -> tuple[int, int, int]:
-    """Write have, logs and claims one after the other; the position at the end of each."""
+@kernel
+def _compose(
+    weights: np.ndarray,
+    spent: np.ndarray,
+    log_index: np.ndarray,
+    log_value: np.ndarray,
+    length: np.ndarray,
+    known: np.ndarray,
+    sending: np.ndarray,
+    claims: np.ndarray,
+    lowered: np.ndarray,
+    mark: np.ndarray,
+    counters: np.ndarray,
+    law: np.ndarray,
+    out: np.ndarray,
+    room: np.ndarray,
+    target: int,
+) -> tuple[int, int, int]:
+    """Write have, logs and claims one after the other; the position at the end of each.
+
+    room: (n,) for the neighbours.
+    """
+    store = Store(
+        weights,
+        spent,
+        log_index,
+        log_value,
+        length,
+        known,
+        sending,
+        claims,
+        lowered,
+        mark,
+        counters,
+    )
+    manner = _manner(law)
     me, ledger = manner.me, manner.ledger
+    neighbours = room[: _find_neighbours(store, manner, target, room)]
     origins = store.length.shape[0]
     at = 0
     for origin in range(origins):
@@ -331,40 +420,49 @@ def _compose(store: Store, manner: Manner, out: np.ndarray, target: int) -> tupl
             at = put_uint(out, at, store.claims[_STAMP, origin])
     end_of_have = at
     slot = 3 + store.counters[_STEP] % manner.patience
-    room = _ENTRIES_MAX
+    entries_left = _ENTRIES_MAX
     for turn in range(origins):
         origin = (me + turn) % origins
         if ledger or origin == me:
             aged = store.sending[slot, origin]
-            start = _start_of_suffix(store, manner, target, origin, aged)
-            if start < store.length[origin] and room > 0:
-                at, written = _put_suffix(store, out, at, origin, ledger, start, room)
-                room -= written
+            start = _start_of_suffix(store, manner, target, neighbours, origin, aged)
+            if start < store.length[origin] and entries_left > 0:
+                at, written = _put_suffix(store, out, at, origin, ledger, start, entries_left)
+                entries_left -= written
     for origin in range(origins):
         store.sending[slot, origin] = store.length[origin]
     end_of_logs = at
     if manner.claims:
-        at = _put_claims(store, manner, out, at, target)
+        at = _put_claims(store, manner, out, at, neighbours)
     return end_of_have, end_of_logs, at
 
 
-@njit(cache=True)
-def _taken(store: Store, me: int, out: np.ndarray) -> int:
+@kernel
+def taken(claims: np.ndarray, counters: np.ndarray, me: int, out: np.ndarray) -> int:
     """Samples claimed by others that outrank this participant's claim; their number."""
     count = 0
-    step = store.counters[_STEP]
-    for origin in range(store.length.shape[0]):
-        sample = store.claims[_SAMPLE, origin]
-        if origin == me or sample < 0 or step - store.claims[_HEARD, origin] > _CLAIM_LEASE_STEPS:
+    for origin in range(claims.shape[1]):
+        sample = claims[_SAMPLE, origin]
+        age = counters[_STEP] - claims[_HEARD, origin]
+        if origin == me or sample < 0 or age > _CLAIM_LEASE_STEPS:
             continue
-        if sample == store.claims[_SAMPLE, me]:
-            mine = store.claims[_SINCE, me]
-            theirs = store.claims[_SINCE, origin]
+        if sample == claims[_SAMPLE, me]:
+            mine = claims[_SINCE, me]
+            theirs = claims[_SINCE, origin]
             if mine < theirs or (mine == theirs and me < origin):
                 continue
         out[count] = sample
         count += 1
     return count
+
+
+@kernel
+def claim(claims: np.ndarray, counters: np.ndarray, me: int, sample: int, now_ns: int) -> None:
+    """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
+    if claims[_SAMPLE, me] != sample:
+        claims[_SAMPLE, me] = sample
+        claims[_SINCE, me] = now_ns
+    claims[_STAMP, me] = counters[_STEP]
 
 
 class Replica:
@@ -416,6 +514,9 @@ class Replica:
         self.store.claims[_SAMPLE] = NOBODY
         self._out = np.zeros(20 * _ENTRIES_MAX + 120 * origins + 64, dtype=np.uint8)
         self._taken = np.zeros(origins, dtype=np.int64)
+        self._room = np.zeros(origins, dtype=np.int64)
+        self._law = np.array(self.manner, dtype=np.int64)
+        self._fields = (*self.store, self._law)
 
     @property
     def weights(self) -> Weights:
@@ -430,24 +531,12 @@ class Replica:
 
     def learn(self, source: int, have: bytes, logs: bytes, claims: bytes) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
-        suffixes = np.frombuffer(logs, dtype=np.uint8)
-        room = self.store.log_index.shape[1] - int(self.store.length.max())
-        if (
-            len(logs) > 2 * room
-            and _walk_logs(self.store, self.manner, suffixes, source, False) < 0
-        ):
-            return False  # no room is made for what is malformed
-        self.reserve(len(logs) // 2)
-        return bool(
-            _learn(
-                self.store,
-                self.manner,
-                np.frombuffer(have, dtype=np.uint8),
-                suffixes,
-                np.frombuffer(claims, dtype=np.uint8),
-                source,
-            )
-        )
+        parts = [np.frombuffer(part, dtype=np.uint8) for part in (have, logs, claims)]
+        outcome = _learn(*self._fields, *parts, source)
+        if outcome == _NO_ROOM:
+            self.reserve(len(logs) // 2)
+            outcome = _learn(*self._fields, *parts, source)
+        return outcome == _LEARNT
 
     def reserve(self, entries: int) -> None:
         """Make room for this many more entries in every log."""
@@ -463,23 +552,22 @@ class Replica:
         for new, old in zip(grown, (self.store.log_index, self.store.log_value), strict=True):
             new[:, : old.shape[1]] = old
         self.store = self.store._replace(log_index=grown[0], log_value=grown[1])
+        self._fields = (*self.store, self._law)
 
     def claim(self, sample: int, now_ns: int) -> None:
         """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
-        claims = self.store.claims
-        if claims[_SAMPLE, self.manner.me] != sample:
-            claims[_SAMPLE, self.manner.me] = sample
-            claims[_SINCE, self.manner.me] = now_ns
-        claims[_STAMP, self.manner.me] = self.store.counters[_STEP]
+        claim(self.store.claims, self.store.counters, self.manner.me, sample, now_ns)
 
     def taken(self) -> npt.NDArray[np.int64]:
         """Samples that others have claimed and this participant must leave; a view."""
-        count = _taken(self.store, self.manner.me, self._taken) if self.manner.claims else 0
+        if not self.manner.claims:
+            return self._taken[:0]
+        count = taken(self.store.claims, self.store.counters, self.manner.me, self._taken)
         return self._taken[:count]
 
     def compose(self, target: int = NOBODY) -> tuple[bytes, bytes, bytes]:
         """(have, logs, claims) for one message to everybody, or to one participant."""
-        end_of_have, end_of_logs, end = _compose(self.store, self.manner, self._out, target)
+        end_of_have, end_of_logs, end = _compose(*self._fields, self._out, self._room, target)
         out = self._out
         return (
             out[:end_of_have].tobytes(),
@@ -497,7 +585,7 @@ class Replica:
         self.store.counters[_STEP] += 1
 
 
-@njit(cache=True)
+@kernel
 def _read_logs(logs: np.ndarray, rows: np.ndarray) -> int:
     at = 0
     row = 0
@@ -530,10 +618,16 @@ def read_logs(logs: bytes) -> npt.NDArray[np.int64] | None:
     return None if count < 0 else rows[:count]
 
 
+@kernel
+def _read_have(have: np.ndarray, lengths: np.ndarray) -> int:
+    at = 0
+    for origin in range(lengths.shape[0]):
+        lengths[origin], at = take_uint(have, at)
+    return at
+
+
 def read_have(have: bytes, origins: int) -> list[int] | None:
     """The log lengths in a version vector, in roster order; None if malformed."""
-    buffer, at, lengths = np.frombuffer(have, dtype=np.uint8), 0, []
-    for _ in range(origins):
-        length, at = take_uint(buffer, at)
-        lengths.append(int(length))
-    return None if at < 0 else lengths
+    lengths = np.zeros(origins, dtype=np.int64)
+    at = _read_have(np.frombuffer(have, dtype=np.uint8), lengths)
+    return None if at < 0 else lengths.tolist()

@@ -2,12 +2,12 @@
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from kantor_protocol.kernels import kernel
 from kantor_protocol.keyed import Purpose, philox, to_unit
 
 
-@njit(cache=True)
+@kernel
 def _walk(xy_m: np.ndarray, seed: int, purpose: int, step: int, diffusion_m: float) -> None:
     for j in range(xy_m.shape[0]):
         word_x, word_y = philox(seed, purpose, 0, step, j)

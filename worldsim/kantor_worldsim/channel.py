@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numba import njit
 
+from kantor_protocol.kernels import kernel
 from kantor_protocol.keyed import Purpose, uniform
 from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.scenario import Scenario
@@ -52,7 +52,7 @@ class _Law(NamedTuple):
     reorder_ns: int
 
 
-@njit(cache=True)
+@kernel
 def _delay(law: _Law, link: int, sequence: int, copy: int) -> int:
     delay = law.delay_ns
     if law.jitter_ns > 0:
@@ -65,7 +65,7 @@ def _delay(law: _Law, link: int, sequence: int, copy: int) -> int:
     return delay
 
 
-@njit(cache=True)
+@kernel
 def _transmit(
     law: _Law,
     xy_m: np.ndarray,
@@ -221,7 +221,7 @@ def links(xy_m: np.ndarray, range_m: float) -> int:
     return int(_links(xy_m, range_m))
 
 
-@njit(cache=True)
+@kernel
 def _links(xy_m: np.ndarray, range_m: float) -> int:
     count = 0
     for i in range(xy_m.shape[0]):

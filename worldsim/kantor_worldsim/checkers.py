@@ -8,6 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.messages import RefusedError, decode_news
 from kantor_protocol.packing import Pairs
@@ -19,6 +20,19 @@ from kantor_worldsim.world import SPEED_TOLERANCE
 
 _COMPLAINTS_MAX = 100
 """A broken record is broken; further complaints only count."""
+
+
+@kernel
+def _fall(
+    view: np.ndarray, consumed: np.ndarray, whole: int, sample: np.ndarray, left: np.ndarray
+) -> bool:
+    """Put entries into a view; whether each one fell, and none below what the truth leaves."""
+    sound = True
+    for i in range(sample.shape[0]):
+        j = sample[i]
+        sound = sound and left[i] < view[j] and left[i] >= whole - consumed[j]
+        view[j] = left[i]
+    return sound
 
 
 class Checker:
@@ -157,6 +171,10 @@ class Checker:
             self._complain("weights", name, "entries that do not decode")
             return
         view = self._views[self._places[name]]
+        before = view[pairs[0]]
+        if _fall(view, self._consumed, self._units.sample, *pairs):
+            return
+        view[pairs[0]] = before  # something is wrong: once more, slowly, to say what
         for sample, left in zip(pairs[0].tolist(), pairs[1].tolist(), strict=True):
             if left >= view[sample]:
                 self._complain(
@@ -212,7 +230,9 @@ class Checker:
                 self._complain("energy", name, f"{units} units in one point")
             np.add.at(self._consumed, pairs[0], pairs[1])
             if self._scenario.merge == "ledger":
-                self._own_spent[name] += np.column_stack(pairs).tolist()
+                self._own_spent[name] += map(
+                    list, zip(pairs[0].tolist(), pairs[1].tolist(), strict=True)
+                )
         if self._points[name] > self._scenario.steps_per_robot:
             self._complain("energy", name, f"{self._points[name]} points shipped")
         if energy_spent < self._points[name] and name != SUPERVISOR:

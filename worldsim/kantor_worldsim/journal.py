@@ -104,7 +104,8 @@ class Journal:
 
     def take_row(self, row: Row) -> None:
         """Write one row of metrics, for viewers; it is not part of the digest."""
-        self._write(METRICS_TOPIC, json.dumps(row._asdict()).encode())
+        if self._file is not None:
+            self._write(METRICS_TOPIC, json.dumps(row._asdict()).encode())
 
     def close(self) -> None:
         """Finish the file, and give the reserve back, so that the result finds room."""

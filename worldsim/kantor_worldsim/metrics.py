@@ -24,8 +24,8 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numba import njit
 
+from kantor_protocol.kernels import kernel
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
 from kantor_protocol.packing import Pairs
@@ -130,7 +130,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
 
 
-@njit(cache=True)
+@kernel
 def _pending(xy_m: np.ndarray, x: float, y: float, units: np.ndarray) -> float:
     total = 0.0
     for j in range(units.shape[0]):
@@ -141,7 +141,7 @@ def _pending(xy_m: np.ndarray, x: float, y: float, units: np.ndarray) -> float:
     return total
 
 
-@njit(cache=True)
+@kernel
 def _least(views: np.ndarray, out: np.ndarray) -> None:
     for j in range(out.shape[0]):
         least = views[0, j]

@@ -1,10 +1,11 @@
 """What a pose senses."""
 
 import numpy as np
-from numba import njit
+
+from kantor_protocol.kernels import kernel
 
 
-@njit(cache=True)
+@kernel
 def sense_targets(
     targets_m: np.ndarray, found: np.ndarray, x: float, y: float, range_m: float, out: np.ndarray
 ) -> int:

@@ -125,7 +125,7 @@ class World:
 
     def _spend(self, body: _Body, spent: bytes) -> list[str]:
         pairs = self._pairs.decode(spent, self._samples)
-        if pairs is None or not 0 < int(pairs[1].sum()) <= self._units.point:
+        if pairs is None or not 0 < sum(pairs[1].tolist()) <= self._units.point:
             return ["units"]
         if body.energy_spent >= self._budget:
             return ["energy"]

@@ -10,10 +10,11 @@ import math
 import numpy as np
 
 from kantor_agent.belief import Belief
-from kantor_agent.field import Grid, kernel, nearest
+from kantor_agent.field import Grid, nearest
 from kantor_agent.planners.base import Goal
+from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import Pose
-from kantor_protocol.replica import NOBODY
+from kantor_protocol.replica import NOBODY, claim, taken
 
 
 @kernel
@@ -84,18 +85,28 @@ def _choose(
     frame: np.ndarray,
     levels: int,
     weights: np.ndarray,
-    taken: np.ndarray,
+    claims: np.ndarray,
+    counters: np.ndarray,
+    held: np.ndarray,
+    me: int,
     best: np.ndarray,
     near: np.ndarray,
     cost_to_go: np.ndarray,
     x: float,
     y: float,
+    now_ns: int,
 ) -> tuple[int, float, float]:
-    """The goal and its place, for calls from Python; a sample in `taken` only if there is no other."""
+    """The goal and its place, for calls from Python; see `Transport.choose`.
+
+    held: room for the samples that others hold. me: NOBODY in a mission without claims.
+    """
     grid = Grid(xy_m, order, slot, cell, first, alive, frame, levels)
-    sample = choose_sample(grid, weights, x, y, taken, best, near, cost_to_go)
-    if sample == NOBODY and taken.shape[0] > 0:
-        sample = choose_sample(grid, weights, x, y, taken[:0], best, near, cost_to_go)
+    skip = held[: taken(claims, counters, me, held) if me != NOBODY else 0]
+    sample = choose_sample(grid, weights, x, y, skip, best, near, cost_to_go)
+    if sample == NOBODY and skip.shape[0] > 0:
+        sample = choose_sample(grid, weights, x, y, skip[:0], best, near, cost_to_go)
+    if me != NOBODY:
+        claim(claims, counters, me, sample, now_ns)
     if sample == NOBODY:
         return NOBODY, x, y
     return sample, xy_m[sample, 0], xy_m[sample, 1]
@@ -114,10 +125,5 @@ class Transport:
 
     def choose(self, belief: Belief, pose: Pose, now_ns: int, /) -> Goal | None:
         """The first sample of the best order; one that another robot holds only if all are held."""
-        replica = belief.replica
-        sample, x_m, y_m = _choose(
-            *belief.to_search, replica.taken(), *self._room, pose.x_m, pose.y_m
-        )
-        if replica.manner.claims:
-            replica.claim(sample, now_ns)
+        sample, x_m, y_m = _choose(*belief.to_choose, *self._room, pose.x_m, pose.y_m, now_ns)
         return None if sample == NOBODY else Goal(x_m, y_m, sample)
