@@ -9,6 +9,7 @@ from kantor_fleet.exits import Exit, fail
 from kantor_fleet.team import participant, team
 from kantor_protocol.machine import StateMachine
 from kantor_protocol.messages import RefusedError
+from kantor_protocol.scenario import ScenarioError
 from kantor_worldsim.checkers import check
 from kantor_worldsim.journal import Digest, file_digest, read
 from kantor_worldsim.loop import in_process, simulate
@@ -28,11 +29,15 @@ def verify(folder: Path) -> Exit:
     if not records or not isinstance(records[0][1], Opening):
         print(f"FAIL  {JOURNAL}: no opening record in it")
         return Exit.NOT_MET
-    verdicts = [
-        *_verdicts_on_file(folder, manifest, records),
-        _verdict_of_checker(records),
-        _verdict_of_execution(manifest, records),
-    ]
+    verdicts = list(_verdicts_on_file(folder, manifest, records))
+    try:
+        verdicts += [_verdict_of_checker(records), _verdict_of_execution(manifest, records)]
+    except (
+        RefusedError,
+        ScenarioError,
+        ValueError,
+    ) as error:  # an opening that nothing can start from
+        verdicts.append((False, f"{JOURNAL}: its opening is no use: {str(error).splitlines()[0]}"))
     for held, line in verdicts:
         print(f"{'ok  ' if held else 'FAIL'}  {line}")
     return Exit.DONE if all(held for held, _ in verdicts) else Exit.NOT_MET

@@ -107,6 +107,18 @@ def test_verify_finds_a_forged_record_behind_a_forged_manifest(kantor: "Kantor")
     assert "executed again" in finished.out
 
 
+def test_verify_tells_of_an_opening_that_is_no_use(kantor: "Kantor") -> None:
+    """A damaged opening is a verdict, not a traceback."""
+    in_process(kantor, "paper-decentralized", *SHORT)
+    (folder,) = kantor.runs()
+    data = (folder / "run.mcap").read_bytes()
+    (folder / "run.mcap").write_bytes(data.replace(b"<f8", b"=f8", 1))
+
+    finished = kantor("verify", folder)
+    assert (finished.code, finished.err) == (1, "")
+    assert "FAIL  run.mcap: its opening is no use" in finished.out
+
+
 def test_ctrl_c_leaves_a_valid_partial_record(kantor: "Kantor") -> None:
     """SIGINT ends the mission, closes the record, draws the picture, exits with 130."""
     process = kantor.start("run", "paper-single", "--exchange", "in-process")

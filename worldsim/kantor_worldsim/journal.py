@@ -1,15 +1,14 @@
 """The journal: the records of a run on disk (MCAP, msgpack) and their digest.
 
-Messages go straight to a buffered file that is flushed on a timer, so a killed recorder loses at most
-that much; MCAP's own chunks would hold seconds back. A file cut anywhere reads up to the cut.
+Every message goes to the operating system at once, so a killed recorder loses nothing that it took;
+MCAP's own chunks would hold seconds back. A file cut anywhere reads up to the cut.
 """
 
 import contextlib
 import hashlib
 import json
 import struct
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
@@ -24,7 +23,6 @@ from kantor_worldsim.records import Batch, Ending, Record, decode_record, encode
 
 RECORD_TOPIC = "/kantor/record"
 METRICS_TOPIC = "/kantor/metrics"
-FLUSH_S = 0.25
 _RESERVE_BYTES = 256 * 1024
 
 
@@ -54,17 +52,11 @@ class Journal:
     more. Room for the ending was set aside at the start.
     """
 
-    def __init__(
-        self,
-        path: Path | None = None,
-        monotonic: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, path: Path | None = None) -> None:
         """path: the file to create; None digests only."""
         self.digest = Digest()
         self.cut: str | None = None
         """Why the file ends early, if it does."""
-        self._monotonic = monotonic
-        self._flushed = monotonic()
         self._file: IO[bytes] | None = None
         self._path = path
         self._sequence = 0
@@ -127,9 +119,7 @@ class Journal:
             self._writer.add_message(
                 self._channels[topic], self._time_ns, payload, self._time_ns, self._sequence
             )
-            if self._monotonic() - self._flushed >= FLUSH_S:
-                self._file.flush()
-                self._flushed = self._monotonic()
+            self._file.flush()
         except OSError as error:
             self._give_up(error)
 

@@ -69,7 +69,7 @@ class Recording:
             self._manifest = _manifest(scenario, seed, exchange)
             _write_json(folder / MANIFEST, self._manifest)
             self._table = _Table(folder / METRICS)
-        self.journal = Journal(None if folder is None else folder / JOURNAL, monotonic)
+        self.journal = Journal(None if folder is None else folder / JOURNAL)
 
     def take(self, record: Record) -> None:
         """Follow one record."""
