@@ -34,8 +34,7 @@ def run(
     from kantor_fleet.run import run as run_mission  # noqa: PLC0415
 
     _check_seed(seed)
-    if not 0.0 < speed <= 1000.0:
-        fail(Exit.USAGE, f"--speed {speed:g}: give a factor above 0, at most 1000")
+    _check_speed(speed)
     return run_mission(find(scenario, set), seed, exchange, speed, out)
 
 
@@ -70,8 +69,7 @@ def worldsim(
     from kantor_fleet.catalog import find  # noqa: PLC0415
 
     _check_seed(seed)
-    if not 0.0 < speed <= 1000.0:
-        fail(Exit.USAGE, f"--speed {speed:g}: give a factor above 0, at most 1000")
+    _check_speed(speed)
     return host_by_hand(
         find(scenario, set), seed, exchange, speed, listen, credentials, fleet, start_after, out
     )
@@ -216,6 +214,11 @@ def main() -> None:
 def _check_seed(seed: int) -> None:
     if not 0 <= seed < 2**63:
         fail(Exit.USAGE, f"--seed {seed}: give a whole number from 0 to 2^63 - 1")
+
+
+def _check_speed(speed: float) -> None:
+    if not 0.0 < speed <= 1000.0:
+        fail(Exit.USAGE, f"--speed {speed:g}: give a factor above 0, at most 1000")
 
 
 def _spread_set(arguments: list[str]) -> list[str]:

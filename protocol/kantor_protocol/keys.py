@@ -56,11 +56,6 @@ def progress(fleet: str) -> str:
     return f"{_ROOT}/{fleet}/{WORLD}/progress"
 
 
-def world(fleet: str) -> str:
-    """All that world-sim tells observers."""
-    return f"{_ROOT}/{fleet}/{WORLD}/**"
-
-
 def everything(fleet: str) -> str:
     """The whole fleet."""
     return f"{_ROOT}/{fleet}/**"

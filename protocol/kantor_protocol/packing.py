@@ -12,8 +12,6 @@ from kantor_protocol.kernels import kernel
 
 MALFORMED = -1
 
-Buffer = npt.NDArray[np.uint8]
-
 
 @kernel
 def put_uint(out: np.ndarray, at: int, value: int) -> int:
