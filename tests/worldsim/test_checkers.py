@@ -466,7 +466,7 @@ def _supervisor_moves(records: Records) -> list[Record]:
     return put_act(records, act, ruling(pose=Pose(50.0, 50.1)))
 
 
-@breaks("speed", "range")
+@breaks("speed")
 def _nowhere(records: Records) -> list[Record]:
     return put_act(records, acts(records, "r1")[-1], ruling(pose=Pose(float("nan"), 0.0)))
 

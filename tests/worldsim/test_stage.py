@@ -77,17 +77,18 @@ def test_record_opens_with_all_that_the_run_starts_from() -> None:
     assert (opening.units.sample, opening.units.point) == (5, 2)
 
 
-def test_everybody_moves_before_anybody_is_heard() -> None:
-    """Range is between the poses at the end of the moment, not between early and late ones."""
+def test_everybody_is_heard_from_where_its_step_began() -> None:
+    """Range is between the poses before the moves of a moment: who comes near is heard next time."""
     theatre = Theatre("radio.range_m=5")
-    batch = theatre.play(
-        r1=outputs(1, (10.0, 0.0), EVERYBODY),
-        r2=outputs(1, (15.0, 0.0), EVERYBODY, source="r2"),
-        r3=outputs(1, (90.0, 0.0), EVERYBODY, source="r3"),
+    near = {"r1": (10.0, 0.0), "r2": (15.0, 0.0), "r3": (90.0, 0.0)}
+    first, second = (
+        theatre.play(**{name: outputs(step, near[name], EVERYBODY, source=name) for name in near})
+        for step in (1, 2)
     )
 
-    assert [(v.source, v.target) for v in batch.verdicts] == [("r1", "r2"), ("r2", "r1")]
-    assert batch.out_of_range == 4
+    assert first.verdicts == ()
+    assert [(v.source, v.target) for v in second.verdicts] == [("r1", "r2"), ("r2", "r1")]
+    assert (first.out_of_range, second.out_of_range) == (6, 4)
 
 
 def test_inbox_is_handed_out_once() -> None:

@@ -1,8 +1,8 @@
 """The radio: who hears an envelope, when, and what gets lost. The only place that knows range.
 
-Range is between true poses at the time of sending. Every draw is keyed by (seed, purpose, link,
-sequence, copy): it depends on nothing that happened before, so one more message or one more robot
-changes no other draw.
+Range is between true poses at the time of sending, which is when a step begins: after the inbox was
+taken in, before the move. Every draw is keyed by (seed, purpose, link, sequence, copy): it depends on
+nothing that happened before, so one more message or one more robot changes no other draw.
 """
 
 from collections.abc import Sequence

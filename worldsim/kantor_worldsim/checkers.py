@@ -110,17 +110,20 @@ class Checker:
         if batch.now_ns < self._now_ns:
             self._complain("order", "record", f"time runs back to {batch.now_ns * 1e-9:.3f} s")
         self._now_ns = batch.now_ns
-        for act in batch.acts:
-            if act.name not in self._places:
-                self._complain("order", act.name, "not in the roster")
-                continue
+        acts = [act for act in batch.acts if act.name in self._places]
+        for stranger in (act.name for act in batch.acts if act.name not in self._places):
+            self._complain("order", stranger, "not in the roster")
+        for act in acts:
             self._check_inbox(act)
+            for envelope in act.outputs.outbox if act.outputs else ():
+                self._sent[envelope.source, envelope.sequence] = envelope.target
+        for verdict in batch.verdicts:
+            self._check_verdict(verdict)
+        for act in acts:
             if act.outputs is None or act.ruling is None:
                 self._absences[act.name] += 1
             else:
                 self._check_act(act)
-        for verdict in batch.verdicts:
-            self._check_verdict(verdict)
 
     def _check_inbox(self, act: Act) -> None:
         for source, sequence in act.heard:
@@ -154,7 +157,6 @@ class Checker:
         self._moved_ns[act.name] = act.now_ns
         self._poses[act.name] = ruling.pose
         for envelope in outputs.outbox:
-            self._sent[envelope.source, envelope.sequence] = envelope.target
             self._check_ledger(act.name, envelope)
 
     def _check_speed(self, name: ParticipantId, now_ns: int, pose: Pose) -> None:

@@ -64,20 +64,18 @@ class Stage:
         return "done" if robots - self.gone or robots <= self._resting else "deserted"
 
     def settle(self, now_ns: int, steps: Iterable[Step]) -> tuple[Verdict, ...]:
-        """Let steps made at one moment happen: first everybody moves, then everybody is heard."""
+        """Let steps made at one moment happen: everybody is heard from where its step began, then moves.
+
+        A robot answers from where it heard, before what it heard makes it turn away (Algorithm 3).
+        """
         self.now_ns = max(self.now_ns, now_ns)
-        acts, sent, absent = [], [], []
-        for name, inputs, outputs in steps:
-            sound = self._sound(name, outputs)
-            if sound is None:
-                absent.append(name)
-            acts.append(self._act(name, inputs, sound))
-            if sound is not None:
-                sent += [Sent(now_ns, envelope) for envelope in sound.outbox]
+        sound = [(name, inputs, self._sound(name, outputs)) for name, inputs, outputs in steps]
+        sent = [Sent(now_ns, e) for _, _, outputs in sound if outputs for e in outputs.outbox]
         verdicts, out_of_range = self.channel.transmit(sent)
-        batch = Batch(now_ns, tuple(acts), tuple(verdicts), out_of_range, tuple(absent))
-        self._tell(batch)
-        return batch.verdicts
+        acts = tuple(self._act(name, inputs, outputs) for name, inputs, outputs in sound)
+        absent = tuple(act.name for act in acts if act.outputs is None)
+        self._tell(Batch(now_ns, acts, tuple(verdicts), out_of_range, absent))
+        return tuple(verdicts)
 
     def end(self, reason: str) -> None:
         """Close the record."""
