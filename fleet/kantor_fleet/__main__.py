@@ -3,20 +3,26 @@
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from kantor_fleet.exits import Exit, fail
 
+if TYPE_CHECKING:
+    from kantor_protocol.scenario import Scenario
+
 
 def run(
     scenario: Annotated[str, tyro.conf.Positional] = "fleet",
     /,
+    *,
     seed: int = 0,
     exchange: Literal["in-process", "lockstep", "wall"] = "lockstep",
     speed: float = 1.0,
     out: Path = Path("runs"),
+    exact: bool = False,
+    exact_every: int = 0,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002  the flag is --set
 ) -> int:
     """Run a mission, with live progress, and leave its record and its picture.
@@ -28,6 +34,8 @@ def run(
             result. wall: a process each, every robot on its own clock.
         speed: wall only: simulated seconds in a real one.
         out: Where the run folder is made.
+        exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
+        exact_every: Periods from one exact distance to the next, seconds of work each; not on the wall.
         set: Override a key of the scenario, such as radio.range_m=150; any number of times.
     """
     from kantor_fleet.catalog import find  # noqa: PLC0415  each verb imports what it needs
@@ -35,12 +43,15 @@ def run(
 
     _check_seed(seed)
     _check_speed(speed)
-    return run_mission(find(scenario, set), seed, exchange, speed, out)
+    mission = find(scenario, set)
+    every = _exact(mission, exact_every, exchange, exact=exact)
+    return run_mission(mission, seed, exchange, speed, out, every)
 
 
 def worldsim(
     scenario: Annotated[str, tyro.conf.Positional] = "fleet",
     /,
+    *,
     listen: str = "tcp/127.0.0.1:7447",
     credentials: Path = Path("credentials"),
     fleet: str = "kantor",
@@ -49,6 +60,7 @@ def worldsim(
     speed: float = 1.0,
     start_after: float | None = None,
     out: Path = Path("runs"),
+    exact: bool = False,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
 ) -> int:
     """World-sim by hand: host the bus, wait for the roster, run the mission, record it.
@@ -63,6 +75,7 @@ def worldsim(
         speed: wall only: simulated seconds in a real one.
         start_after: Seconds after which to start without whoever is missing; by default never.
         out: Where the run folder is made.
+        exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
         set: Override a key of the scenario.
     """
     from kantor_fleet.by_hand import host_by_hand  # noqa: PLC0415
@@ -70,8 +83,10 @@ def worldsim(
 
     _check_seed(seed)
     _check_speed(speed)
+    mission = find(scenario, set)
+    every = _exact(mission, 0, exchange, exact=exact)
     return host_by_hand(
-        find(scenario, set), seed, exchange, speed, listen, credentials, fleet, start_after, out
+        mission, seed, exchange, speed, listen, credentials, fleet, start_after, out, every
     )
 
 
@@ -219,6 +234,23 @@ def _check_seed(seed: int) -> None:
 def _check_speed(speed: float) -> None:
     if not 0.0 < speed <= 1000.0:
         fail(Exit.USAGE, f"--speed {speed:g}: give a factor above 0, at most 1000")
+
+
+def _exact(scenario: "Scenario", every: int, exchange: str, *, exact: bool) -> int | None:
+    """Periods between exact distances, 0 for the end only, None for none."""
+    from kantor_worldsim.exact import AFFORDABLE, available  # noqa: PLC0415
+
+    if not exact and not every:
+        return None
+    if every < 0:
+        fail(Exit.USAGE, f"--exact-every {every}: give a number of periods")
+    if every and exchange == "wall":
+        fail(Exit.USAGE, "--exact-every: not on the wall, it would hold the relay up; use --exact")
+    if not available():
+        fail(Exit.USAGE, "--exact: needs POT; pip install 'kantor[exact]'")
+    if scenario.energy.points * (scenario.samples.count or 1) > AFFORDABLE:
+        fail(Exit.USAGE, "--exact: too many points and samples; at most 4e8 pairs")
+    return every
 
 
 def _spread_set(arguments: list[str]) -> list[str]:

@@ -24,6 +24,7 @@ def host_by_hand(
     fleet: str,
     start_after_s: float | None,
     out: Path,
+    exact_every: int | None,
 ) -> Exit:
     """World-sim in this terminal. Raises ScenarioError, BusError, OSError."""
     from kantor_fleet.preload import warm_up  # noqa: PLC0415  robots by hand do not need these
@@ -48,7 +49,7 @@ def host_by_hand(
             for name in scenario.roster:
                 verb = name if name == "supervisor" else f"agent {name}"
                 view.note(f"  kantor {verb} --connect {listen} --credentials {secrets}")
-            recording = Recording(scenario, seed, exchange, folder)
+            recording = Recording(scenario, seed, exchange, folder, exact_every)
             run(host, plan, recording, interrupts, view.show)
     conclude(folder)
     result = read_result(folder)

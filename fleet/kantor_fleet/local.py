@@ -41,6 +41,7 @@ class Order(NamedTuple):
     exchange: str
     speed: float
     folder: Path
+    exact_every: int | None = None
 
 
 class Fleet:
@@ -146,7 +147,9 @@ def _be_world_sim(order: Order, listen: str, secrets: Path, log: Path) -> None:
     with Interrupts(patient=True) as interrupts:
         try:
             with bus.Host(identity, listen, users, scenario.roster) as host:
-                recording = Recording(scenario, seed, order.exchange, order.folder)
+                recording = Recording(
+                    scenario, seed, order.exchange, order.folder, order.exact_every
+                )
                 result = run(host, plan, recording, interrupts)
         except bus.BusError as error:
             say(str(error))

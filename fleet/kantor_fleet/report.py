@@ -68,10 +68,11 @@ _GRAIN = 1.0 / 4_000
 Points = npt.NDArray[np.float64]
 
 
-def draw(records: Iterable[Record], path: Path) -> None:
+def draw(records: Iterable[Record], path: Path, exact: Sequence[tuple[float, float]] = ()) -> None:
     """Write the picture of a run as PNG, 14 x 8 inches at 110 dpi.
 
     The records may stop anywhere. Without an opening there is nothing to draw, and no file.
+    exact: times (s) with the exact distance (m) that was computed for them.
     """
     run = Run.of(records)
     if run is None:
@@ -81,7 +82,7 @@ def draw(records: Iterable[Record], path: Path) -> None:
     grid = figure.add_gridspec(2, 2, height_ratios=(0.08, 0.92), width_ratios=(1.65, 1.0))
     _write_title(figure.add_subfigure(grid[0, :]), run)
     _draw_map(figure.add_subfigure(grid[1, 0]), run)
-    _draw_curves(figure.add_subfigure(grid[1, 1]), run)
+    _draw_curves(figure.add_subfigure(grid[1, 1]), run, exact)
     figure.savefig(path, format="png", dpi=DPI)
 
 
@@ -356,12 +357,12 @@ def _draw_radio(axes: Axes, run: Run) -> None:
     axes.plot([], [], "o", ms=9.0, mfc="none", mec=_FAINT, label=f"radio range {range_m:g} m")
 
 
-def _draw_curves(place: SubFigure, run: Run) -> None:
+def _draw_curves(place: SubFigure, run: Run, exact: Sequence[tuple[float, float]]) -> None:
     """What the run measured, over simulated time."""
     bounds, progress, mass = place.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.2, 1.0))
     rows = run.metrics.rows
     rows = rows[:-1][_thinned(len(rows) - 1, _ROWS_SHOWN)] + rows[-1:]
-    _draw_bounds(bounds, run, rows)
+    _draw_bounds(bounds, run, rows, exact)
     _draw_progress(progress, run, rows)
     _draw_mass(mass, rows)
     _tidy(mass, "simulated time, s", "mass, %")
@@ -372,7 +373,9 @@ def _draw_curves(place: SubFigure, run: Run) -> None:
         _add_legend(place, moments)
 
 
-def _draw_bounds(axes: Axes, run: Run, rows: Sequence[Row]) -> None:
+def _draw_bounds(
+    axes: Axes, run: Run, rows: Sequence[Row], exact: Sequence[tuple[float, float]]
+) -> None:
     equation = 6 if run.scenario.robots.count == 1 else 11 if run.scenario.centralized else 12
     lines = (
         (f"bound (eq. {equation})", [row.w_ub_paper for row in rows], _FIRST, 2.4),
@@ -381,6 +384,8 @@ def _draw_bounds(axes: Axes, run: Run, rows: Sequence[Row]) -> None:
     )
     for label, values, colour, width in lines:
         _add_line(axes, rows, values, label, colour, width)
+    if exact:
+        axes.plot(*zip(*exact, strict=True), "o", ms=4.5, color=_FOUND, label="exact distance")
     if any(row.w_ub_paper > 0.0 for row in rows):
         axes.set_yscale("log", nonpositive="mask")
     _tidy(axes, "", "$W_\\mathrm{UB}$, m")

@@ -1,5 +1,6 @@
 """`kantor run`: a mission from start to picture."""
 
+import csv
 import sys
 import time
 from pathlib import Path
@@ -18,7 +19,14 @@ from kantor_worldsim.journal import read
 from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.metrics import Result
 from kantor_worldsim.process import progress
-from kantor_worldsim.recording import JOURNAL, REPORT, RESULT, Recording, folder_for
+from kantor_worldsim.recording import (
+    JOURNAL,
+    METRICS,
+    REPORT,
+    RESULT,
+    Recording,
+    folder_for,
+)
 from kantor_worldsim.records import Record
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
@@ -26,15 +34,21 @@ from kantor_worldsim.world import Site
 _GLANCE_S = 0.2
 
 
-def run(scenario: Scenario, seed: int, exchange: str, speed: float, out: Path) -> Exit:
-    """Run a mission and leave its folder; what to exit with. Raises ScenarioError, BusError, OSError."""
+def run(
+    scenario: Scenario, seed: int, exchange: str, speed: float, out: Path, exact_every: int | None
+) -> Exit:
+    """Run a mission and leave its folder; what to exit with. Raises ScenarioError, BusError, OSError.
+
+    exact_every: see Metrics.
+    """
     site = Site.of(scenario, seed)
     folder = folder_for(scenario, seed, out)
     with Interrupts() as interrupts:
         if exchange == "in-process":
-            code = _run_in_process(scenario, seed, site, folder, interrupts)
+            recording = Recording(scenario, seed, exchange, folder, exact_every)
+            code = _run_in_process(scenario, seed, site, recording, interrupts)
         else:
-            order = Order(scenario, seed, exchange, speed, folder)
+            order = Order(scenario, seed, exchange, speed, folder, exact_every)
             code = _run_processes(order, interrupts)
         conclude(folder)
         return interrupts.code or code
@@ -45,13 +59,20 @@ def conclude(folder: Path) -> None:
     from kantor_fleet.report import draw  # noqa: PLC0415  matplotlib is slow to import
 
     try:
-        draw((record for _, record in read(folder / JOURNAL)), folder / REPORT)
+        draw((record for _, record in read(folder / JOURNAL)), folder / REPORT, _exact_of(folder))
     except OSError as error:
         print(f"kantor: no {REPORT}: {error}", file=sys.stderr)
     result = read_result(folder)
     if result is not None:
         print(summary(result))
     print(f"  {folder}/  ({', '.join(sorted(path.name for path in folder.iterdir()))})")
+
+
+def _exact_of(folder: Path) -> list[tuple[float, float]]:
+    """Times (s) and exact distances (m) in a run folder; they take long, so they are not redone."""
+    with (folder / METRICS).open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row.get("w1_exact")]
+    return [(float(row["time_s"]), float(row["w1_exact"])) for row in rows]
 
 
 def read_result(folder: Path) -> Result | None:
@@ -82,9 +103,10 @@ def summary(result: Result) -> str:
         f"{100.0 * result.mass_left:.2f} % of the mass left, "
         f"{100.0 * result.mass_double_counted:.2f} % counted twice"
     )
+    exact = "" if result.w1_exact is None else f", exact {result.w1_exact:.4g}"
     bound = (
         f"{result.w_ub_start:.4g} -> {result.w_ub.paper:.4g} "
-        f"(tight {tight}, last tick's {result.w_ub.final_instant:.4g})"
+        f"(tight {tight}{exact}, last tick's {result.w_ub.final_instant:.4g})"
     )
     radio = (
         f"{result.deliveries} deliveries, {result.drops} dropped, "
@@ -106,9 +128,8 @@ def summary(result: Result) -> str:
 
 
 def _run_in_process(
-    scenario: Scenario, seed: int, site: Site, folder: Path, interrupts: Interrupts
+    scenario: Scenario, seed: int, site: Site, recording: Recording, interrupts: Interrupts
 ) -> Exit:
-    recording = Recording(scenario, seed, "in-process", folder)
     with ProgressView(scenario.name) as view:
         warm_up()
         glanced = time.monotonic()

@@ -57,6 +57,24 @@ def test_an_override_without_a_value_is_refused(kantor: "Kantor") -> None:
     )
 
 
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (("--exact-every", "-1"), "--exact-every -1: give a number of periods"),
+        (("--exact-every", "9", "--exchange", "wall"), "not on the wall"),
+        (("--exact", "--set", "samples.count=90000"), "--exact: too many points and samples"),
+    ],
+)
+def test_an_exact_distance_out_of_reach_is_refused(
+    kantor: "Kantor", flags: tuple[str, ...], says: str
+) -> None:
+    """It takes seconds and memory, which the wall does not wait for."""
+    code, line = refused(kantor, "run", "fleet", *flags)
+
+    assert code == 2
+    assert says in line
+
+
 def test_an_unknown_scenario_is_refused_with_the_known_ones(kantor: "Kantor") -> None:
     """A name that is not packaged lists those that are."""
     code, line = refused(kantor, "run", "flet")

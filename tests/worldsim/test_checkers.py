@@ -568,7 +568,8 @@ def test_every_rule_can_be_broken() -> None:
     listed = Checker.__doc__.partition("-----\n")[2].splitlines()
     names = {line.split()[0] for line in listed if line[4:5].isalpha()}
 
-    assert names == {name.partition("-")[0] for name in BROKEN}
+    broken_by_rows = {"bound"}  # see test_exact.py
+    assert names == {name.partition("-")[0] for name in BROKEN} | broken_by_rows
 
 
 def test_complaint_says_when_who_and_what(played: Play) -> None:

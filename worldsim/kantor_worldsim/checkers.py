@@ -15,6 +15,8 @@ from kantor_protocol.packing import Pairs
 from kantor_protocol.replica import read_have, read_logs
 from kantor_protocol.weights import WeightsSubscriber
 from kantor_worldsim.channel import DROPPED, Verdict
+from kantor_worldsim.exact import ROUNDING
+from kantor_worldsim.metrics import Row
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 from kantor_worldsim.world import SPEED_TOLERANCE
 
@@ -49,6 +51,7 @@ class Checker:
                 entry for entry, and at the end its vector is exactly what the logs it holds leave
     credit      no view is lower than the weights that all spending leaves (both merges)
     speed       no accepted move is longer than speed times time
+    bound       where the bounds claim to hold, the exact distance is not above them (rows that have it)
     goal        a goal has weight in the robot's own view (transport with standing samples)
     order       steps count up by one, time never runs back, an opening first, nothing after the end
     ruling      the world found no fault of its own
@@ -78,6 +81,17 @@ class Checker:
         elif isinstance(record, Ending):
             self._ended = True
             self._end()
+
+    def take_row(self, row: Row) -> None:
+        """Hold a row's bounds against its exact distance, if they claim to be bounds."""
+        if row.w1_exact is None or row.w_ub_tight is None:
+            return
+        least = row.w1_exact * (1.0 - ROUNDING)
+        for form, bound in (("tight", row.w_ub_tight), ("paper", row.w_ub_paper)):
+            if not bound >= least:
+                self._complain(
+                    "bound", f"tick {row.tick}", f"{form} {bound:.6g} m below {row.w1_exact:.6g} m"
+                )
 
     def _complain(self, rule: str, who: str, what: str) -> None:
         self.count += 1

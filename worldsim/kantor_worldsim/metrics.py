@@ -13,10 +13,13 @@ local
     It rises when robots meet, since neighbours join the sum; the rows give the least and the largest.
 tight
     Each remainder shared evenly by the robots: the pending term divided by their number, on the true
-    remaining weights. A bound only while no sample was filled twice, else None.
+    remaining weights. A bound only while no sample was filled twice and no sample walks, else None.
 instant
     The last tick's shipping plus the pending term. It is no bound; it is what the paper plots, since
     its final values lie below what any plan costs.
+
+The exact distance, if it is asked for, is between the samples and the ensemble that the bounds are
+about: every shipped point where it was shipped, what is left shared evenly by the robots.
 """
 
 import math
@@ -30,6 +33,7 @@ from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
 from kantor_protocol.packing import Pairs
 from kantor_protocol.walk import Walk
+from kantor_worldsim import exact
 from kantor_worldsim.channel import DROPPED, links
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 
@@ -54,6 +58,7 @@ class Row(NamedTuple):
     drops: int
     w_ub_local_min: float | None
     w_ub_local_max: float | None
+    w1_exact: float | None = None
 
 
 class Glance(NamedTuple):
@@ -153,8 +158,10 @@ def _least(views: np.ndarray, out: np.ndarray) -> None:
 class Metrics:
     """Follows the records of one run."""
 
-    def __init__(self) -> None:
+    def __init__(self, exact_every: int | None = None) -> None:
+        """exact_every: periods from one exact distance to the next; 0: at the end only; None: never."""
         self.rows: list[Row] = []
+        self._exact_every = exact_every
         self.finds: list[tuple[float, ParticipantId, int, float, float]] = []
         """(time, robot, target, x, y), world frame."""
         self._opening: Opening | None = None
@@ -168,7 +175,7 @@ class Metrics:
             self._follow(record)
         elif isinstance(record, Ending):
             self._ending = record
-            self._row()
+            self._row(last=True)
 
     def _open(self, opening: Opening) -> None:
         scenario, site = opening.scenario, opening.site
@@ -194,6 +201,7 @@ class Metrics:
         self._shipped = 0.0
         self._shipped_by = [0.0] * robots
         self._shipped_now = 0.0
+        self._points: list[tuple[float, float, int]] = []
         self._spent_units = 0
         self._energy_spent = 0
         self._deliveries = self._drops = self._out_of_range = self._violations = self._absences = 0
@@ -257,6 +265,8 @@ class Metrics:
             return
         self._energy_spent += 1
         x, y = self._xy_m[place].tolist()
+        if self._exact_every is not None:
+            self._points.append((x, y, int(pairs[1].sum())))
         for sample, units in zip(pairs[0].tolist(), pairs[1].tolist(), strict=True):
             way_m = math.hypot(self._walk.xy_m[sample, 0] - x, self._walk.xy_m[sample, 1] - y)
             cost = units * way_m / self._units.whole
@@ -274,7 +284,7 @@ class Metrics:
             _least(self._views, self._common)
         return int(self._common.sum())
 
-    def _row(self) -> None:
+    def _row(self, *, last: bool = False) -> None:
         left = self._mass_left()
         whole, robots = self._units.whole, len(self._xy_m)
         places = [(i, *self._xy_m[i].tolist()) for i in range(robots)]
@@ -284,7 +294,8 @@ class Metrics:
             units = self._common if self._scenario.centralized else self._views[i]
             pending += _pending(xy_m, x, y, units) / whole
         tight = None
-        if int(np.maximum(self._true_left, 0).sum()) == whole - self._spent_units:
+        standing = self._scenario.samples.diffusion_m == 0.0
+        if standing and int(np.maximum(self._true_left, 0).sum()) == whole - self._spent_units:
             tight = self._shipped + sum(
                 _pending(xy_m, x, y, self._true_left) / whole / robots for _, x, y in places
             )
@@ -305,7 +316,26 @@ class Metrics:
                 drops=self._drops,
                 w_ub_local_min=min(local, default=None),
                 w_ub_local_max=max(local, default=None),
+                w1_exact=self._exact() if self._exact_due(last=last) else None,
             )
+        )
+
+    def _exact_due(self, *, last: bool) -> bool:
+        if self._exact_every is None:
+            return False
+        return last or (self._exact_every > 0 and self._tick % self._exact_every == 0)
+
+    def _exact(self) -> float:
+        """W_1 between the samples and the robots' ensemble; see the module."""
+        robots = self._xy_m.shape[0]
+        shipped = np.array(self._points, dtype=np.float64).reshape(-1, 3)
+        left = float(np.maximum(self._true_left, 0).sum())
+        samples_m = self._walk.xy_m
+        return exact.w1(
+            np.concatenate((shipped[:, :2], self._xy_m)),
+            np.concatenate((shipped[:, 2], np.full(robots, left / robots))),
+            samples_m,
+            np.ones(samples_m.shape[0]),
         )
 
     def _local_bounds(self) -> list[float]:
@@ -374,7 +404,7 @@ class Metrics:
             detection_rate=len(self.finds) / self._targets if self._targets else None,
             w_ub_start=self.rows[0].w_ub_paper,
             w_ub=Bounds(last.w_ub_paper, last.w_ub_tight, last.w_ub_instant),
-            w1_exact=None,
+            w1_exact=last.w1_exact,
             energy_spent=self._energy_spent,
             energy_total=scenario.steps_per_robot * robots,
             mass_left=last.mass_left,

@@ -49,10 +49,11 @@ class Recording:
         seed: int,
         exchange: str,
         folder: Path | None = None,
+        exact_every: int | None = None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        """folder: an existing folder for the run's files; None keeps nothing."""
-        self.metrics = Metrics()
+        """folder: an existing folder for the run's files; None keeps nothing. exact_every: see Metrics."""
+        self.metrics = Metrics(exact_every)
         self.checker = Checker()
         self.refused_at_door = 0
         """Messages to world-sim that it could not take in; whoever runs the bus counts them."""
@@ -78,6 +79,7 @@ class Recording:
         self.checker.take(record)
         for row in self.metrics.rows[self._rows :]:
             self.journal.take_row(row)
+            self.checker.take_row(row)
             if self._table is not None:
                 self._table.add(row)
         self._rows = len(self.metrics.rows)
