@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kantor_fleet.report import Run, Trail, draw, team_colours
+from kantor_fleet.picture import Run, Trail
+from kantor_fleet.report import draw
+from kantor_fleet.style import team_colours
 from kantor_fleet.team import team
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import Observation, Outputs, Pose, State
