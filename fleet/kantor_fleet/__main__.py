@@ -131,6 +131,52 @@ def supervisor(
     return participate_by_hand(run_supervisor, "supervisor", connect, credentials, patience)
 
 
+def sweep(
+    scenario: Annotated[str, tyro.conf.Positional] = "fleet",
+    /,
+    *,
+    vary: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    seeds: str = "0:20",
+    jobs: int | None = None,
+    cluster: str | None = None,
+    out: Path | None = None,
+    format: Literal["csv", "parquet"] = "csv",  # noqa: A002  the word users know
+    plot: str | None = None,
+    exact: bool = False,
+    retry_failed: bool = False,
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
+) -> int:
+    """Run many seeds of many variants: a table, a summary and a plot.
+
+    Every variant has the same seeds. Finished runs are kept: the same command goes on where it was
+    stopped, and a wider one runs only what is new.
+
+    Args:
+        scenario: A packaged name or a TOML file.
+        vary: A key and its values, such as radio.range_m=50,100,200; any number of times: the product.
+        seeds: 0:50 (without 50), 7, or 1,4,9.
+        jobs: Processes, by default one for each core; with --cluster slurm the number of Slurm jobs.
+        cluster: Run on the Dask scheduler at this address, or in jobs of `slurm`.
+        out: Where everything is kept; sweeps/<scenario> by default.
+        format: Of the table.
+        plot: The column that plot.png shows.
+        exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
+        retry_failed: Run again what has failed.
+        set: Override a key in every variant.
+    """
+    from kantor_fleet.pools import pool  # noqa: PLC0415
+    from kantor_fleet.sweep.plan import plan  # noqa: PLC0415
+    from kantor_fleet.sweep.run import Order  # noqa: PLC0415
+    from kantor_fleet.sweep.run import sweep as run_sweep  # noqa: PLC0415
+
+    planned = plan(scenario, vary, seeds, set, exact=exact)
+    for variant in planned.variants:
+        _exact(variant.scenario, 0, "in-process", exact=exact)
+    folder = out or Path("sweeps") / planned.name
+    order = Order(planned, folder, format, plot, retry_failed)
+    return run_sweep(order, pool(jobs, cluster))
+
+
 def scenarios(
     action: Annotated[Literal["list", "show"], tyro.conf.Positional] = "list",
     name: Annotated[str, tyro.conf.Positional] = "fleet",
@@ -193,6 +239,7 @@ VERBS: dict[str, Callable[..., int]] = {
     "worldsim": worldsim,
     "agent": agent,
     "supervisor": supervisor,
+    "sweep": sweep,
     "scenarios": scenarios,
     "verify": verify,
     "tap": tap,
@@ -210,7 +257,7 @@ def main() -> None:
             VERBS,
             prog="kantor",
             description="Fleets of robot processes on the Zenoh bus that explore together.",
-            args=_spread_set(sys.argv[1:]),
+            args=_spread(sys.argv[1:]),
         )
     except (ScenarioError, CredentialsError) as error:
         fail(Exit.USAGE, str(error))
@@ -253,15 +300,18 @@ def _exact(scenario: "Scenario", every: int, exchange: str, *, exact: bool) -> i
     return every
 
 
-def _spread_set(arguments: list[str]) -> list[str]:
-    """`--set a=1 b=2` as `--set a=1 --set b=2`."""
+_REPEATED = ("--set", "--vary")
+
+
+def _spread(arguments: list[str]) -> list[str]:
+    """`--set a=1 b=2` as `--set a=1 --set b=2`, and `--vary` likewise."""
     spread: list[str] = []
-    in_set = False
+    flag = None
     for argument in arguments:
-        if in_set and "=" in argument and not argument.startswith("-") and spread[-1] != "--set":
-            spread.append("--set")
-        elif argument.startswith("-") or spread[-1:] != ["--set"]:
-            in_set = argument == "--set"
+        if flag and "=" in argument and not argument.startswith("-") and spread[-1] != flag:
+            spread.append(flag)
+        elif argument.startswith("-") or spread[-1:] != [flag]:
+            flag = argument if argument in _REPEATED else None
         spread.append(argument)
     return spread
 

@@ -1,0 +1,72 @@
+"""One run as a value: a case goes in, an outcome comes out, and nothing else happens.
+
+Cases and outcomes travel between processes and machines.
+"""
+
+import os
+import socket
+import time
+
+import msgspec
+
+from kantor_fleet.team import team
+from kantor_protocol.scenario import Scenario, ScenarioError
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.metrics import Result
+from kantor_worldsim.recording import Recording
+from kantor_worldsim.stage import Stage
+from kantor_worldsim.world import Site
+
+_REASON_LETTERS = 300
+
+
+class Case(msgspec.Struct, frozen=True):
+    """What decides a run."""
+
+    scenario: Scenario
+    seed: int
+    exact: bool = False
+    """Also compute the exact Wasserstein distance at the end."""
+
+
+class Outcome(msgspec.Struct, frozen=True, kw_only=True):
+    """What came of a case: a result, or the reason why there is none."""
+
+    result: Result | None = None
+    failed: str | None = None
+    """One line."""
+    wall_s: float = 0.0
+    worker: str = ""
+    """HOST:PID of the process that ran it."""
+
+
+def run_case(case: Case) -> Outcome:
+    """Run a case in this process, with every referee; whatever goes wrong is its outcome."""
+    started = time.monotonic()
+    result, failed = None, None
+    try:
+        result = _run(case)
+    except Exception as error:  # noqa: BLE001  a run that fails must not take others with it
+        failed = reason(error)
+    return Outcome(
+        result=result,
+        failed=failed,
+        wall_s=time.monotonic() - started,
+        worker=f"{socket.gethostname()}:{os.getpid()}",
+    )
+
+
+def reason(error: BaseException) -> str:
+    """An exception as one line."""
+    text = " ".join(str(error).split())
+    line = text if isinstance(error, ScenarioError) else f"{type(error).__name__}: {text}"
+    return line.removesuffix(": ")[:_REASON_LETTERS]
+
+
+def _run(case: Case) -> Result:
+    scenario, seed = case.scenario, case.seed
+    site = Site.of(scenario, seed)
+    recording = Recording(scenario, seed, "in-process", exact_every=0 if case.exact else None)
+    stage = Stage(scenario, seed, site, [recording.take])
+    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    return recording.finish()

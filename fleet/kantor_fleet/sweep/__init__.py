@@ -1,0 +1,1 @@
+"""`kantor sweep`: many seeds, many variants, one table."""

@@ -1,0 +1,194 @@
+"""What a sweep is to run: variants of a scenario, each with the same seeds."""
+
+import hashlib
+import itertools
+import tomllib
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from kantor_fleet.catalog import find
+from kantor_fleet.experiment import Case
+from kantor_protocol.scenario import Scenario, ScenarioError, to_tree
+
+Value = bool | int | float | str
+
+_SEEDS_MAX = 1_000_000
+
+
+class SweepError(ScenarioError):
+    """A sweep that cannot be run; the message is one line with the place and the remedy."""
+
+
+class Key(NamedTuple):
+    """What a run is known by, whatever sweep asked for it."""
+
+    scenario: str
+    """Digest of the resolved scenario and of the files that it names."""
+    seed: int
+    exact: bool
+
+
+class Variant(NamedTuple):
+    """A scenario of the sweep."""
+
+    values: tuple[Value, ...]
+    """One for each varied key."""
+    scenario: Scenario
+    digest: str
+
+
+class Plan(NamedTuple):
+    """A sweep before it runs."""
+
+    keys: tuple[str, ...]
+    """The varied ones."""
+    variants: tuple[Variant, ...]
+    """The product of all values, the last key fastest."""
+    seeds: tuple[int, ...]
+    """The same for every variant, so that runs can be compared in pairs."""
+    exact: bool = False
+
+    @property
+    def name(self) -> str:
+        """The scenario's."""
+        return self.variants[0].scenario.name
+
+    def key(self, variant: Variant, seed: int) -> Key:
+        """What the journal has a run under."""
+        return Key(variant.digest, seed, self.exact)
+
+    def cases(self) -> Iterator[tuple[Key, Case]]:
+        """All runs, seed by seed: a sweep that is cut short has every variant with the same seeds."""
+        for seed in self.seeds:
+            for variant in self.variants:
+                yield self.key(variant, seed), Case(variant.scenario, seed, self.exact)
+
+
+def plan(
+    scenario: str,
+    vary: Sequence[str],
+    seeds: str,
+    overrides: Sequence[str] = (),
+    *,
+    exact: bool = False,
+) -> Plan:
+    """A sweep in which every variant is known to be a scenario.
+
+    scenario: as `catalog.find` takes it. vary: each `key.sub=value,value`. seeds: see `parse_seeds`.
+    overrides: for all variants alike. Raises ScenarioError.
+    """
+    varied = dict(_axis(text) for text in vary)
+    keys = [text.partition("=")[0].strip() for text in vary]
+    for key, times in Counter(keys).items():
+        if times > 1:
+            raise SweepError(f"--vary {key}: given {times} times; put all its values into one")
+    for override in overrides:
+        if override.partition("=")[0].strip() in varied:
+            raise SweepError(f"--set {override}: it is varied as well; drop one of the two")
+    variants = [
+        _variant(scenario, overrides, dict(zip(varied, texts, strict=True)))
+        for texts in itertools.product(*varied.values())
+    ]
+    _refuse_twins(variants, tuple(varied))
+    return Plan(tuple(varied), tuple(variants), parse_seeds(seeds), exact)
+
+
+def parse_seeds(text: str) -> tuple[int, ...]:
+    """Seeds from `0:50` (half-open), `7`, `1,4,9`, or several of these. Raises SweepError."""
+    seeds: list[int] = []
+    for part in text.split(","):
+        first, colon, end = part.partition(":")
+        try:
+            span = range(int(first), int(end)) if colon else range(int(first), int(first) + 1)
+        except ValueError:
+            raise SweepError(f"--seeds {text}: write 0:50, 7, or 1,4,9") from None
+        if not span:
+            raise SweepError(f"--seeds {text}: no seeds; the end is not one of them")
+        if span[0] < 0 or span[-1] >= 2**63:
+            raise SweepError(f"--seeds {text}: give whole numbers from 0 to 2^63 - 1")
+        if len(span) + len(seeds) > _SEEDS_MAX:
+            raise SweepError(f"--seeds {text}: at most {_SEEDS_MAX} seeds")
+        seeds += span
+    if len(set(seeds)) < len(seeds):
+        raise SweepError(f"--seeds {text}: a seed is given twice")
+    return tuple(seeds)
+
+
+def _axis(text: str) -> tuple[str, list[str]]:
+    """A key and its values, as they are written."""
+    key, separator, values = text.partition("=")
+    key = key.strip()
+    if not separator or not key:
+        raise SweepError(f"--vary {text}: write it as key.sub=value,value")
+    texts = _split(values)
+    if not all(texts):
+        raise SweepError(f"--vary {text}: a value is missing; write {key}=value,value")
+    return key, texts
+
+
+def _split(values: str) -> list[str]:
+    """Parts between the commas that stand in no bracket."""
+    parts, depth = [""], 0
+    for letter in values:
+        depth += (letter in "[{") - (letter in "]}")
+        if letter == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    return [part.strip() for part in parts]
+
+
+def _variant(scenario: str, overrides: Sequence[str], texts: dict[str, str]) -> Variant:
+    settings = [f"{key}={text}" for key, text in texts.items()]
+    try:
+        resolved = find(scenario, [*overrides, *settings])
+        digest = _digest(resolved)
+    except ScenarioError as error:
+        place = f"{' '.join(settings)}: " if settings else ""
+        raise SweepError(f"{place}{error}") from None
+    return Variant(tuple(map(_value, texts.values())), resolved, digest)
+
+
+def _value(text: str) -> Value:
+    """What a value is, for a table: a plain TOML value, or else the text."""
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except ValueError:
+        return text
+    return value if isinstance(value, bool | int | float | str) else text
+
+
+def _digest(scenario: Scenario) -> str:
+    """Tells scenarios apart by what they say and by what is in their files, not by where those are."""
+    tree = to_tree(scenario)
+    for key, name in (("samples", scenario.samples.file), ("targets", scenario.targets.file)):
+        if name is not None:
+            tree[key]["file"] = Path(name).suffix + _file_digest(Path(name))
+    return hashlib.blake2b(msgspec.json.encode(tree), digest_size=16).hexdigest()
+
+
+def _file_digest(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "blake2b").hexdigest()
+    except FileNotFoundError:
+        raise SweepError(f"{path}: no such file") from None
+    except OSError as error:
+        raise SweepError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _refuse_twins(variants: Sequence[Variant], keys: Sequence[str]) -> None:
+    """Two variants that are one would be compared with each other."""
+    first: dict[str, Variant] = {}
+    for variant in variants:
+        twin = first.setdefault(variant.digest, variant)
+        if twin is not variant:
+            one, other = (
+                " ".join(f"{key}={value}" for key, value in zip(keys, each.values, strict=True))
+                for each in (twin, variant)
+            )
+            raise SweepError(f"--vary: {one} and {other} are the same scenario; drop one")

@@ -1,0 +1,164 @@
+"""`kantor sweep`: from a plan to a table, and on from where it was left."""
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import msgspec
+from rich.console import Console
+
+from kantor_fleet.exits import Exit
+from kantor_fleet.experiment import Case
+from kantor_fleet.interrupts import Interrupts
+from kantor_fleet.pools import ClusterError, Pool
+from kantor_fleet.progress import printable
+from kantor_fleet.sweep import summary, table
+from kantor_fleet.sweep.journal import Journal
+from kantor_fleet.sweep.plan import Key, Plan
+from kantor_fleet.sweep.table import Run
+from kantor_fleet.sweep.view import SweepView
+from kantor_protocol.scenario import to_tree
+
+RUNS = "runs.jsonl"
+PLAN = "sweep.json"
+TIMINGS = "timings.csv"
+SUMMARY = "summary.csv"
+PLOT = "plot.png"
+
+_WIDTH = 160
+"""Columns of what is printed into a file or a pipe."""
+
+Format = Literal["csv", "parquet"]
+
+
+class Order(NamedTuple):
+    """A sweep, and what is wanted of it."""
+
+    plan: Plan
+    folder: Path
+    format: Format = "csv"
+    plot: str | None = None
+    """A measure; by default the first of the main ones that varies."""
+    retry_failed: bool = False
+
+
+def sweep(order: Order, start: Callable[[Iterable[Case]], Pool]) -> Exit:
+    """Run what is not yet done, write what there is; what to exit with.
+
+    start: the pool. Raises SweepError before anything is written; OSError.
+    """
+    plan = order.plan
+    with Interrupts() as interrupts, Journal(order.folder / RUNS) as journal:
+        _write_plan(order)
+        left = {case: key for key, case in plan.cases() if _is_due(order, journal, key)}
+        code = _run(left, journal, start, interrupts)
+        runs = table.finished(plan, journal.outcomes)
+        if runs:
+            _conclude(order, runs)
+    total = len(plan.variants) * len(plan.seeds)
+    if len(runs) < total:
+        print(f"kantor: {len(runs)} of {total} runs are done; the same command goes on from there")
+    return code or _verdict(runs)
+
+
+def _is_due(order: Order, journal: Journal, key: Key) -> bool:
+    outcome = journal.outcomes.get(key)
+    return outcome is None or (outcome.failed is not None and order.retry_failed)
+
+
+def _run(
+    left: Mapping[Case, Key],
+    journal: Journal,
+    start: Callable[[Iterable[Case]], Pool],
+    interrupts: Interrupts,
+) -> Exit | None:
+    """Run cases into the journal; why that was cut short, if it was."""
+    if not left:
+        return None
+    with SweepView(len(left)) as view, closing(start(left)) as pool:
+        view.note("starting workers (the first time, kernels are compiled: about half a minute)")
+        try:
+            for done in pool:
+                if interrupts():
+                    return interrupts.code
+                if done is not None:
+                    case, outcome = done
+                    journal.add(left[case], outcome)
+                    view.count()
+                    if outcome.failed is not None:
+                        view.note(f"{case.scenario.name}, seed {case.seed}: {outcome.failed}")
+        except ClusterError as error:
+            print(f"kantor: {error}", file=sys.stderr)
+            return Exit.UNREACHABLE
+    return interrupts.code
+
+
+def _verdict(runs: Iterable[Run]) -> Exit:
+    sound = all(run.outcome.result and not run.outcome.result.violations for run in runs)
+    return Exit.DONE if sound else Exit.NOT_MET
+
+
+def _conclude(order: Order, runs: Sequence[Run]) -> None:
+    """Write the tables and the picture, and print the main measures."""
+    plan, folder = order.plan, order.folder
+    lines = summary.summarize(plan, runs)
+    _write_tables(order, runs, lines)
+    main = summary.varying(runs, summary.MAIN)
+    shown = list(dict.fromkeys([order.plot, *main] if order.plot else main))
+    Console(width=None if sys.stdout.isatty() else _WIDTH).print(
+        summary.table_of(plan, lines, shown), soft_wrap=False
+    )
+    _complain(runs)
+    if shown:
+        from kantor_fleet.sweep.plot import draw  # noqa: PLC0415  matplotlib is slow to import
+
+        draw(plan, runs, lines, shown[0], folder / PLOT)
+    print(f"  {folder}/  ({', '.join(sorted(path.name for path in folder.iterdir()))})")
+
+
+def _write_tables(order: Order, runs: Sequence[Run], lines: Sequence[summary.Line]) -> None:
+    plan, folder = order.plan, order.folder
+    whole = table.rows(plan, runs)
+    if order.format == "parquet":
+        table.write_parquet(folder / "table.parquet", plan, whole)
+        (folder / "table.csv").unlink(missing_ok=True)  # it may be of another plan
+    else:
+        table.write_csv(folder / "table.csv", list(table.columns(plan)), whole)
+        (folder / "table.parquet").unlink(missing_ok=True)
+    times = table.timings(plan, runs)
+    table.write_csv(folder / TIMINGS, list(times[0]), times)
+    table.write_csv(folder / SUMMARY, summary.columns(plan), summary.rows(plan, lines))
+
+
+def _write_plan(order: Order) -> None:
+    """What was asked for, every scenario resolved."""
+    plan = order.plan
+    tree = {
+        "seeds": plan.seeds,
+        "exact": plan.exact,
+        "variants": [
+            {
+                "varied": dict(zip(plan.keys, variant.values, strict=True)),
+                "digest": variant.digest,
+                "scenario": to_tree(variant.scenario),
+            }
+            for variant in plan.variants
+        ],
+    }
+    text = msgspec.json.format(msgspec.json.encode(tree), indent=2)
+    table.replace(order.folder / PLAN, lambda draft: draft.write_bytes(text + b"\n"))
+
+
+def _complain(runs: Iterable[Run]) -> None:
+    """Why runs failed, each reason once, and which rules were broken."""
+    reasons = Counter(run.outcome.failed for run in runs if run.outcome.failed is not None)
+    for reason, times in reasons.most_common():
+        print(f"  {times} failed: {printable(reason)}")
+    if reasons:
+        print("  --retry-failed runs these again")
+    broken = [run for run in runs if run.outcome.result and run.outcome.result.violations]
+    if broken:
+        print(f"  {len(broken)} runs with VIOLATIONS; the column `complaints` names them")

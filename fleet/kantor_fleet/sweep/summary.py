@@ -1,0 +1,161 @@
+"""What the runs of a sweep amount to: each variant by itself, and beside the first one.
+
+Runs of the same seed share samples, targets, starts and draws, so variants are compared run by run:
+the differences scatter less than the runs do.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from scipy.stats import bootstrap
+
+from kantor_fleet.sweep.plan import Plan, Variant
+from kantor_fleet.sweep.table import MEASURES, Row, Run, measures
+
+MAIN = ("detection_rate", "finished_tick", "w_ub_paper", "w1_exact", "mass_left")
+"""What is printed, and the first of them drawn, where it varies."""
+
+_RESAMPLES = 2_000
+_LEVEL = 0.95
+
+Numbers = npt.NDArray[np.float64]
+
+
+class Spread(NamedTuple):
+    """How numbers lie; None where there are too few."""
+
+    n: int
+    median: float | None = None
+    quartile_1: float | None = None
+    quartile_3: float | None = None
+    low: float | None = None
+    """Of the 95 % bootstrap interval of the median."""
+    high: float | None = None
+
+    @classmethod
+    def of(cls, numbers: Numbers) -> "Spread":
+        """The same numbers give the same interval: its draws are seeded."""
+        if not numbers.size:
+            return cls(0)
+        first, median, third = np.quantile(numbers, (0.25, 0.5, 0.75)).tolist()
+        return cls(numbers.size, median, first, third, *_interval(numbers))
+
+
+class Line(NamedTuple):
+    """One measure of one variant."""
+
+    variant: Variant
+    measure: str
+    failed: int
+    """Runs without a result."""
+    runs: Spread
+    difference: Spread
+    """Of the runs to those of the first variant with the same seeds."""
+
+
+def summarize(plan: Plan, runs: Iterable[Run]) -> list[Line]:
+    """A line for every variant and measure."""
+    by_variant: dict[str, dict[int, Row]] = {variant.digest: {} for variant in plan.variants}
+    for run in runs:
+        by_variant[run.variant.digest][run.seed] = measures(run.outcome.result)
+    first = by_variant[plan.variants[0].digest]
+    return [
+        _line(variant, name, by_variant[variant.digest], first)
+        for variant in plan.variants
+        for name in MEASURES
+    ]
+
+
+def rows(plan: Plan, lines: Iterable[Line]) -> list[Row]:
+    """summary.csv."""
+    return [
+        dict(zip(plan.keys, line.variant.values, strict=True))
+        | {"measure": line.measure, "failed": line.failed}
+        | line.runs._asdict()
+        | {f"difference_{name}": value for name, value in line.difference._asdict().items()}
+        for line in lines
+    ]
+
+
+def columns(plan: Plan) -> list[str]:
+    """Of summary.csv."""
+    differences = [f"difference_{name}" for name in Spread._fields]
+    return [*plan.keys, "measure", "failed", *Spread._fields, *differences]
+
+
+def varying(runs: Iterable[Run], names: Sequence[str]) -> list[str]:
+    """Those measures that are not the same in all runs."""
+    found = [measures(run.outcome.result) for run in runs]
+    return [name for name in names if len({row[name] for row in found if row} - {None}) > 1]
+
+
+def table_of(plan: Plan, lines: Sequence[Line], names: Sequence[str]) -> Table:
+    """Some measures for a person: median and quartiles, and the difference to the first variant."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False)
+    table.add_column("measure")
+    for key in plan.keys:
+        table.add_column(key, justify="right")
+    for head in ("runs", "failed", "median", "quartiles", "95 % of the median"):
+        table.add_column(head, justify="right")
+    if len(plan.variants) > 1:
+        table.add_column("paired difference, 95 %", justify="right")
+    for name in names:
+        for line in lines:
+            if line.measure == name:
+                table.add_row(*_cells(plan, line))
+        table.add_section()
+    return table
+
+
+def shown(value: float | None) -> str:
+    """A number for a person."""
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.4g}"
+
+
+def _cells(plan: Plan, line: Line) -> list[str]:
+    runs, difference = line.runs, line.difference
+    cells = [line.measure, *map(str, line.variant.values), str(runs.n), str(line.failed)]
+    cells += [
+        shown(runs.median),
+        f"{shown(runs.quartile_1)} to {shown(runs.quartile_3)}",
+        f"{shown(runs.low)} to {shown(runs.high)}",
+    ]
+    if len(plan.variants) > 1:
+        between = f"{shown(difference.median)}  [{shown(difference.low)}, {shown(difference.high)}]"
+        cells.append("" if line.variant is plan.variants[0] else between)
+    return cells
+
+
+def _line(variant: Variant, name: str, mine: Mapping[int, Row], first: Mapping[int, Row]) -> Line:
+    values = {seed: row[name] for seed, row in mine.items() if row.get(name) is not None}
+    others = {seed: row[name] for seed, row in first.items() if row.get(name) is not None}
+    differences = [value - others[seed] for seed, value in values.items() if seed in others]
+    return Line(
+        variant,
+        name,
+        sum(not row for row in mine.values()),
+        Spread.of(np.array([*values.values()], dtype=np.float64)),
+        Spread.of(np.array(differences, dtype=np.float64)),
+    )
+
+
+def _interval(numbers: Numbers) -> tuple[float | None, float | None]:
+    if numbers.size < 2:
+        return None, None
+    if numbers.min() == numbers.max():
+        return float(numbers[0]), float(numbers[0])
+    interval = bootstrap(
+        (numbers,),
+        np.median,
+        n_resamples=_RESAMPLES,
+        confidence_level=_LEVEL,
+        method="percentile",  # the median of few runs takes too few values for a correction of bias
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return float(interval.low), float(interval.high)

@@ -1,0 +1,149 @@
+"""The table of a sweep: a row for each run, in the order of the plan.
+
+It depends on the runs alone, not on who ran them or when: the times are in a table of their own.
+"""
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import NoneType
+from typing import Any, NamedTuple, get_args, get_type_hints
+
+import msgspec
+
+from kantor_fleet.experiment import Outcome
+from kantor_fleet.sweep.plan import Key, Plan, Value, Variant
+from kantor_worldsim.metrics import Result
+
+Row = dict[str, Any]
+"""A value for each column, None where there is none."""
+
+
+class Run(NamedTuple):
+    """A finished run in its place in the plan."""
+
+    variant: Variant
+    seed: int
+    outcome: Outcome
+
+
+def finished(plan: Plan, outcomes: Mapping[Key, Outcome]) -> list[Run]:
+    """What is there of a plan, in its order."""
+    return [
+        Run(variant, seed, outcomes[plan.key(variant, seed)])
+        for variant in plan.variants
+        for seed in plan.seeds
+        if plan.key(variant, seed) in outcomes
+    ]
+
+
+def _leaves(kind: type[msgspec.Struct], before: str = "") -> Iterator[tuple[str, type]]:
+    """Names and types of a result, those of what is in it with its name before theirs."""
+    for name, hint in get_type_hints(kind).items():
+        if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
+            yield from _leaves(hint, f"{before}{name}_")
+        else:
+            (plain,) = set(get_args(hint) or (hint,)) - {NoneType, ...}
+            yield before + name, plain if plain in {bool, int, float} else str
+
+
+RESULT = {name: kind for name, kind in _leaves(Result) if name not in {"seed", "wall_s"}}
+"""Columns of a result, and what is in them."""
+MEASURES = tuple(name for name, kind in RESULT.items() if kind in {int, float})
+"""Those that are numbers."""
+
+
+def columns(plan: Plan) -> dict[str, type]:
+    """The table's, and what is in them. A varied key that the result has too stands once, in front."""
+    axes = zip(*(variant.values for variant in plan.variants), strict=True)
+    varied = {key: _kind(values) for key, values in zip(plan.keys, axes, strict=True)}
+    found = {name: kind for name, kind in RESULT.items() if name not in varied}
+    return {**varied, "seed": int, **found, "failed": str}
+
+
+def rows(plan: Plan, runs: Iterable[Run]) -> list[Row]:
+    """The table's."""
+    blank = dict.fromkeys(columns(plan))
+    return [
+        blank
+        | measures(run.outcome.result)
+        | dict(zip(plan.keys, run.variant.values, strict=True))
+        | {"seed": run.seed, "failed": run.outcome.failed}
+        for run in runs
+    ]
+
+
+def measures(result: Result | None) -> Row:
+    """A result in columns; nothing of what is not there."""
+    if result is None:
+        return {}
+    flat = dict(_flat(msgspec.to_builtins(result)))
+    return {name: flat[name] for name in RESULT}
+
+
+def timings(plan: Plan, runs: Iterable[Run]) -> list[Row]:
+    """Who ran what, and for how long."""
+    return [
+        dict(zip(plan.keys, run.variant.values, strict=True))
+        | {"seed": run.seed, "wall_s": run.outcome.wall_s, "worker": run.outcome.worker}
+        for run in runs
+    ]
+
+
+def write_csv(path: Path, names: Sequence[str], table: Iterable[Row]) -> None:
+    """Replace a file whole. Numbers are written so that they read back as they are."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows([_cell(row[name]) for name in names] for row in table)
+    replace(path, lambda draft: draft.write_text(text.getvalue(), encoding="utf-8"))
+
+
+def write_parquet(path: Path, plan: Plan, table: list[Row]) -> None:
+    """Replace a file whole; a column has one type, whatever is in it."""
+    import pyarrow as pa  # noqa: PLC0415  an extra
+    from pyarrow import parquet  # noqa: PLC0415
+
+    types = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
+    arrays = {
+        name: pa.array(
+            [None if row[name] is None else kind(row[name]) for row in table],
+            types.get(kind, pa.string()),
+        )
+        for name, kind in columns(plan).items()
+    }
+    replace(path, lambda draft: parquet.write_table(pa.table(arrays), draft))
+
+
+def replace(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file whole or not at all."""
+    draft = path.with_name(f".{path.name}.draft")
+    try:
+        write(draft)
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _kind(values: Iterable[Value]) -> type:
+    """The one type that holds all values of a key."""
+    kinds = {type(value) for value in values}
+    if kinds == {int, float}:
+        return float
+    return kinds.pop() if len(kinds) == 1 else str
+
+
+def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{before}{name}_")
+        else:
+            yield before + name, " | ".join(value) if isinstance(value, list) else value
+
+
+def _cell(value: Any) -> Any:
+    """A value as CSV has it: nothing, true and false, or as Python writes it."""
+    if value is None:
+        return ""
+    return str(value).lower() if isinstance(value, bool) else value
