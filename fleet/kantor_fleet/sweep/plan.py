@@ -4,7 +4,7 @@ import hashlib
 import itertools
 import tomllib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +39,10 @@ class Variant(NamedTuple):
     """One for each varied key."""
     scenario: Scenario
     digest: str
+
+    def settings(self, keys: Iterable[str]) -> dict[str, str]:
+        """Its values as a user writes them."""
+        return dict(zip(keys, map(text_of, self.values), strict=True))
 
 
 class Plan(NamedTuple):
@@ -118,6 +122,11 @@ def parse_seeds(text: str) -> tuple[int, ...]:
     return tuple(seeds)
 
 
+def text_of(value: Value) -> str:
+    """A value as a user writes it."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
 def _axis(text: str) -> tuple[str, list[str]]:
     """A key and its values, as they are written."""
     key, separator, values = text.partition("=")
@@ -188,7 +197,7 @@ def _refuse_twins(variants: Sequence[Variant], keys: Sequence[str]) -> None:
         twin = first.setdefault(variant.digest, variant)
         if twin is not variant:
             one, other = (
-                " ".join(f"{key}={value}" for key, value in zip(keys, each.values, strict=True))
+                " ".join(f"{key}={text}" for key, text in each.settings(keys).items())
                 for each in (twin, variant)
             )
             raise SweepError(f"--vary: {one} and {other} are the same scenario; drop one")

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from kantor_fleet.style import FAINT, INK, TEXT_PT, TITLE_PT, add_caption, team_colours, tidy
-from kantor_fleet.sweep.plan import Plan, Value, Variant
+from kantor_fleet.sweep.plan import Plan, Variant
 from kantor_fleet.sweep.summary import Line
 from kantor_fleet.sweep.table import Run, measures, replace
 
@@ -24,6 +25,12 @@ DPI = 110
 _GAP = "   ·   "
 _BOX_IN = 1.1
 """Width of a picture for each box beyond what fits."""
+_CAPTION_LETTERS = 66
+"""What fits on a line above the axes."""
+_BY_RATIO = 20.0
+"""The largest value to the least, from which on x is logarithmic."""
+_MARKED = 8
+"""Values that x has room to name each."""
 _PERCENT = frozenset({"detection_rate", "mass_left", "mass_double_counted"})
 """Shares, shown in percent."""
 _NAMES = {
@@ -44,7 +51,8 @@ def draw(plan: Plan, runs: Sequence[Run], lines: Sequence[Line], measure: str, p
     if not ours:
         return
     axis = _axis(plan)
-    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout="constrained", facecolor="white")
+    layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.06)
+    figure = Figure(figsize=SIZE_IN, dpi=DPI, layout=layout, facecolor="white")
     grid = figure.add_gridspec(2, 1, height_ratios=(0.12, 0.88))
     _write_title(figure.add_subfigure(grid[0]), plan, runs, lines=axis is not None)
     axes = figure.add_subfigure(grid[1]).subplots()
@@ -58,36 +66,50 @@ def draw(plan: Plan, runs: Sequence[Run], lines: Sequence[Line], measure: str, p
 
 
 def _axis(plan: Plan) -> int | None:
-    """Which key lies on x: the first that takes several values, all of them finite numbers."""
+    """Which key lies on x: the first that takes several values, all of them numbers."""
     for index in range(len(plan.keys)):
         values = {variant.values[index] for variant in plan.variants}
-        if len(values) > 1 and all(map(_is_number, values)):
+        if len(values) > 1 and all(type(value) in {int, float} for value in values):
             return index
     return None
 
 
-def _is_number(value: Value) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def _draw_lines(axes: Axes, plan: Plan, lines: Sequence[Line], axis: int) -> None:
+    places = _place_values(axes, sorted({_number(line.variant, axis) for line in lines}))
     groups: dict[str, list[Line]] = {}
     for line in lines:
         groups.setdefault(_label(plan, line.variant, axis), []).append(line)
     for (label, group), colour in zip(groups.items(), team_colours(len(groups)), strict=True):
-        group.sort(key=lambda line: line.variant.values[axis])
-        x = [line.variant.values[axis] for line in group]
+        group.sort(key=lambda line: _number(line.variant, axis))
+        x = [places[_number(line.variant, axis)] for line in group]
+        spreads = [line.runs for line in group]
         scale = _scale(group[0].measure)
-        first, median, third = (
-            scale * np.array([line.runs[field] for line in group], dtype=np.float64)
-            for field in (2, 1, 3)
-        )
+        first = scale * np.array([spread.quartile_1 for spread in spreads])
+        third = scale * np.array([spread.quartile_3 for spread in spreads])
+        median = scale * np.array([spread.median for spread in spreads])
         axes.fill_between(x, first, third, color=colour, alpha=0.16, lw=0.0)
         axes.plot(x, median, "o-", color=colour, lw=1.6, ms=4.5, mec="white", label=label)
-    axes.margins(x=0.03)
     axes.grid(axis="y", color=FAINT, alpha=0.25, lw=0.6)
     if len(groups) > 1:
-        add_caption(axes, axes.lines, columns=2)
+        widest = max(map(len, groups))
+        add_caption(axes, axes.lines, columns=max(1, _CAPTION_LETTERS // widest))
+
+
+def _place_values(axes: Axes, values: Sequence[float]) -> dict[float, float]:
+    """Where each value lies on x: by ratios if they span many, side by side if one is infinite."""
+    axes.margins(x=0.03)
+    finite = all(map(math.isfinite, values))
+    places = dict(zip(values, values if finite else range(len(values)), strict=True))
+    if finite and 0.0 < _BY_RATIO * values[0] <= values[-1]:
+        axes.set_xscale("log")
+    if len(values) <= _MARKED or not finite:
+        axes.set_xticks(list(places.values()), [f"{value:g}" for value in values])
+        axes.set_xticks([], minor=True)
+    return places
+
+
+def _number(variant: Variant, axis: int) -> float:
+    return float(variant.values[axis])
 
 
 def _draw_boxes(axes: Axes, plan: Plan, runs: Sequence[Run], lines: Sequence[Line]) -> None:
@@ -118,8 +140,8 @@ def _draw_boxes(axes: Axes, plan: Plan, runs: Sequence[Run], lines: Sequence[Lin
 def _label(plan: Plan, variant: Variant, axis: int | None) -> str:
     """What a variant is, without what lies on x and what does not vary."""
     words = [
-        f"{key} {value}"
-        for index, (key, value) in enumerate(zip(plan.keys, variant.values, strict=True))
+        f"{key} {text}"
+        for index, (key, text) in enumerate(variant.settings(plan.keys).items())
         if index != axis and len({other.values[index] for other in plan.variants}) > 1
     ]
     return _GAP.join(words)

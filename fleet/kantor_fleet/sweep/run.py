@@ -1,5 +1,7 @@
 """`kantor sweep`: from a plan to a table, and on from where it was left."""
 
+import difflib
+import importlib.util
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,7 +19,7 @@ from kantor_fleet.pools import ClusterError, Pool
 from kantor_fleet.progress import printable
 from kantor_fleet.sweep import summary, table
 from kantor_fleet.sweep.journal import Journal
-from kantor_fleet.sweep.plan import Key, Plan
+from kantor_fleet.sweep.plan import Key, Plan, SweepError
 from kantor_fleet.sweep.table import Run
 from kantor_fleet.sweep.view import SweepView
 from kantor_protocol.scenario import to_tree
@@ -50,6 +52,7 @@ def sweep(order: Order, start: Callable[[Iterable[Case]], Pool]) -> Exit:
 
     start: the pool. Raises SweepError before anything is written; OSError.
     """
+    _check(order)
     plan = order.plan
     with Interrupts() as interrupts, Journal(order.folder / RUNS) as journal:
         _write_plan(order)
@@ -59,9 +62,18 @@ def sweep(order: Order, start: Callable[[Iterable[Case]], Pool]) -> Exit:
         if runs:
             _conclude(order, runs)
     total = len(plan.variants) * len(plan.seeds)
-    if len(runs) < total:
+    if len(runs) < total and (runs or interrupts()):
         print(f"kantor: {len(runs)} of {total} runs are done; the same command goes on from there")
     return code or _verdict(runs)
+
+
+def _check(order: Order) -> None:
+    if order.plot is not None and order.plot not in table.MEASURES:
+        near = difflib.get_close_matches(order.plot, table.MEASURES, 1)
+        known = f"did you mean {near[0]}?" if near else f"known: {', '.join(table.MEASURES)}"
+        raise SweepError(f"--plot {order.plot}: no such measure; {known}")
+    if order.format == "parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise SweepError("--format parquet: needs PyArrow; pip install 'kantor[parquet]'")
 
 
 def _is_due(order: Order, journal: Journal, key: Key) -> bool:

@@ -120,7 +120,12 @@ def shown(value: float | None) -> str:
 
 def _cells(plan: Plan, line: Line) -> list[str]:
     runs, difference = line.runs, line.difference
-    cells = [line.measure, *map(str, line.variant.values), str(runs.n), str(line.failed)]
+    cells = [
+        line.measure,
+        *line.variant.settings(plan.keys).values(),
+        str(runs.n),
+        str(line.failed),
+    ]
     cells += [
         shown(runs.median),
         f"{shown(runs.quartile_1)} to {shown(runs.quartile_3)}",

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import msgspec
 
 from kantor_fleet.experiment import Outcome
-from kantor_fleet.sweep.plan import Key, Plan, Value, Variant
+from kantor_fleet.sweep.plan import Key, Plan, Value, Variant, text_of
 from kantor_worldsim.metrics import Result
 
 Row = dict[str, Any]
@@ -139,11 +139,11 @@ def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]
         if isinstance(value, Mapping):
             yield from _flat(value, f"{before}{name}_")
         else:
-            yield before + name, " | ".join(value) if isinstance(value, list) else value
+            yield before + name, " | ".join(value) if isinstance(value, tuple | list) else value
 
 
 def _cell(value: Any) -> Any:
     """A value as CSV has it: nothing, true and false, or as Python writes it."""
     if value is None:
         return ""
-    return str(value).lower() if isinstance(value, bool) else value
+    return text_of(value) if isinstance(value, bool) else value
