@@ -38,7 +38,10 @@ _CONNECT_S = 10.0
 
 
 class ClusterError(Exception):
-    """A cluster that is not there; the message is one line with the place and the remedy."""
+    """A cluster that cannot be used; the message is one line with the place and the remedy."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))
 
 
 def cores() -> int:
@@ -187,7 +190,8 @@ def _client(address: str, jobs: int | None) -> Iterator["Client"]:
     """A connection to a cluster. Raises ClusterError."""
     from distributed import Client  # noqa: PLC0415  an extra
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters is raised
+    for name in ("distributed", "distributed.client"):  # what matters is raised
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         scheduler = stack.enter_context(_slurm(jobs)) if address == SLURM else address
         try:

@@ -1,0 +1,216 @@
+"""Sweeps beyond one machine: real Dask schedulers and workers, and Slurm commands that are played."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import psutil
+import pytest
+
+from kantor_fleet import pools
+from kantor_fleet.exits import Exit
+from kantor_fleet.sweep.plan import Plan, plan
+from kantor_fleet.sweep.run import Order, sweep
+
+if TYPE_CHECKING:
+    from conftest import Kantor
+
+SMALL = ("energy.points=400", "energy.steps=400", "samples.count=200", "targets.count=50")
+VARY, SEEDS = "radio.range_m=50,100", "0:10"
+RUNS = 20
+
+
+pytestmark = pytest.mark.xdist_group("cluster")
+
+
+class Cluster:
+    """A Dask scheduler and two workers, a process each, without nurses that start them again."""
+
+    def __init__(self, folder: Path, processes: ExitStack) -> None:
+        self._folder, self._processes = folder, processes
+        self.scheduler = self._start("scheduler", "--host", "127.0.0.1", "--port", "0")
+        self.address = _line(self.scheduler, "Scheduler at:").split()[-1]
+        self.workers = [
+            self._start("worker", self.address, "--no-nanny", "--nthreads", "1") for _ in range(2)
+        ]
+        for worker in self.workers:
+            _line(worker, "Starting established connection to")
+
+    def _start(self, role: str, *arguments: str) -> "subprocess.Popen[str]":
+        process = subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.dask_{role}", *arguments, "--no-dashboard"],
+            cwd=self._folder,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self._processes.callback(process.communicate)
+        self._processes.callback(process.kill)
+        return process
+
+
+def _line(process: "subprocess.Popen[str]", part: str) -> str:
+    """The first line of a log that has a part."""
+    assert process.stderr is not None
+    return next(line for line in process.stderr if part in line)
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[Cluster]:
+    """A cluster of this machine."""
+    with ExitStack() as processes:
+        yield Cluster(tmp_path, processes)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the sweep leaves that processes of this machine ran."""
+    folder = tmp_path_factory.mktemp("reference")
+    assert sweep(Order(small_plan(), folder), partial(pools.local, jobs=2)) is Exit.DONE
+    return folder
+
+
+def small_plan() -> Plan:
+    return plan("fleet", [VARY], SEEDS, SMALL)
+
+
+def sweep_command(folder: Path, *arguments: object) -> tuple[object, ...]:
+    return ("sweep", "fleet", "--vary", VARY, "--seeds", SEEDS, "--set", *SMALL, "--out", folder,
+            *arguments)  # fmt: skip
+
+
+def same(one: Path, other: Path) -> bool:
+    """Whether two sweeps left the same table, byte for byte."""
+    return (one / "table.csv").read_bytes() == (other / "table.csv").read_bytes()
+
+
+def await_run(process: "subprocess.Popen[str]") -> None:
+    """Until the first run is done."""
+    assert process.stdout is not None
+    assert any(line.startswith("1/") for line in process.stdout)
+
+
+def test_a_worker_dies_and_the_table_is_that_of_one_machine(
+    kantor: "Kantor", cluster: Cluster, reference: Path
+) -> None:
+    """Dask runs elsewhere what it had; both workers had runs."""
+    folder = kantor.folder / "out"
+    process = kantor.start(*sweep_command(folder, "--cluster", cluster.address))
+    await_run(process)
+    cluster.workers[0].send_signal(signal.SIGKILL)
+    _, err = process.communicate(timeout=120)
+
+    assert (process.returncode, err) == (0, "")
+    assert same(folder, reference)
+    assert str(cluster.workers[1].pid) in (folder / "timings.csv").read_text()
+
+
+def test_the_scheduler_goes_and_the_sweep_goes_on_elsewhere(
+    kantor: "Kantor", cluster: Cluster, reference: Path
+) -> None:
+    """Exit code 4 with one line; what is done is kept, and this machine does the rest."""
+    folder = kantor.folder / "out"
+    process = kantor.start(*sweep_command(folder, "--cluster", cluster.address))
+    await_run(process)
+    cluster.scheduler.kill()
+    out, err = process.communicate(timeout=60)
+
+    assert process.returncode == 4
+    assert err == f"kantor: {cluster.address}: the scheduler is gone\n"
+    assert f"of {RUNS} runs are done; the same command goes on from there" in out
+
+    kept = (folder / "runs.jsonl").read_bytes()
+    assert kantor(*sweep_command(folder)).code == 0
+    assert (folder / "runs.jsonl").read_bytes().startswith(kept)
+    assert same(folder, reference)
+
+
+def test_ctrl_c_gives_up_what_a_cluster_is_running(kantor: "Kantor", cluster: Cluster) -> None:
+    """The workers are not ours to end, and stay."""
+    folder = kantor.folder / "out"
+    process = kantor.start(*sweep_command(folder, "--cluster", cluster.address))
+    await_run(process)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+
+    assert (process.returncode, err) == (130, "")
+    assert [worker.poll() for worker in cluster.workers] == [None, None]
+
+
+def test_a_cluster_that_is_not_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 4 after a bounded time, in one line."""
+    monkeypatch.setattr(pools, "_CONNECT_S", 0.3)
+    address = "tcp://127.0.0.1:9"
+
+    code = sweep(Order(small_plan(), tmp_path), partial(pools.cluster, address=address))
+
+    assert code is Exit.UNREACHABLE
+    err = capsys.readouterr().err
+    assert err.startswith(f"kantor: {address}: no Dask scheduler there (")
+    assert err.count("\n") == 1
+
+
+def test_slurm_jobs_are_asked_for_and_given_back(kantor: "Kantor", reference: Path) -> None:
+    """With the user's settings of dask-jobqueue; here sbatch starts the job on the spot."""
+    commands = kantor.folder / "bin"
+    commands.mkdir()
+    played = {
+        "sbatch": 'cp "$1" job.sh; setsid sh job.sh >job.log 2>&1 & '
+        'echo $! >>jobs; echo "Submitted batch job $!"',
+        "scancel": 'for job in "$@"; do kill -- "-$job"; done; echo "$@" >>cancelled',
+    }
+    for name, script in played.items():
+        (commands / name).write_text(f"#!/bin/sh\n{script}\n")
+        (commands / name).chmod(0o755)
+
+    folder = kantor.folder / "out"
+    finished = kantor(
+        *sweep_command(folder, "--cluster", "slurm", "--jobs", 1),
+        PATH=f"{commands}{os.pathsep}{os.environ['PATH']}",
+        DASK_JOBQUEUE__SLURM__CORES="1",
+        DASK_JOBQUEUE__SLURM__MEMORY="1GB",
+    )
+
+    assert (finished.code, finished.err) == (0, "")
+    assert same(folder, reference)
+    jobs = (kantor.folder / "jobs").read_text().split()
+    assert (kantor.folder / "cancelled").read_text().split() == jobs
+    gone = [psutil.Process(int(job)) for job in jobs if psutil.pid_exists(int(job))]
+    assert psutil.wait_procs(gone, timeout=10)[1] == []
+
+
+def test_slurm_without_settings_or_commands(kantor: "Kantor") -> None:
+    """One line tells what is missing."""
+    arguments = sweep_command(kantor.folder / "out", "--cluster", "slurm", "--jobs", 1)
+
+    finished = kantor(*arguments)
+    assert finished.code == 4
+    assert "slurm: no sbatch here; run this on a machine that submits jobs" in finished.err
+
+    (kantor.folder / "sbatch").write_text("#!/bin/sh\n")
+    (kantor.folder / "sbatch").chmod(0o755)
+    finished = kantor(*arguments, PATH=f"{kantor.folder}{os.pathsep}{os.environ['PATH']}")
+    assert finished.code == 4
+    assert "jobqueue.yaml" in finished.err
+    assert len(finished.err.splitlines()) == 1
+
+
+def test_json_is_left_of_the_plan(reference: Path) -> None:
+    """Every scenario resolved, beside the runs."""
+    told = json.loads((reference / "sweep.json").read_text())
+
+    assert told["seeds"] == list(range(10))
+    assert [variant["varied"] for variant in told["variants"]] == [
+        {"radio.range_m": 50},
+        {"radio.range_m": 100},
+    ]
+    assert told["variants"][0]["scenario"]["samples"]["count"] == 200
