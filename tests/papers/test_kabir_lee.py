@@ -418,11 +418,11 @@ def test_theorems_2_and_3_bound_the_distance_of_a_team(name: str) -> None:
 
 
 def test_theorem_2_is_loose_by_the_number_of_robots() -> None:
-    """Theorem 2 ships what is left once for every agent: at the start it is n_a times the share."""
+    """Theorem 2 ships what is left once for every agent, a plan once: n_a times less, or better."""
     start = small(*TEAMS["centralized-in-turn"]).instants[0].row
 
     assert start.w_ub_tight is not None
-    assert start.w_ub_paper == pytest.approx(3.0 * start.w_ub_tight)
+    assert start.w_ub_paper >= 3.0 * start.w_ub_tight * (1.0 - 1e-12)
 
 
 # Proposition 1.

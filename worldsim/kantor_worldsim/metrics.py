@@ -12,8 +12,9 @@ local
     Theorem 3 to the letter: robot k counts itself and whoever is in its range now, with its own vector.
     It rises when robots meet, since neighbours join the sum; the rows give the least and the largest.
 tight
-    Each remainder shared evenly by the robots: the pending term divided by their number, on the true
-    remaining weights. A bound only while no sample was filled twice and no sample walks, else None.
+    The true remaining weights shipped once, an equal share by each robot (`bounds.py`), where eq. 11
+    ships them once for every robot. A bound only while no sample was filled twice and no sample walks,
+    else None.
 instant
     The last tick's shipping plus the pending term. It is no bound; it is what the paper plots, since
     its final values lie below what any plan costs.
@@ -34,6 +35,7 @@ from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
 from kantor_protocol.packing import Pairs
 from kantor_protocol.walk import Walk
 from kantor_worldsim import exact
+from kantor_worldsim.bounds import Auction
 from kantor_worldsim.channel import DROPPED, links
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 
@@ -198,6 +200,7 @@ class Metrics:
         self._xy_m = site.starts_m.copy()
         size = samples * robots // _PAIRS_PER_ROW
         self._every = scenario.metrics.every or max(1, size)
+        self._auction = Auction(robots, samples, self._every)
         self._shipped = 0.0
         self._shipped_by = [0.0] * robots
         self._shipped_now = 0.0
@@ -296,9 +299,7 @@ class Metrics:
         tight = None
         standing = self._scenario.samples.diffusion_m == 0.0
         if standing and int(np.maximum(self._true_left, 0).sum()) == whole - self._spent_units:
-            tight = self._shipped + sum(
-                _pending(xy_m, x, y, self._true_left) / whole / robots for _, x, y in places
-            )
+            tight = self._shipped + self._auction.cost(xy_m, self._xy_m, self._true_left) / whole
         local = [] if self._scenario.centralized else self._local_bounds()
         self.rows.append(
             Row(
