@@ -213,6 +213,38 @@ def verify(run: Annotated[Path, tyro.conf.Positional], /) -> int:
     return verify_run(run)
 
 
+def reproduce(
+    figure: Annotated[
+        Literal["fig4", "fig5", "fig6", "fig7", "fig8", "fig9", "all"], tyro.conf.Positional
+    ] = "all",
+    /,
+    *,
+    runs: int | None = None,
+    jobs: int | None = None,
+    out: Path = Path("reproduced"),
+) -> int:
+    """Run a paper's experiments, draw its figures, and hold our numbers against the published ones.
+
+    Leaves a PNG, a PDF and a CSV for each figure, and verdicts.csv. Exit code 1 if a claim is missed.
+
+    Args:
+        figure: Of Kabir & Lee, section VI.
+        runs: Runs for each setting; by default as many as in the paper (fig6: 50, fig9: 10).
+        jobs: Processes; by default one for each core.
+        out: Where the figures go.
+    """
+    from kantor_fleet.pools import cores  # noqa: PLC0415
+    from kantor_fleet.reproduce import FIGURES  # noqa: PLC0415
+    from kantor_fleet.reproduce import reproduce as reproduce_figures  # noqa: PLC0415
+
+    if runs is not None and runs < 2:
+        fail(Exit.USAGE, f"--runs {runs}: give at least 2, an interval needs them")
+    if jobs is not None and jobs < 1:
+        fail(Exit.USAGE, f"--jobs {jobs}: give at least 1")
+    names = tuple(FIGURES) if figure == "all" else (figure,)
+    return reproduce_figures(names, runs, jobs or cores(), out)
+
+
 def tap(
     connect: str = "tcp/127.0.0.1:7447",
     credentials: Path = Path("credentials"),
@@ -242,6 +274,7 @@ VERBS: dict[str, Callable[..., int]] = {
     "sweep": sweep,
     "scenarios": scenarios,
     "verify": verify,
+    "reproduce": reproduce,
     "tap": tap,
 }
 

@@ -175,8 +175,8 @@ def draw_trails(axes: Axes, run: Run) -> None:
     axes.plot([], [], "o", ms=7.0, mfc="white", mec=INK, mew=1.0, label="end")
 
 
-def draw_samples(axes: Axes, run: Run) -> None:
-    """Samples by the weight that is left in them."""
+def draw_samples(axes: Axes, run: Run, *, scale: bool = True) -> None:
+    """Samples by the weight that is left in them. scale: tell above the map what the colours mean."""
     xy_m = run.walked(run.site.samples_m, run.scenario.samples.diffusion_m, Purpose.SAMPLE_WALK)
     thin = thinned(xy_m.shape[0], _POINTS_SHOWN)  # they lie along a curve, so this is even
     xy_m, share = xy_m[thin], run.share_left[thin]
@@ -185,14 +185,20 @@ def draw_samples(axes: Axes, run: Run) -> None:
     if empty.any():
         _add_marks(axes, xy_m[empty], s=size, c=EMPTY, zorder=1.0, label="sample used up")
     if not empty.all():
-        scale = Normalize(0.0, 1.0)
         marks = _add_marks(
-            axes, xy_m[~empty], s=size, c=share[~empty], cmap=_WEIGHT, norm=scale, zorder=1.5
+            axes,
+            xy_m[~empty],
+            s=size,
+            c=share[~empty],
+            cmap=_WEIGHT,
+            norm=Normalize(0.0, 1.0),
+            zorder=1.5,
         )
-        add_scale(axes, marks)
+        if scale:
+            _add_scale(axes, marks)
 
 
-def add_scale(axes: Axes, marks: PathCollection) -> None:
+def _add_scale(axes: Axes, marks: PathCollection) -> None:
     """What the samples' colours mean, in the map's upper right corner, outside."""
     place = axes.inset_axes((0.86, 1.009, 0.14, 0.014))
     bar = axes.figure.colorbar(marks, cax=place, orientation="horizontal", ticks=[0.0, 1.0])

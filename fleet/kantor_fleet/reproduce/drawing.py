@@ -1,0 +1,254 @@
+"""The paper's figures, drawn from records and rows. Runs that are drawn have seed 0."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from kantor_fleet.picture import (
+    Run,
+    draw_domain,
+    draw_radio,
+    draw_samples,
+    draw_targets,
+    draw_trails,
+)
+from kantor_fleet.reproduce.claims import Measure, interval
+from kantor_fleet.reproduce.flights import Flight, Setting, records_of
+from kantor_fleet.style import (
+    FAINT,
+    FIRST,
+    FOUND,
+    INK,
+    SECOND,
+    SMALL_PT,
+    TEAM,
+    TEXT_PT,
+    THIRD,
+    add_caption,
+    tidy,
+)
+from kantor_worldsim.records import Batch, Opening
+
+_MAP_IN = 4.4
+"""Width of one map."""
+_SEED = 0
+
+
+def centralized(setting: Setting, flight: Flight) -> Figure:
+    """Figure 4: snapshots (a)-(e) and the bound (f)."""
+    figure, axes = _panels(2, 3)
+    ticks = (0, 300, 600, 800, 1000)
+    _snapshots(axes[:5], setting, ticks)
+    _bounds(axes[5], flight, "(f) upper bound of the Wasserstein distance")
+    return figure
+
+
+def decentralized(setting: Setting, flights: Sequence[Flight]) -> Figure:
+    """Figure 7: the same for two robots that meet."""
+    figure, axes = _panels(2, 3)
+    flight = flights[_SEED]
+    assert flight.result is not None
+    end = flight.result.finished_tick or flight.result.ticks
+    _snapshots(axes[:5], setting, (0, 300, 600, 700, end))
+    _bounds(axes[5], flight, "(f) upper bound of the Wasserstein distance")
+    moments = {"first contact": flight.result.first_contact_tick, "end": end}
+    for (what, tick), style in zip(moments.items(), (":", "--"), strict=True):
+        if tick is not None:
+            axes[5].axvline(tick, color=FAINT, ls=style, lw=1.1, label=f"{what}, {tick}")
+    add_caption(axes[5], axes[5].get_legend_handles_labels()[0], columns=2)
+    return figure
+
+
+def trajectories(settings: Mapping[str, Setting]) -> Figure:
+    """Figure 5: the ways of two methods side by side."""
+    figure, axes = _panels(1, 2)
+    for place, (letter, (name, setting)) in zip(
+        axes, zip("ab", settings.items(), strict=True), strict=True
+    ):
+        *_, run = _runs_at(setting, (1000,))
+        _map(place, run)
+        found = f"{len(run.metrics.finds)} of {run.site.targets_m.shape[0]} targets"
+        _title(place, f"({letter}) {name}: {found}")
+    _legend(figure, axes[0])
+    return figure
+
+
+def moving(settings: Mapping[str, Setting]) -> Figure:
+    """Figure 8: three moments of each, one above the other."""
+    figure, axes = _panels(2, 3)
+    for row, (name, setting) in enumerate(settings.items()):
+        places = axes[3 * row : 3 * row + 3]
+        _snapshots(places, setting, (0, 500, 1000), "abc" if row == 0 else "def", f"{name}, ")
+    return figure
+
+
+def comparison(
+    methods: Mapping[str, Sequence[Flight]], detected: Measure, robots_s: Measure
+) -> Figure:
+    """Figure 6: box plots of detection and bars of execution time."""
+    figure = Figure(figsize=(10.5, 4.4), layout=_layout())
+    boxes, bars = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
+    _boxes(boxes, {name: [detected(f) for f in flights] for name, flights in methods.items()})
+    tidy(boxes, "", "detected, %")
+    _title(boxes, f"(a) detection over {len(next(iter(methods.values())))} random starts")
+    times_s = {name: [robots_s(f) for f in flights] for name, flights in methods.items()}
+    medians_s = [float(np.median(values)) for values in times_s.values()]
+    bars.bar(list(methods), medians_s, color=TEAM[: len(methods)], width=0.6)
+    for x, median_s in enumerate(medians_s):
+        bars.annotate(
+            f"{median_s:.2f}",
+            (x, median_s),
+            (0, 3),
+            textcoords="offset points",
+            ha="center",
+            size=TEXT_PT,
+            color=INK,
+        )
+    tidy(bars, "", "CPU time of five robots, s")
+    _title(bars, "(b) execution time, both methods compiled")
+    return figure
+
+
+def diffusion(
+    varying: Mapping[int, Sequence[Flight]],
+    invariant: Mapping[int, Sequence[Flight]],
+    detected: Measure,
+) -> Figure:
+    """Figure 9: means with 95 % intervals against the diffusion rate v."""
+    figure = Figure(figsize=(6.6, 4.4), layout=_layout())
+    axes = figure.subplots()
+    for flights, label, colour in (
+        (varying, "samples walk", SECOND),
+        (invariant, "samples stand", THIRD),
+    ):
+        means = [interval([detected(f) for f in runs]) for runs in flights.values()]
+        axes.errorbar(
+            list(flights),
+            [mean for mean, _ in means],
+            [half for _, half in means],
+            color=colour,
+            marker="o",
+            ms=4.0,
+            lw=1.6,
+            capsize=3.0,
+            label=label,
+        )
+    tidy(axes, "diffusion rate v, m a tick", "detected, %")
+    add_caption(axes, axes.get_legend_handles_labels()[0])
+    return figure
+
+
+def _panels(rows: int, columns: int) -> tuple[Figure, list[Axes]]:
+    figure = Figure(figsize=(_MAP_IN * columns, 4.2 * rows + 0.4), layout=_layout())
+    return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
+
+
+def _layout() -> ConstrainedLayoutEngine:
+    return ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
+
+
+def _snapshots(
+    places: Sequence[Axes],
+    setting: Setting,
+    ticks: Sequence[int],
+    letters: str = "abcde",
+    prefix: str = "",
+) -> None:
+    for place, run, tick, letter in zip(
+        places, _runs_at(setting, ticks), ticks, letters, strict=False
+    ):
+        _map(place, run)
+        found = f", {len(run.metrics.finds)} detected" if run.site.targets_m.size else ""
+        _title(place, f"({letter}) {prefix}t = {tick}{found}")
+    figure = places[0].figure
+    assert isinstance(figure, Figure)
+    _legend(figure, places[min(1, len(places) - 1)])
+
+
+def _runs_at(setting: Setting, ticks: Sequence[int]) -> Iterator[Run]:
+    """The run at each of some ticks; it goes on when the next one is asked for."""
+    records = iter(records_of(setting, _SEED))
+    opening = next(records)
+    assert isinstance(opening, Opening)
+    run, waiting = Run(opening), next(records, None)
+    for tick in ticks:
+        until_ns = (tick + 1) * run.scenario.period_ns  # robots act at any phase of a period
+        while isinstance(waiting, Batch) and waiting.now_ns < until_ns:
+            run.follow(waiting)
+            waiting = next(records, None)
+        yield run
+
+
+def _map(axes: Axes, run: Run) -> None:
+    draw_domain(axes, run)
+    draw_trails(axes, run)
+    draw_samples(axes, run, scale=False)
+    draw_targets(axes, run)
+    draw_radio(axes, run)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.02)
+    tidy(axes, "x, m", "y, m")
+
+
+def _title(axes: Axes, text: str) -> None:
+    axes.set_title(text, size=TEXT_PT + 0.5, color=INK, loc="left")
+
+
+def _legend(figure: Figure, axes: Axes) -> None:
+    """One legend for all maps, below them."""
+    handles, labels = axes.get_legend_handles_labels()
+    known = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+    if not set(labels) - known:
+        return
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=8,
+        frameon=False,
+        fontsize=SMALL_PT + 0.5,
+        labelcolor=INK,
+        markerscale=1.2,
+    )
+
+
+def _bounds(axes: Axes, flight: Flight, title: str) -> None:
+    ticks = [row.tick for row in flight.rows]
+    lines: tuple[tuple[str, Callable[[Any], float | None], str, float], ...] = (
+        ("bound", lambda row: row.w_ub_paper, FIRST, 2.2),
+        ("tight bound", lambda row: row.w_ub_tight, SECOND, 1.4),
+        ("last tick's shipping and pending", lambda row: row.w_ub_instant, THIRD, 1.1),
+    )
+    for label, measure, colour, width in lines:
+        values = np.array([measure(row) for row in flight.rows], dtype=np.float64)
+        if not np.isnan(values).all():
+            axes.plot(ticks, values, color=colour, lw=width, label=f"{label}, {values[-1]:.3g} m")
+    exact = [(row.tick, row.w1_exact) for row in flight.rows if row.w1_exact is not None]
+    if exact:
+        label = f"exact distance, {exact[-1][1]:.3g} m"
+        axes.plot(*zip(*exact, strict=True), "o", ms=4.0, color=FOUND, label=label)
+    axes.set_ylim(bottom=0.0)
+    tidy(axes, "tick", "m")
+    axes.set_title(title, size=TEXT_PT + 0.5, color=INK, loc="left", pad=46.0)
+    add_caption(axes, axes.get_legend_handles_labels()[0], columns=2)
+
+
+def _boxes(axes: Axes, groups: Mapping[str, Sequence[float]]) -> None:
+    """Boxes with every run beside them."""
+    plot = axes.boxplot(
+        list(groups.values()),
+        tick_labels=list(groups),
+        widths=0.5,
+        patch_artist=True,
+        showfliers=False,
+        medianprops={"color": INK, "lw": 1.6},
+    )
+    for box, colour in zip(plot["boxes"], TEAM, strict=False):
+        box.set(facecolor=colour, alpha=0.75, edgecolor=INK, linewidth=0.8)
+    for place, values in enumerate(groups.values(), 1):
+        shift = 0.12 * np.sin(2.4 * np.arange(len(values)))  # apart, the same every time
+        axes.scatter(place + shift, values, s=7.0, c=INK, alpha=0.35, linewidths=0.0, zorder=3.0)

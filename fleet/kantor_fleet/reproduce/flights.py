@@ -1,0 +1,104 @@
+"""The runs behind a figure: settings in, measured flights out."""
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from kantor_fleet.catalog import find
+from kantor_fleet.experiment import Case, Outcome, reason
+from kantor_fleet.team import team
+from kantor_protocol.machine import SUPERVISOR, Inputs, Outputs, StateMachine
+from kantor_protocol.scenario import Scenario
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.metrics import Row
+from kantor_worldsim.recording import Recording
+from kantor_worldsim.records import Record
+from kantor_worldsim.stage import Stage
+from kantor_worldsim.world import Site
+
+EXACT_EVERY = 100
+"""Periods from one exact distance to the next, in the flights that have them."""
+
+
+class Setting(NamedTuple):
+    """A packaged scenario with overrides."""
+
+    scenario: str
+    overrides: tuple[str, ...] = ()
+    exact: bool = False
+
+    @property
+    def text(self) -> str:
+        """As on a command line."""
+        return " ".join((self.scenario, *self.overrides))
+
+    def find(self) -> Scenario:
+        """The scenario itself."""
+        return find(self.scenario, self.overrides)
+
+    def case(self, seed: int) -> Case:
+        """One run of it."""
+        return Case(self.find(), seed, self.exact)
+
+
+class Flight(Outcome, frozen=True, kw_only=True):
+    """An outcome with the course of the run."""
+
+    rows: tuple[Row, ...] = ()
+    robots_s: float = 0.0
+    """CPU seconds inside the robots' steps: planning, weights and messages."""
+
+
+Flights = Mapping[Setting, Sequence[Flight]]
+"""By setting, in the order of the seeds."""
+
+
+class _Timed:
+    """A participant whose steps are timed."""
+
+    def __init__(self, machine: StateMachine) -> None:
+        self._machine = machine
+        self.spent_ns = 0
+
+    def step(self, inputs: Inputs, /) -> Outputs:
+        start_ns = time.process_time_ns()
+        outputs = self._machine.step(inputs)
+        self.spent_ns += time.process_time_ns() - start_ns
+        return outputs
+
+
+def fly(case: Case) -> Flight:
+    """Run a case with every referee, and keep how it went."""
+    try:
+        return _fly(case)
+    except Exception as error:  # noqa: BLE001  told with the others at the end
+        return Flight(failed=reason(error))
+
+
+def _fly(case: Case) -> Flight:
+    scenario, seed = case.scenario, case.seed
+    site = Site.of(scenario, seed)
+    machines = {name: _Timed(machine) for name, machine in team(scenario, seed, site).items()}
+    recording = Recording(
+        scenario, seed, "in-process", exact_every=EXACT_EVERY if case.exact else None
+    )
+    stage = Stage(scenario, seed, site, [recording.take])
+    simulate(stage, in_process(machines), seed, lambda: False)
+    spent_ns = sum(timed.spent_ns for name, timed in machines.items() if name != SUPERVISOR)
+    result = recording.finish()
+    return Flight(
+        result=result,
+        failed=result.complaints[0] if result.complaints else None,
+        rows=tuple(recording.metrics.rows),
+        robots_s=spent_ns * 1e-9,
+    )
+
+
+def records_of(setting: Setting, seed: int) -> list[Record]:
+    """The whole record of one run, for a picture."""
+    scenario = setting.find()
+    site = Site.of(scenario, seed)
+    records: list[Record] = []
+    stage = Stage(scenario, seed, site, [records.append])
+    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    return records
