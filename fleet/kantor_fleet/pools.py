@@ -213,12 +213,28 @@ def _slurm(jobs: int | None) -> Iterator["SLURMCluster"]:
     if shutil.which("sbatch") is None:
         raise ClusterError("slurm: no sbatch here; run this on a machine that submits jobs")
     try:
-        jobs_of_slurm = SLURMCluster()
+        slurm = SLURMCluster()
     except (ValueError, TypeError) as error:
         raise ClusterError(f"slurm: {error}; set it in ~/.config/dask/jobqueue.yaml") from None
-    with jobs_of_slurm:
-        jobs_of_slurm.scale(jobs=jobs or 1)
-        yield jobs_of_slurm
+    with slurm:
+        if refusal := slurm.sync(_submit, slurm, jobs or 1):
+            raise ClusterError(f"slurm: {refusal}; see ~/.config/dask/jobqueue.yaml")
+        yield slurm
+
+
+async def _submit(slurm: "SLURMCluster", jobs: int) -> str | None:
+    """Submit jobs; unlike `scale` it tells why Slurm does not take them."""
+    from distributed import Status  # noqa: PLC0415  an extra
+
+    for _ in range(jobs):
+        slurm.worker_spec.update(slurm.new_worker_spec())
+    try:
+        await slurm
+    except (RuntimeError, ValueError) as error:
+        for job in slurm.workers.values():
+            job.status = Status.failed  # Dask cannot close what it believes to be on its way
+        return str(error).rpartition("stderr:")[2].strip()
+    return None
 
 
 def _run_there(work: Work, case: Case, here: str) -> Outcome:

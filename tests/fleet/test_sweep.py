@@ -309,6 +309,8 @@ def test_a_spread_is_what_numpy_says_and_the_same_every_time() -> None:
 
 # The command
 
+group = pytest.mark.xdist_group("sweep")  # they share a fixture that is dear
+
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -330,6 +332,7 @@ def same(one: Path, other: Path) -> bool:
     )
 
 
+@group
 def test_a_sweep_leaves_its_folder(reference: Path) -> None:
     """A row for each run in the order of the plan; a result's fields; the times apart."""
     table, summary = rows_of(reference / "table.csv"), rows_of(reference / "summary.csv")
@@ -361,6 +364,7 @@ def test_a_sweep_leaves_its_folder(reference: Path) -> None:
     )
 
 
+@group
 def test_interrupted_and_resumed_it_leaves_the_same_table(
     kantor: "Kantor", reference: Path
 ) -> None:
@@ -398,6 +402,7 @@ def test_sigterm_ends_it_with_143(kantor: "Kantor") -> None:
     assert process.returncode == 143
 
 
+@group
 def test_a_worker_that_is_killed_costs_nothing(kantor: "Kantor", reference: Path) -> None:
     """Its case is run again; the table is the same."""
     folder = kantor.folder / "sweeps" / "fleet"
@@ -441,7 +446,9 @@ def test_a_run_that_fails_is_kept_with_its_reason(kantor: "Kantor") -> None:
     again = kantor(*arguments)
 
     assert (first.code, again.code) == (1, 1)
-    assert "row 1 is not finite" in first.out
+    assert first.out.count("a run failed: ") == 1, "one reason, told once"
+    assert "2 failed: " in again.out
+    assert "row 1 is not finite" in again.out
     assert len(journal_lines(folder)) == 4
     from pyarrow import parquet
 

@@ -188,7 +188,7 @@ def test_slurm_jobs_are_asked_for_and_given_back(kantor: "Kantor", reference: Pa
     assert psutil.wait_procs(gone, timeout=10)[1] == []
 
 
-def test_slurm_without_settings_or_commands(kantor: "Kantor") -> None:
+def test_slurm_that_takes_no_jobs(kantor: "Kantor") -> None:
     """One line tells what is missing."""
     arguments = sweep_command(kantor.folder / "out", "--cluster", "slurm", "--jobs", 1)
 
@@ -196,11 +196,18 @@ def test_slurm_without_settings_or_commands(kantor: "Kantor") -> None:
     assert finished.code == 4
     assert "slurm: no sbatch here; run this on a machine that submits jobs" in finished.err
 
-    (kantor.folder / "sbatch").write_text("#!/bin/sh\n")
+    (kantor.folder / "sbatch").write_text("#!/bin/sh\necho no such partition >&2; exit 1\n")
     (kantor.folder / "sbatch").chmod(0o755)
-    finished = kantor(*arguments, PATH=f"{kantor.folder}{os.pathsep}{os.environ['PATH']}")
+    path = f"{kantor.folder}{os.pathsep}{os.environ['PATH']}"
+    finished = kantor(*arguments, PATH=path)
     assert finished.code == 4
     assert "jobqueue.yaml" in finished.err
+    assert len(finished.err.splitlines()) == 1
+
+    settings = {"DASK_JOBQUEUE__SLURM__CORES": "1", "DASK_JOBQUEUE__SLURM__MEMORY": "1GB"}
+    finished = kantor(*arguments, PATH=path, **settings)
+    assert finished.code == 4
+    assert finished.err.startswith("kantor: slurm: no such partition; see ")
     assert len(finished.err.splitlines()) == 1
 
 

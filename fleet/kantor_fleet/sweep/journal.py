@@ -40,7 +40,7 @@ class Journal:
         self._path = path
         self._header = _Header(_FORMAT, version("kantor"))
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("a+b", buffering=0)
+        self._file = path.open("a+b")
         try:
             self._lock()
             self._recover()
@@ -110,3 +110,4 @@ class Journal:
 
     def _write(self, line: _Header | _Line) -> None:
         self._file.write(msgspec.json.encode(line) + b"\n")
+        self._file.flush()

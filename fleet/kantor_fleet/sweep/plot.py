@@ -46,9 +46,10 @@ _NAMES = {
 
 
 def draw(plan: Plan, runs: Sequence[Run], lines: Sequence[Line], measure: str, path: Path) -> None:
-    """Write the picture of a measure as PNG; nothing if no run has it."""
+    """Write the picture of a measure as PNG; no file if no run has it."""
     ours = [line for line in lines if line.measure == measure and line.runs.n]
     if not ours:
+        path.unlink(missing_ok=True)  # it may be of another plan
         return
     axis = _axis(plan)
     layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.06)

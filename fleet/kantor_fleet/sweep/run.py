@@ -99,9 +99,7 @@ def _run(
                 if done is not None:
                     case, outcome = done
                     journal.add(left[case], outcome)
-                    view.count()
-                    if outcome.failed is not None:
-                        view.note(f"{case.scenario.name}, seed {case.seed}: {outcome.failed}")
+                    view.count(outcome.failed)
         except ClusterError as error:
             print(f"kantor: {error}", file=sys.stderr)
             return Exit.UNREACHABLE
@@ -115,19 +113,17 @@ def _verdict(runs: Iterable[Run]) -> Exit:
 
 def _conclude(order: Order, runs: Sequence[Run]) -> None:
     """Write the tables and the picture, and print the main measures."""
+    from kantor_fleet.sweep.plot import draw  # noqa: PLC0415  matplotlib is slow to import
+
     plan, folder = order.plan, order.folder
     lines = summary.summarize(plan, runs)
     _write_tables(order, runs, lines)
-    main = summary.varying(runs, summary.MAIN)
+    main = summary.varying(runs, summary.MAIN) or summary.MAIN
     shown = list(dict.fromkeys([order.plot, *main] if order.plot else main))
-    Console(width=None if sys.stdout.isatty() else _WIDTH).print(
-        summary.table_of(plan, lines, shown), soft_wrap=False
-    )
+    console = Console(width=None if sys.stdout.isatty() else _WIDTH)
+    console.print(summary.table_of(plan, lines, shown))
     _complain(runs)
-    if shown:
-        from kantor_fleet.sweep.plot import draw  # noqa: PLC0415  matplotlib is slow to import
-
-        draw(plan, runs, lines, shown[0], folder / PLOT)
+    draw(plan, runs, lines, shown[0], folder / PLOT)
     print(f"  {folder}/  ({', '.join(sorted(path.name for path in folder.iterdir()))})")
 
 

@@ -49,6 +49,7 @@ class SweepView:
         self._monotonic = monotonic
         self._started_s = monotonic()
         self._due_s = -math.inf
+        self._told: set[str] = set()
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -62,8 +63,11 @@ class SweepView:
     ) -> None:
         self._bar.stop()
 
-    def count(self) -> None:
-        """One more is done."""
+    def count(self, failed: str | None = None) -> None:
+        """One more is done. failed: the reason; each is told once."""
+        if failed is not None and failed not in self._told:
+            self._told.add(failed)
+            self.note(f"a run failed: {failed}")
         self._done += 1
         self._bar.advance(self._task)
         now_s = self._monotonic()
