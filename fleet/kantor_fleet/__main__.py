@@ -234,8 +234,8 @@ def reproduce(
         out: Where the figures go.
     """
     from kantor_fleet.pools import cores  # noqa: PLC0415
-    from kantor_fleet.reproduce import FIGURES  # noqa: PLC0415
     from kantor_fleet.reproduce import reproduce as reproduce_figures  # noqa: PLC0415
+    from kantor_fleet.reproduce.kabir_lee import FIGURES  # noqa: PLC0415
 
     if runs is not None and runs < 2:
         fail(Exit.USAGE, f"--runs {runs}: give at least 2, an interval needs them")

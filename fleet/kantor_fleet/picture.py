@@ -196,6 +196,9 @@ def draw_samples(axes: Axes, run: Run, *, scale: bool = True) -> None:
         )
         if scale:
             _add_scale(axes, marks)
+        else:
+            label = "sample with weight left"
+            axes.plot([], [], "o", ms=4.0, mew=0.0, color=_WEIGHT(1.0), label=label)
 
 
 def _add_scale(axes: Axes, marks: PathCollection) -> None:

@@ -8,7 +8,6 @@ from contextlib import closing
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from kantor_fleet.exits import Exit
@@ -18,15 +17,19 @@ from kantor_fleet.preload import warm_up
 from kantor_fleet.reproduce.claims import MISS, UNMATCHED, Verdict
 from kantor_fleet.reproduce.flights import Flight, Flights, Setting, fly
 from kantor_fleet.reproduce.kabir_lee import FIGURES, Figure
+from kantor_fleet.sweep.view import SweepView
 from kantor_worldsim.exact import available
 
 _EXACT_RUNS = 3
 """An exact distance takes seconds; these runs have eleven each."""
+_WIDTH = 160
+"""Columns of what is printed into a file or a pipe."""
 
 
 def reproduce(names: Sequence[str], runs: int | None, jobs: int, out: Path) -> Exit:
-    """Fly, draw, judge and tell. Raises OSError."""
+    """Fly, judge, draw and tell. Raises OSError."""
     started = time.monotonic()
+    out.mkdir(parents=True, exist_ok=True)
     figures = {name: _affordable(FIGURES[name], runs) for name in names}
     with Interrupts() as interrupts:
         warm_up()
@@ -34,26 +37,27 @@ def reproduce(names: Sequence[str], runs: int | None, jobs: int, out: Path) -> E
         if interrupts.code is not None:
             print("kantor: interrupted; nothing was written", file=sys.stderr)
             return interrupts.code
-    failed = [
-        f"{setting.text}: {f.failed}" for setting, fs in flights.items() for f in fs if f.failed
-    ]
-    for line in failed[:10]:
-        print(f"kantor: {line}", file=sys.stderr)
+    failed = sum(flight.failed is not None for runs in flights.values() for flight in runs)
     if failed:
+        print(f"kantor: {failed} runs failed; nothing was written", file=sys.stderr)
         return Exit.NOT_MET
-    out.mkdir(parents=True, exist_ok=True)
-    verdicts = []
-    for name, figure in figures.items():
-        seen = _first(flights, figure)
-        verdicts += [claim.judge(name, seen) for claim in figure.claims]
-        _write_runs(out / f"{name}.csv", seen)
-        picture = figure.draw(seen)
-        picture.savefig(out / f"{name}.png", dpi=120)
-        picture.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})
+    verdicts = [
+        line for name, figure in figures.items() for line in _conclude(name, figure, flights, out)
+    ]
     _write_verdicts(out / "verdicts.csv", verdicts)
     _print(verdicts)
     print(f"  {out}/  (figures, numbers and verdicts; {time.monotonic() - started:.0f} s)")
     return Exit.NOT_MET if any(verdict.verdict == MISS for verdict in verdicts) else Exit.DONE
+
+
+def _conclude(name: str, figure: Figure, flights: Flights, out: Path) -> list[Verdict]:
+    """Write the numbers and the picture of a figure, and judge its claims."""
+    seen = _first(flights, figure)
+    _write_runs(out / f"{name}.csv", seen)
+    picture = figure.draw(seen)
+    picture.savefig(out / f"{name}.png", dpi=120)
+    picture.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})
+    return [claim.judge(name, seen) for claim in figure.claims]
 
 
 def _affordable(figure: Figure, runs: int | None) -> Figure:
@@ -92,19 +96,14 @@ def _fly_all(orders: dict[Setting, int], jobs: int, interrupts: Interrupts) -> F
         for seed in range(count)
     }
     flights: dict[Setting, list[Flight]] = {s: [Flight()] * count for s, count in orders.items()}
-    columns = (TextColumn("flying"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with (
-        Progress(*columns, disable=not sys.stdout.isatty()) as progress,
-        closing(local(cases, jobs, fly)) as pool,
-    ):
-        task = progress.add_task("", total=len(cases))
+    with SweepView(len(cases)) as view, closing(local(cases, jobs, fly)) as pool:
         for done in pool:
             if interrupts():
                 break
             if done is not None:
                 setting, seed = cases[done[0]]
                 flights[setting][seed] = _flight(done[1])
-                progress.advance(task)
+                view.count(done[1].failed)
     return flights
 
 
@@ -154,7 +153,7 @@ def _write_verdicts(path: Path, verdicts: Sequence[Verdict]) -> None:
 
 
 def _print(verdicts: Sequence[Verdict]) -> None:
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else _WIDTH)
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("figure", "claim", "published", "faithful reading", "ours", "verdict"):
         table.add_column(name)

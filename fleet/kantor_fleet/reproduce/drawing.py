@@ -1,7 +1,6 @@
-"""The paper's figures, drawn from records and rows. Runs that are drawn have seed 0."""
+"""The paper's figures, drawn from records and rows. A run that is drawn has seed 0 unless told."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,11 +30,11 @@ from kantor_fleet.style import (
     add_caption,
     tidy,
 )
+from kantor_worldsim.metrics import Row
 from kantor_worldsim.records import Batch, Opening
 
 _MAP_IN = 4.4
 """Width of one map."""
-_SEED = 0
 
 
 def centralized(setting: Setting, flight: Flight) -> Figure:
@@ -43,23 +42,24 @@ def centralized(setting: Setting, flight: Flight) -> Figure:
     figure, axes = _panels(2, 3)
     ticks = (0, 300, 600, 800, 1000)
     _snapshots(axes[:5], setting, ticks)
-    _bounds(axes[5], flight, "(f) upper bound of the Wasserstein distance")
+    _bounds(axes[5], flight)
     return figure
 
 
-def decentralized(setting: Setting, flights: Sequence[Flight]) -> Figure:
-    """Figure 7: the same for two robots that meet."""
+def decentralized(setting: Setting, flights: Sequence[Flight], ended: Measure) -> Figure:
+    """Figure 7: the same for two robots that meet, in the run whose end is nearest to the median."""
     figure, axes = _panels(2, 3)
-    flight = flights[_SEED]
-    assert flight.result is not None
-    end = flight.result.finished_tick or flight.result.ticks
-    _snapshots(axes[:5], setting, (0, 300, 600, 700, end))
-    _bounds(axes[5], flight, "(f) upper bound of the Wasserstein distance")
-    moments = {"first contact": flight.result.first_contact_tick, "end": end}
-    for (what, tick), style in zip(moments.items(), (":", "--"), strict=True):
-        if tick is not None:
-            axes[5].axvline(tick, color=FAINT, ls=style, lw=1.1, label=f"{what}, {tick}")
-    add_caption(axes[5], axes[5].get_legend_handles_labels()[0], columns=2)
+    ends = np.array([ended(flight) for flight in flights])
+    seed = int(np.abs(ends - np.median(ends)).argmin())
+    result = flights[seed].result
+    assert result is not None
+    end = int(ends[seed])
+    _snapshots(axes[:5], setting, (0, 300, 600, 700, end), seed=seed)
+    if result.first_contact_tick is not None:
+        contact = f"first contact, {result.first_contact_tick}"
+        axes[5].axvline(result.first_contact_tick, color=FAINT, ls=":", lw=1.2, label=contact)
+    axes[5].axvline(end, color=FAINT, ls="--", lw=1.2, label=f"end, {end}")
+    _bounds(axes[5], flights[seed])
     return figure
 
 
@@ -157,10 +157,10 @@ def _snapshots(
     ticks: Sequence[int],
     letters: str = "abcde",
     prefix: str = "",
+    seed: int = 0,
 ) -> None:
-    for place, run, tick, letter in zip(
-        places, _runs_at(setting, ticks), ticks, letters, strict=False
-    ):
+    runs = _runs_at(setting, ticks, seed)
+    for place, run, tick, letter in zip(places, runs, ticks, letters, strict=False):
         _map(place, run)
         found = f", {len(run.metrics.finds)} detected" if run.site.targets_m.size else ""
         _title(place, f"({letter}) {prefix}t = {tick}{found}")
@@ -169,9 +169,9 @@ def _snapshots(
     _legend(figure, places[min(1, len(places) - 1)])
 
 
-def _runs_at(setting: Setting, ticks: Sequence[int]) -> Iterator[Run]:
+def _runs_at(setting: Setting, ticks: Sequence[int], seed: int = 0) -> Iterator[Run]:
     """The run at each of some ticks; it goes on when the next one is asked for."""
-    records = iter(records_of(setting, _SEED))
+    records = iter(records_of(setting, seed))
     opening = next(records)
     assert isinstance(opening, Opening)
     run, waiting = Run(opening), next(records, None)
@@ -189,7 +189,7 @@ def _map(axes: Axes, run: Run) -> None:
     draw_samples(axes, run, scale=False)
     draw_targets(axes, run)
     draw_radio(axes, run)
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal", adjustable="box")
     axes.margins(0.02)
     tidy(axes, "x, m", "y, m")
 
@@ -216,25 +216,25 @@ def _legend(figure: Figure, axes: Axes) -> None:
     )
 
 
-def _bounds(axes: Axes, flight: Flight, title: str) -> None:
+def _bounds(axes: Axes, flight: Flight) -> None:
     ticks = [row.tick for row in flight.rows]
-    lines: tuple[tuple[str, Callable[[Any], float | None], str, float], ...] = (
+    lines: tuple[tuple[str, Callable[[Row], float | None], str, float], ...] = (
         ("bound", lambda row: row.w_ub_paper, FIRST, 2.2),
         ("tight bound", lambda row: row.w_ub_tight, SECOND, 1.4),
         ("last tick's shipping and pending", lambda row: row.w_ub_instant, THIRD, 1.1),
     )
     for label, measure, colour, width in lines:
         values = np.array([measure(row) for row in flight.rows], dtype=np.float64)
-        if not np.isnan(values).all():
-            axes.plot(ticks, values, color=colour, lw=width, label=f"{label}, {values[-1]:.3g} m")
+        at_end = "" if np.isnan(values[-1]) else f", {values[-1]:.3g} m at the end"
+        axes.plot(ticks, values, color=colour, lw=width, label=label + at_end)
     exact = [(row.tick, row.w1_exact) for row in flight.rows if row.w1_exact is not None]
     if exact:
-        label = f"exact distance, {exact[-1][1]:.3g} m"
+        label = f"exact distance, {exact[-1][1]:.3g} m at the end"
         axes.plot(*zip(*exact, strict=True), "o", ms=4.0, color=FOUND, label=label)
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(0.0, 1.45 * axes.get_ylim()[1])  # room for the legend
     tidy(axes, "tick", "m")
-    axes.set_title(title, size=TEXT_PT + 0.5, color=INK, loc="left", pad=46.0)
-    add_caption(axes, axes.get_legend_handles_labels()[0], columns=2)
+    _title(axes, "(f) upper bound of the Wasserstein distance")
+    axes.legend(loc="upper right", frameon=False, fontsize=SMALL_PT, labelcolor=INK)
 
 
 def _boxes(axes: Axes, groups: Mapping[str, Sequence[float]]) -> None:

@@ -274,7 +274,7 @@ FIG_7 = Figure(
             finished,
         ),
     ),
-    lambda flights: drawing.decentralized(C, flights[C]),
+    lambda flights: drawing.decentralized(C, flights[C], finished),
 )
 
 FIG_8 = Figure(
