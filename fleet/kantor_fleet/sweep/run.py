@@ -94,12 +94,12 @@ def _run(
         view.note("starting workers (the first time, kernels are compiled: about half a minute)")
         try:
             for done in pool:
-                if interrupts():
-                    return interrupts.code
                 if done is not None:
                     case, outcome = done
                     journal.add(left[case], outcome)
                     view.count(outcome.failed)
+                if interrupts():
+                    break
         except ClusterError as error:
             print(f"kantor: {error}", file=sys.stderr)
             return Exit.UNREACHABLE
@@ -121,7 +121,8 @@ def _conclude(order: Order, runs: Sequence[Run]) -> None:
     main = summary.varying(runs, summary.MAIN) or summary.MAIN
     shown = list(dict.fromkeys([order.plot, *main] if order.plot else main))
     console = Console(width=None if sys.stdout.isatty() else _WIDTH)
-    console.print(summary.table_of(plan, lines, shown))
+    for measure in shown:
+        console.print(summary.table_of(plan, lines, measure), markup=False)
     _complain(runs)
     draw(plan, runs, lines, shown[0], folder / PLOT)
     print(f"  {folder}/  ({', '.join(sorted(path.name for path in folder.iterdir()))})")

@@ -93,48 +93,48 @@ def varying(runs: Iterable[Run], names: Sequence[str]) -> list[str]:
     return [name for name in names if len({row[name] for row in found if row} - {None}) > 1]
 
 
-def table_of(plan: Plan, lines: Sequence[Line], names: Sequence[str]) -> Table:
-    """Some measures for a person: median and quartiles, and the difference to the first variant."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("measure")
-    for key in plan.keys:
-        table.add_column(key, justify="right")
-    for head in ("runs", "failed", "median", "quartiles", "95 % of the median"):
+def table_of(plan: Plan, lines: Iterable[Line], measure: str) -> Table:
+    """One measure for a person; in brackets 95 % intervals."""
+    table = Table(
+        title=measure,
+        title_style="bold",
+        title_justify="left",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+    )
+    several = len(plan.variants) > 1
+    heads = [*plan.keys, "runs", "median", "quartiles", *["paired difference"] * several]
+    for head in heads:
         table.add_column(head, justify="right")
-    if len(plan.variants) > 1:
-        table.add_column("paired difference, 95 %", justify="right")
-    for name in names:
-        for line in lines:
-            if line.measure == name:
-                table.add_row(*_cells(plan, line))
-        table.add_section()
+    for line in lines:
+        if line.measure == measure:
+            table.add_row(*_cells(plan, line)[: len(heads)])
     return table
 
 
-def shown(value: float | None) -> str:
+def _shown(value: float | None) -> str:
     """A number for a person."""
     if value is None:
         return "-"
-    return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.4g}"
+    return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
 def _cells(plan: Plan, line: Line) -> list[str]:
-    runs, difference = line.runs, line.difference
-    cells = [
-        line.measure,
+    first = line.variant is plan.variants[0]
+    return [
         *line.variant.settings(plan.keys).values(),
-        str(runs.n),
-        str(line.failed),
+        f"{line.runs.n}, {line.failed} failed" if line.failed else f"{line.runs.n}",
+        _told(line.runs),
+        f"{_shown(line.runs.quartile_1)} to {_shown(line.runs.quartile_3)}",
+        "" if first else _told(line.difference),
     ]
-    cells += [
-        shown(runs.median),
-        f"{shown(runs.quartile_1)} to {shown(runs.quartile_3)}",
-        f"{shown(runs.low)} to {shown(runs.high)}",
-    ]
-    if len(plan.variants) > 1:
-        between = f"{shown(difference.median)}  [{shown(difference.low)}, {shown(difference.high)}]"
-        cells.append("" if line.variant is plan.variants[0] else between)
-    return cells
+
+
+def _told(spread: Spread) -> str:
+    if spread.low is None:
+        return _shown(spread.median)
+    return f"{_shown(spread.median)} [{_shown(spread.low)}, {_shown(spread.high)}]"
 
 
 def _line(variant: Variant, name: str, mine: Mapping[int, Row], first: Mapping[int, Row]) -> Line:
