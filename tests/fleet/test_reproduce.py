@@ -1,0 +1,189 @@
+"""`kantor reproduce`: verdicts that can fail, and figures, numbers and a table from one command."""
+
+import csv
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import pytest
+from PIL import Image
+
+from kantor_fleet.reproduce.claims import (
+    MISS,
+    OK,
+    UNMATCHED,
+    Ahead,
+    Median,
+    Ratio,
+    Share,
+    Spread,
+    interval,
+    quartiles,
+)
+from kantor_fleet.reproduce.flights import Flight, Setting
+from kantor_fleet.reproduce.kabir_lee import FIGURES, drop_at_contact, loosest
+from kantor_worldsim.metrics import Row
+
+if TYPE_CHECKING:
+    from conftest import Kantor
+
+HERE, THERE = Setting("here"), Setting("there")
+
+
+def flights(*robots_s: float) -> list[Flight]:
+    """Flights that stand for one number each."""
+    return [Flight(robots_s=value) for value in robots_s]
+
+
+def number(flight: Flight) -> float:
+    return flight.robots_s
+
+
+def test_a_median_must_lie_in_its_band() -> None:
+    """Its ends belong to it; one run outside the band does not matter, the middle one does."""
+
+    def verdict(*values: float, why: str = "") -> str:
+        claim = Median("it", HERE, "2", 1.0, 3.0, number, why=why)
+        return claim.judge("fig0", {HERE: flights(*values)}).verdict
+
+    assert [verdict(*values) for values in ((1, 3, 99), (3, 3, 3), (1, 1, 1))] == [OK] * 3
+    assert [verdict(*values) for values in ((0, 0.9, 3), (1, 3.1, 99))] == [MISS] * 2
+    assert verdict(2, 2, why="the published figure is impossible") == UNMATCHED
+    assert verdict(4, 4, why="the published figure is impossible") == MISS
+
+
+def test_a_median_is_told_with_its_quartiles_and_its_band() -> None:
+    line = Median("it", HERE, "2", 1.0, math.inf, number, 1, " %").judge(
+        "fig0", {HERE: flights(1, 2, 3, 4, 5)}
+    )
+
+    assert (line.ours, line.reading) == ("3.0 [2.0, 4.0] %", "≥ 1 %")
+
+
+def test_the_narrowest_spread_must_be_the_narrowest() -> None:
+    claim = Spread("it", HERE, (THERE,), "narrower", number, "")
+
+    wide, narrow = flights(0, 10, 20), flights(100, 101, 102)
+    assert claim.judge("fig0", {HERE: narrow, THERE: wide}).verdict == OK
+    assert claim.judge("fig0", {HERE: wide, THERE: narrow}).verdict == MISS
+
+
+@pytest.mark.parametrize(
+    ("upper", "lower", "apart", "verdict"),
+    [
+        ((15, 16, 17), (1, 2, 3), True, OK),
+        ((5, 6, 7), (4.9, 5.9, 6.9), False, OK),  # seed by seed ahead
+        ((5, 6, 7), (4.9, 5.9, 6.9), True, MISS),  # but the intervals overlap
+        ((5, 6, 7), (6, 5, 8), False, MISS),
+        ((1, 2, 3), (5, 6, 7), True, MISS),
+    ],
+)
+def test_being_ahead_takes_pairs_and_where_asked_intervals_apart(
+    upper: Sequence[float], lower: Sequence[float], *, apart: bool, verdict: str
+) -> None:
+    claim = Ahead("it", HERE, THERE, "ahead", "", number, "", apart=apart)
+
+    line = claim.judge("fig0", {HERE: flights(*upper), THERE: flights(*lower)})
+
+    assert line.verdict == verdict
+
+
+def test_an_unsure_reading_takes_any_sign() -> None:
+    claim = Ahead("it", HERE, THERE, "ahead", "", number, "", sure=False)
+
+    assert claim.judge("fig0", {HERE: flights(1, 2), THERE: flights(2, 1)}).verdict == OK
+
+
+def test_a_ratio_is_told_and_not_judged() -> None:
+    claim = Ratio("it", HERE, THERE, "much less", number, "it depends")
+
+    line = claim.judge("fig0", {HERE: flights(1, 1), THERE: flights(2, 2)})
+
+    assert (line.verdict, line.why) == (UNMATCHED, "it depends")
+    assert "0.50 times" in line.ours
+
+
+def test_a_share_counts_runs() -> None:
+    claim = Share("it", HERE, "", 0.25, lambda flight: flight.robots_s > 10)
+
+    assert claim.judge("fig0", {HERE: flights(1, 2, 3, 11)}).verdict == OK
+    assert claim.judge("fig0", {HERE: flights(1, 2, 11, 11)}).verdict == MISS
+
+
+def test_an_interval_is_students() -> None:
+    """Mean 2, standard error 1/sqrt(3), two degrees of freedom: t = 4.303."""
+    assert interval([1.0, 2.0, 3.0]) == pytest.approx((2.0, 4.3026527 / math.sqrt(3.0)))
+    assert quartiles([7.0]) == (7.0, 7.0, 7.0)
+
+
+def test_measures_read_the_rows(row: Row) -> None:
+    """The fall in one tick near the contact; the bound over the exact distance at its worst."""
+    bounds = {9: 100.0, 10: 100.0, 11: 70.0, 12: 69.0, 40: 1.0}
+    rows = [row._replace(tick=tick, w_ub_instant=bound) for tick, bound in bounds.items()]
+    exact = [row._replace(w_ub_tight=tight, w1_exact=1.0) for tight in (1.5, 2.5, None, 2.0)]
+    result = FakeResult(first_contact_tick=10)
+
+    assert drop_at_contact(Flight(rows=tuple(rows), result=result)) == pytest.approx(30.0)  # type: ignore[arg-type]
+    assert drop_at_contact(Flight(rows=tuple(rows), result=FakeResult(None))) == 0.0  # type: ignore[arg-type]
+    assert loosest(Flight(rows=(*exact, row))) == 2.5
+
+
+class FakeResult:
+    """As much of a result as a measure reads."""
+
+    def __init__(self, first_contact_tick: int | None) -> None:
+        self.first_contact_tick = first_contact_tick
+
+
+@pytest.fixture
+def row() -> Row:
+    return Row(0, 0.0, 0, 0, 1.0, None, 1.0, 1.0, 0.0, 0, 0, 0, None, None)
+
+
+def test_every_setting_of_every_figure_is_a_scenario_that_can_be_run() -> None:
+    for figure in FIGURES.values():
+        for setting in {setting for claim in figure.claims for setting in claim.settings}:
+            assert setting.find().planner.name in {"transport", "spectral"}
+
+
+def test_a_figure_comes_with_its_numbers_and_its_verdicts(kantor: "Kantor") -> None:
+    """`kantor reproduce fig8`: PNG, PDF, CSV and the table; as often as asked for."""
+    done = kantor("reproduce", "fig8", "--runs", 2, "--jobs", 2, "--out", "figures")
+    folder = kantor.folder / "figures"
+
+    assert done.code in (0, 1), done.err  # two runs may miss a band
+    assert {path.name for path in folder.iterdir()} == {
+        "fig8.png",
+        "fig8.pdf",
+        "fig8.csv",
+        "verdicts.csv",
+    }
+    with Image.open(folder / "fig8.png") as image:
+        assert image.width > 1000
+    assert (folder / "fig8.pdf").read_bytes().startswith(b"%PDF")
+    with (folder / "fig8.csv").open(encoding="utf-8", newline="") as file:
+        runs = list(csv.DictReader(file))
+    assert [int(run["seed"]) for run in runs] == [0, 1, 0, 1]
+    assert all(0 < int(run["detected"]) <= 500 for run in runs)
+    with (folder / "verdicts.csv").open(encoding="utf-8", newline="") as file:
+        verdicts = list(csv.DictReader(file))
+    assert {line["figure"] for line in verdicts} == {"fig8"}
+    assert done.code == (1 if any(line["verdict"] == MISS for line in verdicts) else 0)
+    for line in verdicts:
+        assert line["ours"].split()[0] in done.out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--runs", 1), "--runs 1: give at least 2, an interval needs them"),
+        (("--jobs", 0), "--jobs 0: give at least 1"),
+    ],
+)
+def test_what_cannot_be_run_is_refused(
+    kantor: "Kantor", arguments: tuple[object, ...], says: str
+) -> None:
+    done = kantor("reproduce", "fig8", *arguments, "--out", "figures")
+
+    assert (done.code, done.err) == (2, f"kantor: {says}\n")
+    assert not (kantor.folder / "figures").exists()
