@@ -10,7 +10,7 @@ help:
 	@echo "make demo    set up, then five robot processes explore on the bus and leave a picture"
 	@echo "make test    set up, then run the tests"
 	@echo "make check   lint, types and import contracts"
-	@echo "make paper   the first paper's claims over 20 seeds, as a table"
+	@echo "make paper   the first paper's figures with a verdict beside each number (kantor reproduce all)"
 	@echo "make bench   speed, as ratios in one run"
 
 demo: $(VENV)/.installed $(VENV)/.kernels
@@ -35,8 +35,8 @@ format: $(VENV)/.developing
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-paper: $(VENV)/.installed $(VENV)/.kernels
-	$(BIN)/python benchmarks/paper_figures.py
+paper: $(VENV)/.developing $(VENV)/.kernels
+	$(KANTOR) reproduce all
 
 bench: $(VENV)/.installed $(VENV)/.kernels
 	$(BIN)/python benchmarks/run.py

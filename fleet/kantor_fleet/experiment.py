@@ -3,12 +3,19 @@
 Cases and outcomes travel between processes and machines.
 """
 
+import functools
+import hashlib
 import os
 import socket
 import time
+from pathlib import Path
 
 import msgspec
 
+import kantor_agent
+import kantor_protocol
+import kantor_supervisor
+import kantor_worldsim
 from kantor_fleet.team import team
 from kantor_protocol.scenario import Scenario, ScenarioError
 from kantor_worldsim.loop import in_process, simulate
@@ -38,6 +45,16 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float = 0.0
     worker: str = ""
     """HOST:PID of the process that ran it."""
+
+
+@functools.cache
+def code() -> str:
+    """Digest of the sources that decide what comes of a case, a planner of the user's own among them."""
+    digest = hashlib.blake2b(digest_size=16)
+    for package in (kantor_protocol, kantor_agent, kantor_supervisor, kantor_worldsim):
+        for path in sorted(Path(package.__path__[0]).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def run_case(case: Case) -> Outcome:

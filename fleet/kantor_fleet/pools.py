@@ -16,13 +16,12 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
-from importlib.metadata import version
 from multiprocessing.connection import Connection, wait
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, NamedTuple
 
 from kantor_fleet.exits import Exit, fail
-from kantor_fleet.experiment import Case, Outcome, reason, run_case
+from kantor_fleet.experiment import Case, Outcome, code, reason, run_case
 
 if TYPE_CHECKING:
     from dask_jobqueue import SLURMCluster
@@ -95,7 +94,7 @@ def cluster(
     """
     with _client(address, jobs) as client:
         arrived: SimpleQueue[Future] = SimpleQueue()
-        here = version("kantor")
+        here = code()
         pending = {client.submit(_run_there, work, case, here, pure=False): case for case in cases}
         for future in pending:
             future.add_done_callback(arrived.put)
@@ -239,10 +238,8 @@ async def _submit(slurm: "SLURMCluster", jobs: int) -> str | None:
 
 def _run_there(work: Work, case: Case, here: str) -> Outcome:
     """What a worker of a cluster does. Raises ClusterError."""
-    there = version("kantor")
-    if there != here:
-        host = socket.gethostname()
-        raise ClusterError(f"{host} has kantor {there}, not {here}; install the same everywhere")
+    if code() != here:
+        raise ClusterError(f"{socket.gethostname()}: another kantor; install the same everywhere")
     return work(case)
 
 

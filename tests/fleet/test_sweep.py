@@ -6,7 +6,7 @@ import os
 import signal
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ import pytest
 
 from kantor_fleet.exits import Exit
 from kantor_fleet.experiment import Case, Outcome, run_case
-from kantor_fleet.pools import local
+from kantor_fleet.pools import Pool, local
 from kantor_fleet.sweep.journal import Journal
 from kantor_fleet.sweep.plan import Key, SweepError, parse_seeds, plan
 from kantor_fleet.sweep.run import Order, sweep
@@ -185,7 +185,7 @@ def test_what_an_extra_is_needed_for_names_it(
 
 # The journal
 
-KEY, OUTCOME = Key("scenario", 3, exact=False), Outcome(failed="thunder", wall_s=1.5)
+KEY, OUTCOME = Key("scenario", "code", 3, exact=False), Outcome(failed="thunder", wall_s=1.5)
 
 
 def test_a_journal_keeps_runs_and_forgets_a_torn_line(tmp_path: Path) -> None:
@@ -461,13 +461,30 @@ def test_a_run_that_fails_is_kept_with_its_reason(kantor: "Kantor") -> None:
     assert len(journal_lines(folder)) == 6
 
 
-def test_exit_codes_tell_of_failures(tmp_path: Path) -> None:
-    """Any pool will do."""
+def thunder(cases: Iterable[Case]) -> Pool:
+    """A pool in which every run fails."""
+    for case in cases:
+        yield case, Outcome(failed="thunder")
+
+
+def test_the_exit_code_tells_of_failures(tmp_path: Path) -> None:
+    """Whatever the pool."""
     order = Order(plan("fleet", [], "0:2"), tmp_path)
 
-    def all_fail(cases: object) -> object:
-        for case in cases:  # type: ignore[attr-defined]
-            yield case, Outcome(failed="thunder")
-
-    assert sweep(order, all_fail) is Exit.NOT_MET  # type: ignore[arg-type]
+    assert sweep(order, thunder) is Exit.NOT_MET
     assert [row["failed"] for row in rows_of(tmp_path / "table.csv")] == ["thunder", "thunder"]
+
+
+def test_changed_sources_and_exact_distances_are_other_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who edits a planner does not want the old one's results."""
+    plans = plan("fleet", [], "0:2"), plan("fleet", [], "0:2", exact=True)
+    for made in plans:
+        sweep(Order(made, tmp_path), thunder)
+        sweep(Order(made, tmp_path), thunder)
+    assert len(journal_lines(tmp_path)) == 4
+
+    monkeypatch.setattr("kantor_fleet.sweep.plan.code", lambda: "edited")
+    sweep(Order(plans[0], tmp_path), thunder)
+    assert len(journal_lines(tmp_path)) == 6

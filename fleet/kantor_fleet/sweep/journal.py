@@ -25,6 +25,7 @@ class _Header(msgspec.Struct, frozen=True):
 
 class _Line(msgspec.Struct, frozen=True):
     scenario: str
+    code: str
     seed: int
     exact: bool
     outcome: Outcome
@@ -106,7 +107,7 @@ class Journal:
             raise SweepError(
                 f"{self._path}: line {number} is no run ({error}); remove it"
             ) from None
-        self.outcomes[Key(run.scenario, run.seed, run.exact)] = run.outcome
+        self.outcomes[Key(run.scenario, run.code, run.seed, run.exact)] = run.outcome
 
     def _write(self, line: _Header | _Line) -> None:
         self._file.write(msgspec.json.encode(line) + b"\n")

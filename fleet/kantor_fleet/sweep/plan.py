@@ -11,7 +11,7 @@ from typing import NamedTuple
 import msgspec
 
 from kantor_fleet.catalog import find
-from kantor_fleet.experiment import Case
+from kantor_fleet.experiment import Case, code
 from kantor_protocol.scenario import Scenario, ScenarioError, to_tree
 
 Value = bool | int | float | str
@@ -28,6 +28,8 @@ class Key(NamedTuple):
 
     scenario: str
     """Digest of the resolved scenario and of the files that it names."""
+    code: str
+    """Digest of the sources: whoever changes a planner wants new runs."""
     seed: int
     exact: bool
 
@@ -63,7 +65,7 @@ class Plan(NamedTuple):
 
     def key(self, variant: Variant, seed: int) -> Key:
         """What the journal has a run under."""
-        return Key(variant.digest, seed, self.exact)
+        return Key(variant.digest, code(), seed, self.exact)
 
     def cases(self) -> Iterator[tuple[Key, Case]]:
         """All runs, seed by seed: a sweep that is cut short has every variant with the same seeds."""
