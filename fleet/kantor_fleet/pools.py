@@ -245,21 +245,21 @@ def _run_there(work: Work, case: Case, here: str) -> Outcome:
 
 def _collected(future: "Future", address: str) -> Outcome:
     """What came of a case on a cluster. Raises ClusterError."""
-    from distributed import CancelledError, KilledWorker  # noqa: PLC0415  an extra
+    from distributed import KilledWorker  # noqa: PLC0415  an extra
 
     outcome: Outcome
     try:
         outcome = future.result()
     except ClusterError:
         raise
-    except CancelledError:
-        raise ClusterError(f"{address}: the scheduler is gone") from None
     except KilledWorker:
         outcome = Outcome(failed="its worker died, and so did the others that tried")
     except ImportError as error:
         raise ClusterError(
             f"{address}: no kantor on a worker ({error}); install it there"
         ) from None
-    except Exception as error:  # noqa: BLE001  whatever Dask makes of a run that fails
+    except Exception as error:
+        if future.status != "error":  # the run itself is well; what came of it cannot be had
+            raise ClusterError(f"{address}: the scheduler is gone") from None
         outcome = Outcome(failed=reason(error))
     return outcome
