@@ -258,7 +258,7 @@ def _collected(future: "Future", address: str) -> Outcome:
         raise ClusterError(
             f"{address}: no kantor on a worker ({error}); install it there"
         ) from None
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001  whatever Dask makes of a run that fails
         if future.status != "error":  # the run itself is well; what came of it cannot be had
             raise ClusterError(f"{address}: the scheduler is gone") from None
         outcome = Outcome(failed=reason(error))

@@ -14,10 +14,13 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
+import workers
 from kantor_fleet import pools
 from kantor_fleet.exits import Exit
+from kantor_fleet.experiment import Case
 from kantor_fleet.sweep.plan import Plan, plan
 from kantor_fleet.sweep.run import Order, sweep
+from strategies import mission
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -25,6 +28,8 @@ if TYPE_CHECKING:
 SMALL = ("energy.points=400", "energy.steps=400", "samples.count=200", "targets.count=50")
 VARY, SEEDS = "radio.range_m=50,100", "0:10"
 RUNS = 20
+ENVIRONMENT = {"PYTHONPATH": str(Path(workers.__file__).parent)}
+"""Of a cluster: its workers find the tests' work."""
 
 
 pytestmark = pytest.mark.xdist_group("cluster")
@@ -50,6 +55,7 @@ class Cluster:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
+            env=os.environ | ENVIRONMENT,
         )
         self._processes.callback(process.communicate)
         self._processes.callback(process.kill)
@@ -110,6 +116,21 @@ def test_a_worker_dies_and_the_table_is_that_of_one_machine(
     assert (process.returncode, err) == (0, "")
     assert same(folder, reference)
     assert str(cluster.workers[1].pid) in (folder / "timings.csv").read_text()
+
+
+def test_a_case_that_kills_workers_has_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dask gives it up; the pool goes on with whoever is left."""
+    monkeypatch.setitem(ENVIRONMENT, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
+    cases = [Case(mission(), seed) for seed in (workers.DEADLY_SEED, 4, 5)]
+    with ExitStack() as processes:
+        address = Cluster(tmp_path, processes).address
+        pool = pools.cluster(cases, address, work=workers.die_of_a_seed)
+        done = {case.seed: outcome for case, outcome in filter(None, pool)}
+
+    assert done.keys() == {case.seed for case in cases}
+    assert done[workers.DEADLY_SEED].failed == "its worker died, and so did the others that tried"
 
 
 def test_the_scheduler_goes_and_the_sweep_goes_on_elsewhere(
