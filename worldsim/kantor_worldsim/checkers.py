@@ -199,7 +199,9 @@ class Checker:
         self, name: ParticipantId, goal: tuple[float, float] | None, spent: dict[int, int]
     ) -> None:
         """The weight at the time of choosing: what is left now, and what it has shipped since."""
-        if goal is None or self._scenario.samples.diffusion_m > 0.0:
+        scenario = self._scenario
+        standing = scenario.samples.diffusion_m == 0.0
+        if goal is None or not standing or scenario.planner.name != "transport":
             return
         if self._samples_by_place is None:
             self._samples_by_place = self._index_samples()
