@@ -135,9 +135,7 @@ def _is_due(
     if least < 0:
         return beacon != 0 and target < 0
     slack = 0 if origin == me or relay else _STALE_STEPS
-    return least + slack < stamp and (
-        stamp > sent[0, origin] or step - sent[1, origin] >= patience
-    )
+    return least + slack < stamp and (stamp > sent[0, origin] or step - sent[1, origin] >= patience)
 
 
 @kernel
@@ -219,9 +217,7 @@ class Registers:
         self._heard[source] = self._step
         if content:
             packed = np.frombuffer(content, dtype=np.uint8)
-            _learn(
-                self.values, self.total, self.stamps, self._known, self.me, source, packed
-            )
+            _learn(self.values, self.total, self.stamps, self._known, self.me, source, packed)
 
     def compose(self, target: int = -1) -> bytes:
         """What everybody in range, or one participant, lacks; empty without registers."""

@@ -18,7 +18,7 @@ from kantor_agent.belief import Belief
 from kantor_agent.planners.base import Goal
 from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import Pose
-from kantor_protocol.modes import harmonics, visit
+from kantor_protocol.modes import harmonics, phase, rectangle_of, visit
 from kantor_protocol.registers import add
 from kantor_protocol.scenario import Domain, Gaussian, Scenario
 
@@ -106,8 +106,8 @@ def _choose(
     y: float,
 ) -> tuple[float, float]:
     """Count the visit, then the goal of steepest descent."""
-    harmonics(math.pi * (x - domain[0]) / domain[2], cos_x, sin_x)
-    harmonics(math.pi * (y - domain[1]) / domain[3], cos_y, sin_y)
+    harmonics(phase(x, domain[0], domain[2]), cos_x, sin_x)
+    harmonics(phase(y, domain[1], domain[3]), cos_y, sin_y)
     visit(cos_x, cos_y, visited)
     add(values, total, stamps, me, visited)
     b_x, b_y = gradient(total, mean, emphasis, domain, cos_x, sin_x, cos_y, sin_y)
@@ -127,8 +127,8 @@ def _mean_over(
     modes = cos_x.shape[0]
     mean[:] = 0.0
     for j in range(xy_m.shape[0]):
-        harmonics(math.pi * (xy_m[j, 0] - domain[0]) / domain[2], cos_x, sin_x)
-        harmonics(math.pi * (xy_m[j, 1] - domain[1]) / domain[3], cos_y, sin_y)
+        harmonics(phase(xy_m[j, 0], domain[0], domain[2]), cos_x, sin_x)
+        harmonics(phase(xy_m[j, 1], domain[1], domain[3]), cos_y, sin_y)
         for kx in range(modes):
             for ky in range(modes):
                 mean[kx * modes + ky] += cos_x[kx] * cos_y[ky]
@@ -164,7 +164,7 @@ class Spectral:
     def __init__(self, scenario: Scenario) -> None:
         """The density is the scenario's mixture where that stands still, else its samples."""
         modes, domain, samples = scenario.planner.modes, scenario.domain, scenario.samples
-        self._domain = np.array([*domain.min_m, *np.subtract(domain.max_m, domain.min_m)])
+        self._domain = rectangle_of(domain)
         order = np.arange(modes)
         weight = (1.0 + order[:, None] ** 2 + order[None, :] ** 2) ** -1.5
         norm = np.where(order > 0, 0.5, 1.0)  # h_k^2 / (Lx Ly) is the product of two of these
@@ -178,7 +178,7 @@ class Spectral:
         self._follows = mean is None
         self._walked = -1
 
-    def choose(self, belief: Belief, pose: Pose, now_ns: int, /) -> Goal | None:
+    def choose(self, belief: Belief, pose: Pose, _now_ns: int, /) -> Goal | None:
         """Where the steepest descent leaves the domain: a goal so far that no vehicle slows down."""
         if self._follows and belief.walked != self._walked:
             self._walked = belief.walked
