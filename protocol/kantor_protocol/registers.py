@@ -9,8 +9,9 @@ Talking
 1. Every message carries the stamps of all registers that its sender holds, at once an
    acknowledgement. While nobody is heard that is all, or, with `beacon`, every register as well.
 2. A register goes to neighbours of which one lacks it: its stamp once, and again only when the
-   acknowledgement has not come within `patience` steps. Its origin and a relay send it at once; others
-   forward it when a neighbour's is stale by several steps, since it most likely hears the origin itself.
+   acknowledgement has not come within `patience` steps. Its origin and a relay send it at once. Others
+   forward it when a neighbour lacks several writes, or has lacked the last one for several steps: most
+   likely it hears the origin itself.
 3. What does not fit into one message waits for the next; the own register goes first, then the others
    from a place that moves on with each step.
 4. Receiving is idempotent. Loss, duplication, delay and reordering cost time, never truth.
@@ -31,7 +32,7 @@ _BYTES_MAX = 48 * 1024
 """For one message; with the longest logs and claims a body still fits."""
 _NUMBER_BYTES, _HEAD_BYTES, _STAMP_BYTES = 8, 12, 6
 _STALE_STEPS = 6
-"""How stale a neighbour's register may be before a robot forwards another's."""
+"""How many writes, or steps, behind a neighbour may be before a robot forwards another's register."""
 _FRESH_STEPS = 4
 """A participant heard within so many steps beyond `patience` counts as a neighbour."""
 
@@ -88,9 +89,11 @@ def _learn(
     total: np.ndarray,
     stamps: np.ndarray,
     known: np.ndarray,
+    learnt: np.ndarray,
     me: int,
     source: int,
     content: np.ndarray,
+    step: int,
 ) -> None:
     """Take in sound content."""
     origins, width = values.shape
@@ -107,7 +110,7 @@ def _learn(
                 total[i] += number - values[origin, i]
                 values[origin, i] = number
         if news:
-            stamps[origin] = stamp
+            stamps[origin], learnt[origin] = stamp, step
 
 
 @kernel
@@ -115,6 +118,7 @@ def _is_due(
     stamps: np.ndarray,
     known: np.ndarray,
     heard: np.ndarray,
+    learnt: np.ndarray,
     sent: np.ndarray,
     law: np.ndarray,
     origin: int,
@@ -134,8 +138,10 @@ def _is_due(
             least = held if least < 0 else min(least, held)
     if least < 0:
         return beacon != 0 and target < 0
-    slack = 0 if origin == me or relay else _STALE_STEPS
-    return least + slack < stamp and (stamp > sent[0, origin] or step - sent[1, origin] >= patience)
+    if least >= stamp or (stamp <= sent[0, origin] and step - sent[1, origin] < patience):
+        return False
+    stale = least + _STALE_STEPS < stamp or step - learnt[origin] > _STALE_STEPS
+    return origin == me or relay != 0 or stale
 
 
 @kernel
@@ -144,6 +150,7 @@ def _compose(
     stamps: np.ndarray,
     known: np.ndarray,
     heard: np.ndarray,
+    learnt: np.ndarray,
     sent: np.ndarray,
     law: np.ndarray,
     out: np.ndarray,
@@ -161,7 +168,7 @@ def _compose(
         origin = (step + turn) % origins if turn else me
         if (turn and origin == me) or at + longest > out.shape[0]:
             continue
-        if _is_due(stamps, known, heard, sent, law, origin, target, step):
+        if _is_due(stamps, known, heard, learnt, sent, law, origin, target, step):
             at = put_uint(out, at, origin)
             at = put_uint(out, at, stamps[origin])
             for i in range(width):
@@ -194,6 +201,7 @@ class Registers:
         self.me = me
         self._known = np.zeros((origins, origins), dtype=np.int64)
         self._heard = np.full(origins, -1, dtype=np.int64)
+        self._learnt = np.zeros(origins, dtype=np.int64)
         self._sent = np.zeros((2, origins), dtype=np.int64)
         self._law = np.array([me, relay, beacon, max(1, patience_steps)], dtype=np.int64)
         self._step = 0
@@ -217,7 +225,17 @@ class Registers:
         self._heard[source] = self._step
         if content:
             packed = np.frombuffer(content, dtype=np.uint8)
-            _learn(self.values, self.total, self.stamps, self._known, self.me, source, packed)
+            _learn(
+                self.values,
+                self.total,
+                self.stamps,
+                self._known,
+                self._learnt,
+                self.me,
+                source,
+                packed,
+                self._step,
+            )
 
     def compose(self, target: int = -1) -> bytes:
         """What everybody in range, or one participant, lacks; empty without registers."""
@@ -228,6 +246,7 @@ class Registers:
             self.stamps,
             self._known,
             self._heard,
+            self._learnt,
             self._sent,
             self._law,
             self._out,
