@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, Pose
 from kantor_protocol.messages import News, decode_news, encode
+from kantor_protocol.modes import VISIT
 from kantor_protocol.packing import Pairs, put_uint
+from kantor_protocol.registers import read_register
 from kantor_protocol.replica import read_have, read_logs
 from kantor_protocol.weights import WeightsMessage, WeightsSubscriber
 from kantor_worldsim.channel import DROPPED, Verdict
@@ -24,6 +26,7 @@ from strategies import SEEDS, examples
 Play = Callable[..., tuple[Record, ...]]
 Records = Sequence[Record]
 
+SPECTRAL = ("planner=spectral", "planner.modes=3")
 MERGES = {"ledger": ("merge=ledger",), "min": ("merge=min", "claims=false")}
 RADIOS = {
     "perfect": (),
@@ -143,6 +146,14 @@ def uints(*values: int) -> bytes:
     for value in values:
         at = put_uint(buffer, at, value)
     return buffer[:at].tobytes()
+
+
+def own_register(act: Act) -> int:
+    """How many writes the own register has that r1 sends along; 0 if it sends none."""
+    content = decode_news(act.outputs.outbox[0].body).registers
+    found = read_register(content, 3, 9, 0)
+    assert found is not None
+    return found[0]
 
 
 def consumed(records: Records, until_ns: int) -> npt.NDArray[np.int64]:
@@ -451,6 +462,39 @@ def _view_falls_before_the_truth_does(records: Records) -> list[Record]:
             told = put_act(records, early, outputs(lowered=pairs(*before, ahead[0])))
             return put_act(told, late, outputs(lowered=pairs(*later)))
     raise AssertionError("r1 never learns anything")
+
+
+@breaks("register", run=SPECTRAL)
+def _counts_a_place_where_it_was_not(records: Records) -> list[Record]:
+    act = acts(records, "r1")[3]
+    moved = msgspec.structs.replace(act.observation, pose=Pose(1.0, 2.0))
+    return put_act(records, act, lambda a: msgspec.structs.replace(a, observation=moved))
+
+
+@breaks("register", run=SPECTRAL)
+def _sends_sums_that_are_not_its_own(records: Records) -> list[Record]:
+    act = [act for act in acts(records, "r1") if own_register(act)][-1]
+    sums = bytes([0]) + bytes([own_register(act)]) + uints(2 * VISIT, *[0] * 8)
+    lie = news(act, lambda said: msgspec.structs.replace(said, registers=bytes(3) + sums))
+    return put_act(records, act, lie)
+
+
+@breaks("register", run=SPECTRAL)
+def _says_that_it_wrote_more_often(records: Records) -> list[Record]:
+    act = [act for act in acts(records, "r1") if own_register(act)][-1]
+
+    def boast(said: News) -> News:
+        before, stamp, rest = said.registers[:4], said.registers[4], said.registers[5:]
+        return msgspec.structs.replace(said, registers=before + bytes([stamp + 1]) + rest)
+
+    return put_act(records, act, news(act, boast))
+
+
+@breaks("register", run=SPECTRAL)
+def _sends_registers_that_do_not_decode(records: Records) -> list[Record]:
+    act = acts(records, "r1")[3]
+    change = news(act, lambda said: msgspec.structs.replace(said, registers=b"\x80"))
+    return put_act(records, act, change)
 
 
 @breaks("speed")

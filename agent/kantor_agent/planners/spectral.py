@@ -78,8 +78,10 @@ def way_out(domain: np.ndarray, x: float, y: float, dx: float, dy: float) -> tup
         dx = 0.0
     if (y <= y_min and dy < 0.0) or (y >= y_max and dy > 0.0):
         dy = 0.0
-    if dx == 0.0 and dy == 0.0:
+    size = max(abs(dx), abs(dy))
+    if size == 0.0:
         return x, y
+    dx, dy = dx / size, dy / size
     reach = math.inf
     if dx != 0.0:
         reach = ((x_max if dx > 0.0 else x_min) - x) / dx
