@@ -1,8 +1,9 @@
 """How fast kantor is, measured in one go, as CPU time and as ratios to what was run beside it.
 
-    python benchmarks/run.py [--quick] [--only planner|fleet|lockstep|wire] [--save FILE]
+    python benchmarks/run.py [--quick] [--only planner|spectral|fleet|lockstep|wire] [--save FILE]
 
 planner   CPU time of one planner step, beside the paper's algorithm taken to the letter in numpy
+spectral  the same of multiscale coverage by its modes, and what its registers cost
 fleet     robot-steps that one CPU second buys when the whole fleet is in one process
 lockstep  ticks a second with a process for every robot, beside a bare Zenoh barrier
 wire      bytes that a robot publishes in a tick, beside its whole weight vector
@@ -22,7 +23,7 @@ from typing import Any
 
 from tables import Table, show
 
-SECTIONS = ("planner", "fleet", "lockstep", "wire")
+SECTIONS = ("planner", "spectral", "fleet", "lockstep", "wire")
 LIBRARIES = ("kantor", "eclipse-zenoh", "numpy", "numba", "msgspec")
 
 
