@@ -148,10 +148,10 @@ def uints(*values: int) -> bytes:
     return buffer[:at].tobytes()
 
 
-def own_register(act: Act) -> int:
+def own_register(act: Act, origins: int = 3) -> int:
     """How many writes the own register has that r1 sends along; 0 if it sends none."""
     content = decode_news(act.outputs.outbox[0].body).registers
-    found = read_register(content, 3, 9, 0)
+    found = read_register(content, origins, 9, 0)
     assert found is not None
     return found[0]
 
@@ -183,6 +183,20 @@ def test_no_complaint_about_a_sound_run(
     assert check(records).complaints == []
     assert isinstance(records[-1], Ending)
     assert records[-1].reason == "done"
+
+
+@pytest.mark.parametrize("radio", RADIOS)
+@pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
+def test_no_complaint_about_a_sound_run_by_registers(
+    played: Play, coordination: str, radio: str
+) -> None:
+    """Sums over places, whatever becomes of the messages that carry them."""
+    records = played(*SPECTRAL, *RADIOS[radio], f"coordination={coordination}")
+
+    assert check(records).complaints == []
+    origins = len(opening(records).scenario.roster)
+    told = [own_register(act, origins) for act in acts(records, "r1")]
+    assert max(told) > 5
 
 
 @examples(25)
