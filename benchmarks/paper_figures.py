@@ -145,6 +145,8 @@ A = Setting("paper-centralized")
 A_CONCURRENT = Setting("paper-centralized-concurrent")
 C = Setting("paper-decentralized")
 C_CONCURRENT = Setting("paper-decentralized", CONCURRENT)
+B = ("starts.random=true", "metrics.every=0")
+SPECTRAL = (*B, "planner=spectral")
 NO_LESS, NO_MORE = math.inf, -math.inf
 
 CLAIMS: tuple[Claim | Gap, ...] = (
@@ -161,6 +163,29 @@ CLAIMS: tuple[Claim | Gap, ...] = (
         _detected,
         1,
         " %",
+    ),
+    Claim(
+        "VI-B: detected, optimal transport",
+        Setting(A.scenario, B),
+        "89 %",
+        87,
+        91,
+        _detected,
+        1,
+        " %",
+    ),
+    *(
+        Claim(
+            f"VI-B: detected, spectral, K = {modes}",
+            Setting(A.scenario, (*SPECTRAL, f"planner.modes={modes}")),
+            "< 82 %",
+            low,
+            high,
+            _detected,
+            1,
+            " %",
+        )
+        for modes, low, high in ((10, 66, 73), (15, 74, 80), (20, 78, 84))
     ),
     Claim("VI-C: first contact, tick", C, "693", 685, 705, _first_contact),
     Claim("VI-C: end, in turn, tick", C, "1057", 1025, 1060, _finished),
