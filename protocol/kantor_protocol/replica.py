@@ -11,7 +11,8 @@ Theory of operation
    come within `patience` steps.
 4. Entries of others are forwarded, so news travels over several hops. A robot holds foreign entries
    back for `patience` steps, since a neighbour most likely heard them itself; a relay does not.
-5. Receiving is idempotent: a suffix that starts beyond what is held is left (it will come again), what
+5. What a planner shares beside weights and claims stands in `registers.py` and comes with the same message.
+6. Receiving is idempotent: a suffix that starts beyond what is held is left (it will come again), what
    is held already is skipped. Loss, duplication, delay and reordering cost time, never truth.
 
 Two meanings of the log, by `merge`:
