@@ -93,7 +93,7 @@ class Mission:
         self.replica = replica_of("r1", scenario, self.units, count)
         walk = Walk(samples_m, 0.0, scenario.period_ns, 0, Purpose.SAMPLE_WALK)
         self.belief = Belief(walk, self.units, self.replica)
-        self.planner = PLANNERS["transport"](scenario)
+        self.planner = PLANNERS[scenario.planner.name](scenario)
         self.pose = Pose(*starts_of(scenario, 0)[0].tolist())
         self._vehicle = VEHICLES["first-order"](scenario.vehicle)
         self._dt_s = scenario.clock.period_s

@@ -1,8 +1,9 @@
 """How fast kantor is, measured in one go, as CPU time and as ratios to what was run beside it.
 
-    python benchmarks/run.py [--quick] [--only planner|fleet|peers|lockstep|wire] [--save FILE]
+    python benchmarks/run.py [--quick] [--only SECTION] [--save FILE]
 
 planner   CPU time of one planner step, beside the paper's algorithm taken to the letter in numpy
+spectral  the same of multiscale coverage by its modes, and what its registers cost
 fleet     robot-steps that one CPU second buys when the whole fleet is in one process
 peers     the same of other simulators, if they are installed
 lockstep  ticks a second with a process for every robot, beside a bare Zenoh barrier
@@ -23,7 +24,7 @@ from typing import Any
 
 from tables import Table, show
 
-SECTIONS = ("planner", "fleet", "peers", "lockstep", "wire")
+SECTIONS = ("planner", "spectral", "fleet", "peers", "lockstep", "wire")
 LIBRARIES = ("kantor", "eclipse-zenoh", "numpy", "numba", "msgspec")
 
 

@@ -174,6 +174,7 @@ NEWS = st.builds(
     have=st.binary(max_size=40),
     logs=st.binary(max_size=40),
     claims=st.binary(max_size=40),
+    registers=st.binary(max_size=40),
 )
 POSES = st.builds(Pose, x_m=FINITE, y_m=FINITE, heading_rad=FINITE, speed_m_s=FINITE)
 ENVELOPES = st.builds(
@@ -212,7 +213,7 @@ _KEYS_OF_SCENARIOS = """
 name summary coordination merge claims limit_s domain robots energy samples density starts
 targets vehicle clock sensor radio supervisor planner publish metrics min_m max_m count
 random poses_m speed_m_s period_s order spread drift_ppm jitter_s points steps mean_m
-variance_m2 weight file diffusion_m range_m drop delay_s horizon every
+variance_m2 weight file diffusion_m range_m drop delay_s horizon modes every
 """
 TOML_KEYS = st.sampled_from(_KEYS_OF_SCENARIOS.split()) | st.text(max_size=6)
 _TOML_SCALARS = st.one_of(

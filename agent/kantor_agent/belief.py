@@ -9,6 +9,7 @@ from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_e
 from kantor_protocol.kernels import kernel
 from kantor_protocol.messages import News
 from kantor_protocol.packing import Pairs, pack_pairs
+from kantor_protocol.registers import Registers
 from kantor_protocol.replica import NOBODY, Manner, Replica, Store, spend
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, Weights
@@ -146,6 +147,16 @@ class Belief:
         return self.replica.weights
 
     @property
+    def registers(self) -> Registers:
+        """What planners tell one another."""
+        return self.replica.registers
+
+    @property
+    def walked(self) -> int:
+        """Steps that the samples have walked."""
+        return self._walk.steps
+
+    @property
     def empty(self) -> bool:
         """Whether no sample has weight left."""
         return bool(self.grid.alive[0] == 0)
@@ -158,7 +169,7 @@ class Belief:
 
     def learn(self, source: int, news: News) -> bool:
         """Take in what another participant sent; False when it is malformed."""
-        return self.replica.learn(source, news.have, news.logs, news.claims)
+        return self.replica.learn(source, news.have, news.logs, news.claims, news.registers)
 
     def advance(self, now_ns: int) -> None:
         """Bring walking samples to `now_ns` and drop those that messages have emptied."""

@@ -81,7 +81,7 @@ def _what(run: Run) -> str:
         f"seed {run.seed}",
         "1 robot" if robots == 1 else f"{robots} robots",
         scenario.coordination,
-        f"{scenario.merge} merge {'with' if scenario.claims else 'without'} claims",
+        f"{scenario.merge} merge {'with' if scenario.claiming else 'without'} claims",
         f"{scenario.planner.name} planner",
     )
     return _GAP.join(parts)

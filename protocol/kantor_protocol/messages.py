@@ -73,6 +73,9 @@ class News(_Message, frozen=True, array_like=True, tag=1):
     """Suffixes: origin, start, span, count, then count packed pairs. LEB128."""
     claims: bytes
     """Registers: origin, stamp, sample + 1 (0: none), since_ns. LEB128."""
+    registers: bytes = b""
+    """For every origin the stamp of the register that the sender holds; then registers: origin, stamp,
+    numbers. LEB128, the numbers zigzag-folded. Empty in a mission whose planner has none."""
 
 
 class Mission(_Message, frozen=True, array_like=True, tag=2):
@@ -179,6 +182,12 @@ _OUTPUTS = msgspec.msgpack.Decoder(Outputs)
 _PROGRESS = msgspec.msgpack.Decoder(Progress)
 
 encode = _ENCODER.encode
+
+
+def encode_news(news: News) -> bytes:
+    """The body of an envelope. Without registers it ends before them: they have a default."""
+    fields = (News.__struct_config__.tag, *msgspec.structs.astuple(news))
+    return encode(fields if news.registers else fields[:-1])
 
 
 def decode_news(body: bytes) -> News:

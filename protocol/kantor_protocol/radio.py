@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterable
 
 from kantor_protocol.clock import clocks
 from kantor_protocol.machine import SUPERVISOR, Envelope, ParticipantId, Pose
-from kantor_protocol.messages import VERSION, News, RefusedError, decode_news, encode
+from kantor_protocol.messages import VERSION, News, RefusedError, decode_news, encode_news
+from kantor_protocol.registers import Registers
 from kantor_protocol.replica import NOBODY, Replica
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.weights import Units
@@ -32,7 +33,8 @@ class Radio:
 
     def say(self, replica: Replica, target: ParticipantId, step: int, pose: Pose) -> Envelope:
         """What the target, or everybody in range, lacks."""
-        have, logs, claims = replica.compose(self._places.get(target, NOBODY))
+        place = self._places.get(target, NOBODY)
+        have, logs, claims = replica.compose(place)
         news = News(
             version=VERSION,
             step=step,
@@ -41,22 +43,34 @@ class Radio:
             have=have,
             logs=logs,
             claims=claims,
+            registers=replica.registers.compose(place),
         )
-        return Envelope(source=self._me, sequence=step, target=target, body=encode(news))
+        return Envelope(source=self._me, sequence=step, target=target, body=encode_news(news))
 
 
 def replica_of(me: ParticipantId, scenario: Scenario, units: Units, samples: int) -> Replica:
     """An empty replica for a participant of a scenario."""
+    place, origins = scenario.roster.index(me), len(scenario.roster)
+    relay, beacon = me == SUPERVISOR, scenario.radio.beacon == "state"
+    patience = patience_steps(me, scenario)
     return Replica(
-        scenario.roster.index(me),
-        len(scenario.roster),
+        place,
+        origins,
         samples,
         units,
         ledger=scenario.merge == "ledger",
-        claims=scenario.claims,
-        relay=me == SUPERVISOR,
-        beacon=scenario.radio.beacon == "state",
-        patience_steps=patience_steps(me, scenario),
+        claims=scenario.claiming,
+        relay=relay,
+        beacon=beacon,
+        patience_steps=patience,
+        registers=Registers(
+            place,
+            origins,
+            scenario.register_width,
+            relay=relay,
+            beacon=beacon,
+            patience_steps=patience,
+        ),
     )
 
 

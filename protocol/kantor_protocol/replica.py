@@ -11,7 +11,8 @@ Theory of operation
    come within `patience` steps.
 4. Entries of others are forwarded, so news travels over several hops. A robot holds foreign entries
    back for `patience` steps, since a neighbour most likely heard them itself; a relay does not.
-5. Receiving is idempotent: a suffix that starts beyond what is held is left (it will come again), what
+5. What a planner shares beside weights and claims stands in `registers.py` and comes with the same message.
+6. Receiving is idempotent: a suffix that starts beyond what is held is left (it will come again), what
    is held already is skipped. Loss, duplication, delay and reordering cost time, never truth.
 
 Two meanings of the log, by `merge`:
@@ -33,6 +34,7 @@ import numpy.typing as npt
 
 from kantor_protocol.kernels import kernel
 from kantor_protocol.packing import put_int, put_uint, take_int, take_uint
+from kantor_protocol.registers import Registers
 from kantor_protocol.weights import Units, Weights
 
 NOBODY = -1
@@ -484,8 +486,13 @@ class Replica:
         relay: bool = False,
         beacon: bool = False,
         patience_steps: int = 2,
+        registers: Registers | None = None,
     ) -> None:
-        """me: this participant's place in the roster of `origins` participants. The rest: Manner."""
+        """me: this participant's place in the roster of `origins` participants. The rest: Manner.
+
+        registers: what the planner shares beside the weights, by default nothing.
+        """
+        self.registers = Registers(me, origins, 0) if registers is None else registers
         self.manner = Manner(
             me=me,
             ledger=ledger,
@@ -529,13 +536,19 @@ class Replica:
         index, value = self.store.log_index[row, :length], self.store.log_value[row, :length]
         return list(zip(index.tolist(), value.tolist(), strict=True))
 
-    def learn(self, source: int, have: bytes, logs: bytes, claims: bytes) -> bool:
+    def learn(
+        self, source: int, have: bytes, logs: bytes, claims: bytes, registers: bytes = b""
+    ) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
+        if not self.registers.sound(registers):
+            return False
         parts = [np.frombuffer(part, dtype=np.uint8) for part in (have, logs, claims)]
         outcome = _learn(*self._fields, *parts, source)
         if outcome == _NO_ROOM:
             self.reserve(len(logs) // 2)
             outcome = _learn(*self._fields, *parts, source)
+        if outcome == _LEARNT:
+            self.registers.learn(source, registers)
         return outcome == _LEARNT
 
     def reserve(self, entries: int) -> None:
@@ -583,6 +596,7 @@ class Replica:
         """Begin the next step."""
         self.store.counters[_LOWERED] = 0
         self.store.counters[_STEP] += 1
+        self.registers.end_step()
 
 
 @kernel

@@ -23,7 +23,7 @@ Probability = Annotated[float, Meta(ge=0.0, lt=1.0)]
 Seconds = Annotated[float, Meta(ge=0.0, le=1e6)]
 Point = tuple[float, float]
 
-PlannerName = Literal["transport"]
+PlannerName = Literal["transport", "spectral"]
 VehicleName = Literal["first-order", "second-order", "unicycle", "dubins"]
 
 
@@ -168,8 +168,11 @@ class Planner(_Table, frozen=True, kw_only=True):
     """How goals are chosen."""
 
     name: PlannerName = "transport"
+    """transport: optimal transport (Kabir & Lee). spectral: multiscale coverage (Mathew & Mezic)."""
     horizon: Annotated[int, Meta(ge=1, le=12)] = 3
-    """h: samples in one plan."""
+    """transport: h, samples in one plan."""
+    modes: Annotated[int, Meta(ge=1, le=64)] = 15
+    """spectral: K, cosine modes along each axis."""
 
 
 class Publish(_Table, frozen=True, kw_only=True):
@@ -198,7 +201,7 @@ class Scenario(_Table, frozen=True, kw_only=True):
     merge: Literal["min", "ledger"] = "ledger"
     """min: elementwise minimum, as in the paper. ledger: everybody's spending, counted once."""
     claims: bool = True
-    """Robots claim the sample they head for."""
+    """Robots claim the sample they head for, if their planner heads for samples."""
     limit_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     """Simulated time after which the mission is cut; by default 1.5 times the energy's."""
     domain: Domain
@@ -231,6 +234,16 @@ class Scenario(_Table, frozen=True, kw_only=True):
     def centralized(self) -> bool:
         """Whether there is a supervisor."""
         return self.coordination == "centralized"
+
+    @property
+    def claiming(self) -> bool:
+        """Whether robots claim samples: asked for, and the planner has samples to claim."""
+        return self.claims and self.planner.name == "transport"
+
+    @property
+    def register_width(self) -> int:
+        """Integers in the register by which robots coordinate; 0 for a planner without one."""
+        return self.planner.modes**2 if self.planner.name == "spectral" else 0
 
     @property
     def period_ns(self) -> int:
@@ -364,15 +377,18 @@ def _override(tree: dict[str, Any], override: str) -> None:
     path = key.strip().split(".")
     if not separator or not all(path):
         raise ScenarioError(f"--set {override}: write it as key.sub=value")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except (ValueError, RecursionError):
+        value = text.strip()
+    if isinstance(value, str) and "name" in _KNOWN.get(".".join(path), ()):
+        path.append("name")  # planner=spectral says which planner
     table = tree
     for i, part in enumerate(path[:-1]):
         table = table.setdefault(part, {})
         if not isinstance(table, dict):
             raise ScenarioError(f"--set {override}: {'.'.join(path[: i + 1])} is not a table")
-    try:
-        table[path[-1]] = tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        table[path[-1]] = text.strip()
+    table[path[-1]] = value
 
 
 _PERIODS_UNDER_WAY = 1000
@@ -448,8 +464,6 @@ def _complaints(scenario: Scenario) -> Iterable[str]:
         yield f"clock.jitter_s: must be below the shortest period after spread and drift, {shortest_s:g} s"
     if scenario.radio.delay_s + scenario.radio.jitter_s > _PERIODS_UNDER_WAY * shortest_s:
         yield f"radio.delay_s: with the jitter over {_PERIODS_UNDER_WAY} periods; make it shorter"
-    if scenario.claims and scenario.planner.name != "transport":
-        yield "claims: only the transport planner has them; set claims=false"
 
 
 def _not_finite(tree: Any, path: str = "") -> Iterable[str]:

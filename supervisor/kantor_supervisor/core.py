@@ -55,4 +55,4 @@ class Supervisor:
         return outputs
 
     def _learn(self, source: int, news: News) -> bool:
-        return self._replica.learn(source, news.have, news.logs, news.claims)
+        return self._replica.learn(source, news.have, news.logs, news.claims, news.registers)

@@ -19,8 +19,10 @@ import pytest
 
 from kantor_agent.core import Agent
 from kantor_protocol.machine import Envelope, Inputs, Observation, Outputs, Pose
-from kantor_protocol.messages import decode_news
+from kantor_protocol.messages import News, decode_news
+from kantor_protocol.modes import VISIT
 from kantor_protocol.packing import Pairs
+from kantor_protocol.registers import read_register
 from kantor_protocol.replica import read_have, read_logs
 from kantor_protocol.scenario import Scenario, parse
 
@@ -122,7 +124,17 @@ class Stage:
         entries = " ".join(f"r{o + 1}#{at}={j}:{u}" for o, at, j, u in logs.tolist())
         claims = "claims " if news.claims else ""
         to = envelope.target or "everybody"
-        return f"to {to}: {claims}has {have}, tells {entries or 'nothing'}"
+        return f"to {to}: {claims}has {have}, tells {entries or 'nothing'}{self._registers(news)}"
+
+    def _registers(self, news: News) -> str:
+        """Visits by origin, for those that the message has: the first number counts them."""
+        width, told = self.scenario.register_width, []
+        for place, name in enumerate(self.scenario.roster if width else ()):
+            found = read_register(news.registers, len(self.scenario.roster), width, place)
+            assert found is not None
+            stamp, numbers = found
+            told += [f" {name}#{stamp}={numbers[0] // VISIT}"] if stamp else []
+        return f", registers{''.join(told) or ' none'}" if width else ""
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.txt")), ids=lambda path: path.stem)

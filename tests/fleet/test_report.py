@@ -249,6 +249,7 @@ def test_drawing_needs_no_display(tmp_path: Path) -> None:
         ("merge=ledger",),
         CENTRALIZED,
         ("coordination=centralized", "merge=ledger"),
+        ("planner=spectral",),
     ],
 )
 @pytest.mark.parametrize("limit_s", [0.5, 2.0, 10.0])

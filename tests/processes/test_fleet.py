@@ -82,6 +82,21 @@ def test_same_seed_same_digest_in_process_and_over_the_bus(kantor: "Kantor") -> 
     assert "every byte the same" in finished.out
 
 
+def test_registers_are_the_same_in_process_and_over_the_bus(kantor: "Kantor") -> None:
+    """Multiscale coverage with loss, repetition and delay: integers add up to the same everywhere."""
+    for exchange in ("in-process", "lockstep"):
+        finished = kantor(
+            "run", "fleet", "--exchange", exchange, *LOSSY, "planner=spectral", "energy.points=1000",
+        )  # fmt: skip
+        assert finished.code == 0, finished.err
+
+    results = [result_of(folder) for folder in kantor.runs()]
+    assert len({result["digest"] for result in results}) == 1
+    assert [result["planner"] for result in results] == ["spectral", "spectral"]
+    assert all(result["claims"] is False for result in results)
+    assert "every byte the same" in kantor("verify", kantor.runs()[-1]).out
+
+
 def test_a_wall_run_finds_what_virtual_time_finds(kantor: "Kantor") -> None:
     """Robots with different periods, drift and jitter, each on its own timer: detection within five
     points of virtual time (median of seven seeds), every rule held, and each robot replays from its

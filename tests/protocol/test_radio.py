@@ -67,6 +67,33 @@ def test_word_carries_what_the_replica_composes(target: str) -> None:
     assert decode_news(envelope.body) == News(1, 7, 1.0, 2.0, have, logs, claims)
 
 
+def test_word_carries_registers_where_the_planner_has_them() -> None:
+    """K x K numbers for the spectral planner; the supervisor has the same, to relay."""
+    for overrides, width in (((), 0), (("planner=spectral", "planner.modes=4"), 16)):
+        scenario = mission("coordination=centralized", *overrides)
+        units = Units.of(30, 12)
+        for name in scenario.roster:
+            held = replica_of(name, scenario, units, 12)
+            word = Radio(name, scenario.roster).say(held, "", 1, Pose(1.0, 2.0))
+
+            assert held.registers.values.shape == (4, width)
+            assert decode_news(word.body).registers == bytes(4 if width else 0)
+
+
+def test_unsound_registers_are_refused_with_all_that_came_with_them() -> None:
+    """A message is taken in whole or not at all, whichever part is broken."""
+    units = Units.of(30, 12)
+    held = replica_of("r1", mission("planner=spectral", "planner.modes=1"), units, 12)
+    logs = bytes([1, 0, 1, 1, 2 * 3, 2])
+    register = bytes([0, 1, 0, 1, 1, 2 * 9])
+
+    assert not held.learn(1, bytes(3), logs, b"", register + b"\x80")
+    assert not held.learn(1, bytes(3), b"\x80", b"", register)
+    assert (held.weights.tolist(), held.registers.total.tolist()) == ([5] * 12, [0])
+    assert held.learn(1, bytes(3), logs, b"", register)
+    assert (held.weights[3], held.registers.total.tolist()) == (3, [9])
+
+
 @pytest.mark.parametrize(
     ("name", "overrides", "merges", "relays", "beacons"),
     [

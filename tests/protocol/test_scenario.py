@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from kantor_protocol.clock import clocks
 from kantor_protocol.machine import SUPERVISOR
 from kantor_protocol.scenario import (
+    Planner,
     Scenario,
     ScenarioError,
     from_tree,
@@ -140,7 +141,11 @@ REFUSED = {
     "too-little-energy": ("energy.points=2", "energy.points", "at least one point for each"),
     "certain-loss": ("radio.drop=1.0", "radio.drop", "< 1.0"),
     "horizon-of-13": ("planner.horizon=13", "planner.horizon", "<= 12"),
-    "unknown-planner": ("planner.name=oracle", "planner.name", "transport"),
+    "no-modes": ("planner.modes=0", "planner.modes", ">= 1"),
+    "65-modes": ("planner.modes=65", "planner.modes", "<= 64"),
+    "unknown-planner": ("planner.name=oracle", "planner.name", "transport, spectral"),
+    "unknown-planner-in-short": ("planner=oracle", "planner.name", "transport, spectral"),
+    "unknown-vehicle-in-short": ("vehicle=boat", "vehicle.name", "dubins"),
     "unknown-vehicle": ("vehicle.name=boat", "vehicle.name", "dubins"),
     "unknown-merge": ("merge=max", "merge", "min, ledger"),
     "unknown-coordination": ("coordination=both", "coordination", "centralized, decentralized"),
@@ -216,6 +221,30 @@ def test_override_is_toml_or_plain_text() -> None:
 
     assert (scenario.merge, scenario.claims) == ("min", False)
     assert (scenario.radio.range_m, scenario.summary) == (3.0, "two words")
+
+
+@pytest.mark.parametrize(
+    "written", ["planner=spectral", "planner='spectral'", " planner = spectral"]
+)
+def test_a_name_alone_says_which_planner_or_vehicle(written: str) -> None:
+    """A table that has a name may be set to it; what else is in the table stays."""
+    scenario = mission("planner.horizon=5", written, "vehicle=dubins", "planner.modes=10")
+
+    assert scenario.planner == Planner(name="spectral", horizon=5, modes=10)
+    assert scenario.vehicle.name == "dubins"
+
+
+def test_only_a_planner_that_heads_for_samples_claims_them() -> None:
+    """Claims are on by default; with another planner they are without effect, on any mission."""
+    assert mission().claiming
+    assert not mission("claims=false").claiming
+    assert not mission("planner=spectral", "claims=true").claiming
+
+
+def test_register_is_as_wide_as_the_modes() -> None:
+    """K x K sums; robots that plan by samples share none."""
+    assert mission("planner=spectral", "planner.modes=10").register_width == 100
+    assert mission("planner.modes=10").register_width == 0
 
 
 @pytest.mark.parametrize("key", ["name", "domain", "robots", "energy", "samples"])

@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, Pose
 from kantor_protocol.messages import News, decode_news, encode
+from kantor_protocol.modes import VISIT
 from kantor_protocol.packing import Pairs, put_uint
+from kantor_protocol.registers import read_register
 from kantor_protocol.replica import read_have, read_logs
 from kantor_protocol.weights import WeightsMessage, WeightsSubscriber
 from kantor_worldsim.channel import DROPPED, Verdict
@@ -24,6 +26,7 @@ from strategies import SEEDS, examples
 Play = Callable[..., tuple[Record, ...]]
 Records = Sequence[Record]
 
+SPECTRAL = ("planner=spectral", "planner.modes=3")
 MERGES = {"ledger": ("merge=ledger",), "min": ("merge=min", "claims=false")}
 RADIOS = {
     "perfect": (),
@@ -145,6 +148,14 @@ def uints(*values: int) -> bytes:
     return buffer[:at].tobytes()
 
 
+def own_register(act: Act, origins: int = 3) -> int:
+    """How many writes the own register has that r1 sends along; 0 if it sends none."""
+    content = decode_news(act.outputs.outbox[0].body).registers
+    found = read_register(content, origins, 9, 0)
+    assert found is not None
+    return found[0]
+
+
 def consumed(records: Records, until_ns: int) -> npt.NDArray[np.int64]:
     """Units that all participants together have shipped to each sample by then."""
     total = np.zeros(60, dtype=np.int64)
@@ -172,6 +183,20 @@ def test_no_complaint_about_a_sound_run(
     assert check(records).complaints == []
     assert isinstance(records[-1], Ending)
     assert records[-1].reason == "done"
+
+
+@pytest.mark.parametrize("radio", RADIOS)
+@pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
+def test_no_complaint_about_a_sound_run_by_registers(
+    played: Play, coordination: str, radio: str
+) -> None:
+    """Sums over places, whatever becomes of the messages that carry them."""
+    records = played(*SPECTRAL, *RADIOS[radio], f"coordination={coordination}")
+
+    assert check(records).complaints == []
+    origins = len(opening(records).scenario.roster)
+    told = [own_register(act, origins) for act in acts(records, "r1")]
+    assert max(told) > 5
 
 
 @examples(25)
@@ -451,6 +476,39 @@ def _view_falls_before_the_truth_does(records: Records) -> list[Record]:
             told = put_act(records, early, outputs(lowered=pairs(*before, ahead[0])))
             return put_act(told, late, outputs(lowered=pairs(*later)))
     raise AssertionError("r1 never learns anything")
+
+
+@breaks("register", run=SPECTRAL)
+def _counts_a_place_where_it_was_not(records: Records) -> list[Record]:
+    act = acts(records, "r1")[3]
+    moved = msgspec.structs.replace(act.observation, pose=Pose(1.0, 2.0))
+    return put_act(records, act, lambda a: msgspec.structs.replace(a, observation=moved))
+
+
+@breaks("register", run=SPECTRAL)
+def _sends_sums_that_are_not_its_own(records: Records) -> list[Record]:
+    act = [act for act in acts(records, "r1") if own_register(act)][-1]
+    sums = bytes([0]) + bytes([own_register(act)]) + uints(2 * VISIT, *[0] * 8)
+    lie = news(act, lambda said: msgspec.structs.replace(said, registers=bytes(3) + sums))
+    return put_act(records, act, lie)
+
+
+@breaks("register", run=SPECTRAL)
+def _says_that_it_wrote_more_often(records: Records) -> list[Record]:
+    act = [act for act in acts(records, "r1") if own_register(act)][-1]
+
+    def boast(said: News) -> News:
+        before, stamp, rest = said.registers[:4], said.registers[4], said.registers[5:]
+        return msgspec.structs.replace(said, registers=before + bytes([stamp + 1]) + rest)
+
+    return put_act(records, act, news(act, boast))
+
+
+@breaks("register", run=SPECTRAL)
+def _sends_registers_that_do_not_decode(records: Records) -> list[Record]:
+    act = acts(records, "r1")[3]
+    change = news(act, lambda said: msgspec.structs.replace(said, registers=b"\x80"))
+    return put_act(records, act, change)
 
 
 @breaks("speed")

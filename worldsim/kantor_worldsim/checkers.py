@@ -9,9 +9,11 @@ from collections.abc import Iterable
 import numpy as np
 
 from kantor_protocol.kernels import kernel
-from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
+from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, Outputs, ParticipantId, Pose
 from kantor_protocol.messages import RefusedError, decode_news
+from kantor_protocol.modes import rectangle_of, visit_at
 from kantor_protocol.packing import Pairs
+from kantor_protocol.registers import read_register
 from kantor_protocol.replica import read_have, read_logs
 from kantor_protocol.weights import WeightsSubscriber
 from kantor_worldsim.channel import DROPPED, Verdict
@@ -53,6 +55,8 @@ class Checker:
     speed       no accepted move is longer than speed times time
     bound       where the bounds claim to hold, the exact distance is not above them (rows that have it)
     goal        a goal has weight in the robot's own view (transport with standing samples)
+    register    the own register that a robot sends is the sum over the places from which it chose
+                (spectral; not once an output is missing from the record)
     order       steps count up by one, time never runs back, an opening first, nothing after the end
     ruling      the world found no fault of its own
     """
@@ -117,6 +121,10 @@ class Checker:
         self._have: dict[ParticipantId, list[int]] = {}
         self._consumed = np.zeros(self._samples, dtype=np.int64)
         self._absences = dict.fromkeys(names, 0)
+        self._registers = np.zeros((len(names), scenario.register_width), dtype=np.int64)
+        self._rectangle = rectangle_of(scenario.domain)
+        self._said = dict(self._poses)
+        self._missed: set[ParticipantId] = set()
         self._in_flight: dict[tuple[ParticipantId, int, ParticipantId], list[int]] = {}
         self._sent: dict[tuple[ParticipantId, int], ParticipantId] = {}
 
@@ -136,6 +144,7 @@ class Checker:
         for act in acts:
             if act.outputs is None or act.ruling is None:
                 self._absences[act.name] += 1
+                self._missed.add(act.name)
             else:
                 self._check_act(act)
 
@@ -167,6 +176,7 @@ class Checker:
         self._check_weights(act.name, outputs.lowered)
         self._check_published(act.name, outputs.weights)
         self._check_goal(act.name, outputs.goal, spent)
+        self._check_register(act, outputs, chose=bool(spent))
         self._steps[act.name], self._absences[act.name] = outputs.step, 0
         self._moved_ns[act.name] = act.now_ns
         self._poses[act.name] = ruling.pose
@@ -213,7 +223,9 @@ class Checker:
         self, name: ParticipantId, goal: tuple[float, float] | None, spent: dict[int, int]
     ) -> None:
         """The weight at the time of choosing: what is left now, and what it has shipped since."""
-        if goal is None or self._scenario.samples.diffusion_m > 0.0:
+        scenario = self._scenario
+        standing = scenario.samples.diffusion_m == 0.0
+        if goal is None or not standing or scenario.planner.name != "transport":
             return
         if self._samples_by_place is None:
             self._samples_by_place = self._index_samples()
@@ -275,6 +287,30 @@ class Checker:
             consumed = self._own_spent[name][start : start + own.shape[0]]
             if own[:, 2:].tolist() != consumed:
                 self._complain("ledger", name, f"its log from {start} on is not what it consumed")
+
+    def _check_register(self, act: Act, outputs: Outputs, *, chose: bool) -> None:
+        """It chooses where it was observed last, or where it went itself if that word is late."""
+        name, place, width = act.name, self._places[act.name], self._scenario.register_width
+        if not width or name in self._missed:
+            return
+        timely = act.observation.step == outputs.step - 1
+        pose = act.observation.pose if timely else self._said[name]
+        self._said[name] = outputs.pose
+        if chose:
+            modes = self._scenario.planner.modes
+            self._registers[place] += visit_at(pose.x_m, pose.y_m, self._rectangle, modes)
+        for envelope in outputs.outbox:
+            try:
+                content = decode_news(envelope.body).registers
+            except RefusedError:
+                content = b"\x80"
+            sent = read_register(content, len(self._places), width, place)
+            if sent is None:
+                self._complain("register", name, "sends what nobody can read")
+            elif sent[0] and not np.array_equal(sent[1], self._registers[place]):
+                self._complain("register", name, "its sums are not those over its places")
+            elif sent[0] and sent[0] != self._points[name]:
+                self._complain("register", name, f"writes {sent[0]} of {self._points[name]}")
 
     def _check_verdict(self, verdict: Verdict) -> None:
         target = self._sent.get((verdict.source, verdict.sequence))

@@ -395,7 +395,7 @@ class Metrics:
             clock=scenario.clock.order,
             planner=scenario.planner.name,
             merge=scenario.merge,
-            claims=scenario.claims,
+            claims=scenario.claiming,
             robots=robots,
             ticks=self._tick,
             finished_tick=finished,

@@ -1,0 +1,286 @@
+"""Registers: one vector of integers for every participant, held by everybody (design, part 4).
+
+An origin adds to its own register and nobody else writes it. Everywhere else the newest value wins, by
+the origin's stamp, which counts its writes. What a planner wants is the sum over all origins: integers
+make it exact, so that it is the same wherever the same registers are held, whatever came first.
+
+Talking
+-------
+1. Every message carries the stamps of all registers that its sender holds, at once an
+   acknowledgement. While nobody is heard that is all, or, with `beacon`, every register as well.
+2. A register goes to neighbours of which one lacks it: its stamp once, and again only when the
+   acknowledgement has not come within `patience` steps. Its origin and a relay send it at once. Others
+   forward it when a neighbour lacks several writes, or has lacked the last one for several steps: most
+   likely it hears the origin itself.
+3. What does not fit into one message waits for the next; the own register goes first, then the others
+   from a place that moves on with each step.
+4. Receiving is idempotent. Loss, duplication, delay and reordering cost time, never truth.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from kantor_protocol.kernels import kernel
+from kantor_protocol.packing import MALFORMED, put_int, put_uint, take_int, take_uint
+
+Register = npt.NDArray[np.int64]
+
+STAMP_MAX = 1 << 40
+NUMBER_MAX = 1 << 52
+"""Sums over a thousand origins stay within 64 bits."""
+_BYTES_MAX = 48 * 1024
+"""For one message; with the longest logs and claims a body still fits."""
+_NUMBER_BYTES, _HEAD_BYTES, _STAMP_BYTES = 8, 12, 6
+_STALE_STEPS = 6
+"""How many writes, or steps, behind a neighbour may be before a robot forwards another's register."""
+_FRESH_STEPS = 4
+"""A participant heard within so many steps beyond `patience` counts as a neighbour."""
+
+
+@kernel
+def add(
+    values: np.ndarray, total: np.ndarray, stamps: np.ndarray, me: int, amounts: np.ndarray
+) -> None:
+    """Add amounts (width,) to the own register: one write."""
+    for i in range(amounts.shape[0]):
+        values[me, i] += amounts[i]
+        total[i] += amounts[i]
+    stamps[me] += 1
+
+
+@kernel
+def _take_head(content: np.ndarray, at: int, origins: int) -> tuple[int, int, int]:
+    """Read what precedes the numbers of a register: (origin, stamp, position), or MALFORMED."""
+    origin, at = take_uint(content, at)
+    stamp, at = take_uint(content, at)
+    if at < 0 or origin >= origins or stamp < 1 or stamp > STAMP_MAX:
+        return 0, 0, MALFORMED
+    return origin, stamp, at
+
+
+@kernel
+def _sound(content: np.ndarray, origins: int, width: int) -> bool:
+    """Whether content is stamps and then whole registers.
+
+    The first number of a register bounds the others, as the number of visits bounds every sum over
+    visits of something within [-1, 1].
+    """
+    at = 0
+    for _ in range(origins):
+        stamp, at = take_uint(content, at)
+        if at < 0 or stamp > STAMP_MAX:
+            return False
+    while at < content.shape[0]:
+        _origin, _stamp, at = _take_head(content, at, origins)
+        bound = NUMBER_MAX
+        for i in range(width):
+            number, at = take_int(content, at)
+            if at < 0 or number > bound or number < (0 if i == 0 else -bound):
+                return False
+            bound = number if i == 0 else bound
+        if at < 0:
+            return False
+    return True
+
+
+@kernel
+def _learn(
+    values: np.ndarray,
+    total: np.ndarray,
+    stamps: np.ndarray,
+    known: np.ndarray,
+    learnt: np.ndarray,
+    me: int,
+    source: int,
+    content: np.ndarray,
+    step: int,
+) -> None:
+    """Take in sound content."""
+    origins, width = values.shape
+    at = 0
+    for origin in range(origins):
+        stamp, at = take_uint(content, at)
+        known[source, origin] = max(known[source, origin], stamp)
+    while 0 <= at < content.shape[0]:
+        origin, stamp, at = _take_head(content, at, origins)
+        news = at >= 0 and origin != me and stamp > stamps[origin]
+        for i in range(width):
+            number, at = take_int(content, at)
+            if news:
+                total[i] += number - values[origin, i]
+                values[origin, i] = number
+        if news:
+            stamps[origin], learnt[origin] = stamp, step
+
+
+@kernel
+def _is_due(
+    stamps: np.ndarray,
+    known: np.ndarray,
+    heard: np.ndarray,
+    learnt: np.ndarray,
+    sent: np.ndarray,
+    law: np.ndarray,
+    origin: int,
+    target: int,
+    step: int,
+) -> bool:
+    """Whether a register belongs in a message to everybody (target < 0), or to one participant."""
+    me, relay, beacon, patience = law[0], law[1], law[2], law[3]
+    stamp = stamps[origin]
+    if stamp == 0:
+        return False
+    least = -1
+    for other in range(stamps.shape[0]):
+        wanted = other not in (me, origin) and target in (-1, other)
+        if wanted and heard[other] >= 0 and heard[other] + patience + _FRESH_STEPS >= step:
+            held = known[other, origin]
+            least = held if least < 0 else min(least, held)
+    if least < 0:
+        return beacon != 0 and target < 0
+    if least >= stamp or (stamp <= sent[0, origin] and step - sent[1, origin] < patience):
+        return False
+    stale = least + _STALE_STEPS < stamp or step - learnt[origin] > _STALE_STEPS
+    return origin == me or relay != 0 or stale
+
+
+@kernel
+def _compose(
+    values: np.ndarray,
+    stamps: np.ndarray,
+    known: np.ndarray,
+    heard: np.ndarray,
+    learnt: np.ndarray,
+    sent: np.ndarray,
+    law: np.ndarray,
+    out: np.ndarray,
+    target: int,
+    step: int,
+) -> int:
+    """Write stamps and registers; the bytes used."""
+    origins, width = values.shape
+    me = law[0]
+    at = 0
+    for origin in range(origins):
+        at = put_uint(out, at, stamps[origin])
+    longest = _HEAD_BYTES + _NUMBER_BYTES * width
+    for turn in range(origins + 1):
+        origin = (step + turn) % origins if turn else me
+        if (turn and origin == me) or at + longest > out.shape[0]:
+            continue
+        if _is_due(stamps, known, heard, learnt, sent, law, origin, target, step):
+            at = put_uint(out, at, origin)
+            at = put_uint(out, at, stamps[origin])
+            for i in range(width):
+                at = put_int(out, at, values[origin, i])
+            sent[0, origin] = stamps[origin]
+            sent[1, origin] = step
+    return at
+
+
+class Registers:
+    """The registers that one participant holds, and what it tells others of them."""
+
+    def __init__(
+        self,
+        me: int,
+        origins: int,
+        width: int,
+        *,
+        relay: bool = False,
+        beacon: bool = False,
+        patience_steps: int = 2,
+    ) -> None:
+        """me: place in the roster of `origins` participants. width: integers in a register, or 0."""
+        self.values = np.zeros((origins, width), dtype=np.int64)
+        """(n, width) the newest known of each origin."""
+        self.total = np.zeros(width, dtype=np.int64)
+        """(width,) the sum over origins."""
+        self.stamps = np.zeros(origins, dtype=np.int64)
+        """(n,) writes of each origin that `values` includes."""
+        self.me = me
+        self._known = np.zeros((origins, origins), dtype=np.int64)
+        self._heard = np.full(origins, -1, dtype=np.int64)
+        self._learnt = np.zeros(origins, dtype=np.int64)
+        self._sent = np.zeros((2, origins), dtype=np.int64)
+        self._law = np.array([me, relay, beacon, max(1, patience_steps)], dtype=np.int64)
+        self._step = 0
+        longest = _HEAD_BYTES + _NUMBER_BYTES * width
+        room = min(_BYTES_MAX, origins * (_STAMP_BYTES + longest))
+        self._out = np.zeros(room if width else 0, dtype=np.uint8)
+
+    def add(self, amounts: Register) -> None:
+        """Add (width,) integers to the own register; the first sum is the largest in size."""
+        add(self.values, self.total, self.stamps, self.me, amounts)
+
+    def sound(self, content: bytes) -> bool:
+        """Whether content is well-formed, whole; empty content always is."""
+        origins, width = self.values.shape
+        if not content or not width:
+            return not content
+        return bool(_sound(np.frombuffer(content, dtype=np.uint8), origins, width))
+
+    def learn(self, source: int, content: bytes) -> None:
+        """Take in sound content from a participant."""
+        self._heard[source] = self._step
+        if content:
+            packed = np.frombuffer(content, dtype=np.uint8)
+            _learn(
+                self.values,
+                self.total,
+                self.stamps,
+                self._known,
+                self._learnt,
+                self.me,
+                source,
+                packed,
+                self._step,
+            )
+
+    def compose(self, target: int = -1) -> bytes:
+        """What everybody in range, or one participant, lacks; empty without registers."""
+        if not self._out.size:
+            return b""
+        used = _compose(
+            self.values,
+            self.stamps,
+            self._known,
+            self._heard,
+            self._learnt,
+            self._sent,
+            self._law,
+            self._out,
+            target,
+            self._step,
+        )
+        return self._out[:used].tobytes()
+
+    def end_step(self) -> None:
+        """Begin the next step."""
+        self._step += 1
+
+
+@kernel
+def _find(content: np.ndarray, origins: int, wanted: int, register: np.ndarray) -> int:
+    at = 0
+    for _ in range(origins):
+        _stamp, at = take_uint(content, at)
+    found = 0
+    while 0 <= at < content.shape[0]:
+        origin, stamp, at = _take_head(content, at, origins)
+        for i in range(register.shape[0]):
+            number, at = take_int(content, at)
+            if at >= 0 and origin == wanted:
+                register[i] = number
+        if origin == wanted:
+            found = stamp
+    return found if at >= 0 else MALFORMED
+
+
+def read_register(
+    content: bytes, origins: int, width: int, origin: int
+) -> tuple[int, Register] | None:
+    """Stamp and numbers of an origin's register in a message; stamp 0 if absent, None if malformed."""
+    register = np.zeros(width, dtype=np.int64)
+    stamp = _find(np.frombuffer(content, dtype=np.uint8), origins, origin, register)
+    return None if stamp < 0 else (stamp, register)
