@@ -12,6 +12,7 @@ import os
 import shutil
 import signal
 import socket
+import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -211,6 +212,7 @@ def _slurm(jobs: int | None) -> Iterator["SLURMCluster"]:
 
     if shutil.which("sbatch") is None:
         raise ClusterError("slurm: no sbatch here; run this on a machine that submits jobs")
+    warnings.filterwarnings("ignore", "Port .* is already in use")  # of a page nobody looks at
     try:
         slurm = SLURMCluster()
     except (ValueError, TypeError) as error:
