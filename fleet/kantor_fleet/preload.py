@@ -24,13 +24,17 @@ clock = { jitter_s = 0.01 }
 radio = { drop = 0.1, duplicate = 0.1, jitter_s = 0.01, reorder = 0.1 }
 density = [{ mean_m = [5, 5], variance_m2 = [4, 4] }]
 """
+_MANNERS = (
+    ("merge='ledger'", "samples.diffusion_m=0"),
+    ("merge='min'", "samples.diffusion_m=1"),
+    ("planner='spectral'", "samples.diffusion_m=1"),
+)
 
 
 def warm_up() -> None:
-    """Compile every kernel, or load it from the cache, by two tiny missions."""
-    for merge in ("merge='ledger'", "merge='min'"):
-        still = "samples.diffusion_m=0" if "ledger" in merge else "samples.diffusion_m=1"
-        scenario = parse(_TINY, "warm-up", [merge, still, "targets.diffusion_m=1"])
+    """Compile every kernel, or load it from the cache, by tiny missions."""
+    for manner in _MANNERS:
+        scenario = parse(_TINY, "warm-up", [*manner, "targets.diffusion_m=1"])
         site = Site.of(scenario, 0)
         recording = Recording(scenario, 0, "in-process")
         stage = Stage(scenario, 0, site, [recording.take])

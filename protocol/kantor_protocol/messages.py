@@ -182,12 +182,13 @@ _OUTPUTS = msgspec.msgpack.Decoder(Outputs)
 _PROGRESS = msgspec.msgpack.Decoder(Progress)
 
 encode = _ENCODER.encode
+_EIGHT_ITEMS, _EMPTY = b"\x98", encode(b"")
 
 
 def encode_news(news: News) -> bytes:
-    """The body of an envelope. Without registers it ends before them: they have a default."""
-    fields = (News.__struct_config__.tag, *msgspec.structs.astuple(news))
-    return encode(fields if news.registers else fields[:-1])
+    """The body of an envelope. Without registers it is an array of one item less: they have a default."""
+    body = encode(news)
+    return body if news.registers else _EIGHT_ITEMS + body[1 : -len(_EMPTY)]
 
 
 def decode_news(body: bytes) -> News:

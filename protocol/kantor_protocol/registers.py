@@ -214,28 +214,24 @@ class Registers:
         add(self.values, self.total, self.stamps, self.me, amounts)
 
     def sound(self, content: bytes) -> bool:
-        """Whether content is well-formed, whole; empty content always is."""
+        """Whether content is well-formed, whole; without registers none is."""
         origins, width = self.values.shape
-        if not content or not width:
-            return not content
-        return bool(_sound(np.frombuffer(content, dtype=np.uint8), origins, width))
+        return width > 0 and bool(_sound(np.frombuffer(content, dtype=np.uint8), origins, width))
 
     def learn(self, source: int, content: bytes) -> None:
         """Take in sound content from a participant."""
         self._heard[source] = self._step
-        if content:
-            packed = np.frombuffer(content, dtype=np.uint8)
-            _learn(
-                self.values,
-                self.total,
-                self.stamps,
-                self._known,
-                self._learnt,
-                self.me,
-                source,
-                packed,
-                self._step,
-            )
+        _learn(
+            self.values,
+            self.total,
+            self.stamps,
+            self._known,
+            self._learnt,
+            self.me,
+            source,
+            np.frombuffer(content, dtype=np.uint8),
+            self._step,
+        )
 
     def compose(self, target: int = -1) -> bytes:
         """What everybody in range, or one participant, lacks; empty without registers."""

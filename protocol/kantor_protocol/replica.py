@@ -540,14 +540,14 @@ class Replica:
         self, source: int, have: bytes, logs: bytes, claims: bytes, registers: bytes = b""
     ) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
-        if not self.registers.sound(registers):
+        if registers and not self.registers.sound(registers):
             return False
         parts = [np.frombuffer(part, dtype=np.uint8) for part in (have, logs, claims)]
         outcome = _learn(*self._fields, *parts, source)
         if outcome == _NO_ROOM:
             self.reserve(len(logs) // 2)
             outcome = _learn(*self._fields, *parts, source)
-        if outcome == _LEARNT:
+        if outcome == _LEARNT and registers:
             self.registers.learn(source, registers)
         return outcome == _LEARNT
 
