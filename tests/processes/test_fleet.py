@@ -183,7 +183,7 @@ def test_a_robot_may_come_late(kantor: "Kantor") -> None:
     endpoint = free_endpoint()
     world = kantor.start(
         "worldsim", "fleet", "--listen", endpoint, "--speed", 5, "--start-after", 3,
-        "--set", "limit_s=60",
+        "--set", "limit_s=100",
     )  # fmt: skip
     await_line(world, "t=")
     robots = [kantor.start("agent", f"r{i}", "--connect", endpoint) for i in range(1, 5)]
