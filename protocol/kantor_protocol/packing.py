@@ -37,7 +37,7 @@ def take_uint(buffer: np.ndarray, at: int) -> tuple[int, int]:
     shift = 0
     if at < 0:
         return 0, MALFORMED
-    while at < buffer.shape[0] and shift < 63:
+    while at < len(buffer) and shift < 63:
         byte = np.int64(buffer[at])
         at += 1
         value |= int((byte & 127) << shift)

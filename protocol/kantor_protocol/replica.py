@@ -48,7 +48,7 @@ _FRESH_STEPS = 4
 
 _REPEATED = 32
 """So many unacknowledged entries are repeated with every message, so that one loss costs nothing."""
-_LENGTH_MAX = 1 << 40
+LENGTH_MAX = 1 << 40
 """No log is longer; it keeps sums of positions within 64 bits."""
 
 # Rows of Store.claims.
@@ -153,7 +153,7 @@ def _walk_logs(store: Store, manner: Manner, logs: np.ndarray, source: int, appl
         count, at = take_uint(logs, at)
         if at < 0 or origin >= store.length.shape[0] or count > span or count > logs.shape[0]:
             return -1
-        if start > _LENGTH_MAX or span > _LENGTH_MAX:
+        if start > LENGTH_MAX or span > LENGTH_MAX:
             return -1
         if (ledger and count != span) or (not ledger and origin != source):
             return -1
@@ -595,7 +595,7 @@ def _read_logs(logs: np.ndarray, rows: np.ndarray) -> int:
         _span, at = take_uint(logs, at)
         count, at = take_uint(logs, at)
         index = 0
-        if at < 0 or start > _LENGTH_MAX or count > logs.shape[0]:
+        if at < 0 or start > LENGTH_MAX or count > logs.shape[0]:
             return -1
         for i in range(count):
             step, at = take_int(logs, at)
