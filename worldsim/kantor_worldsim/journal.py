@@ -86,9 +86,9 @@ class Journal:
         except OSError as error:
             self._give_up(error)
 
-    def take(self, record: Record) -> None:
-        """Write one record."""
-        payload = encode_record(record)
+    def take(self, record: Record, payload: bytes = b"") -> None:
+        """Write one record. payload: the record encoded, if somebody has done so already."""
+        payload = payload or encode_record(record)
         self.digest.add(payload)
         if isinstance(record, Batch | Ending):
             self._time_ns = record.now_ns

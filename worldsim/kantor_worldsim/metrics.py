@@ -24,14 +24,16 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from kantor_protocol.kernels import kernel
 from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
-from kantor_protocol.packing import Pairs
+from kantor_protocol.machine import ParticipantId, State
 from kantor_protocol.walk import Walk
+from kantor_worldsim import reading as of
 from kantor_worldsim.channel import DROPPED, links
-from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
+from kantor_worldsim.reading import Reader, Reading
+from kantor_worldsim.records import Batch, Ending, Opening, Record
 
 _PAIRS_PER_ROW = 200_000
 """Robot-sample distances that one row of metrics may cost when the period is chosen by size."""
@@ -130,47 +132,182 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
 
 
+# Slots of Tally.counts and Tally.shipped.
+_VIOLATIONS, _STEPS, _BYTES_WEIGHTS, _BYTES_TOTAL, _ENERGY, _UNITS = 0, 1, 2, 3, 4, 5
+_DELIVERIES, _DROPS, _FIRST_CONTACT, _LEAST, _FINDS = 6, 7, 8, 9, 10
+_EVER, _NOW = 0, 1
+_NEVER = -1
+
+
+class Tally(NamedTuple):
+    """What is counted batch by batch. n participants, of them m robots; N samples."""
+
+    counts: npt.NDArray[np.int64]
+    """(11,): violations, robot-steps, bytes on weights keys and in all, points and units shipped,
+    deliveries, drops, step of the first contact or _NEVER, units in `least`, finds in this batch."""
+    shipped: npt.NDArray[np.float64]
+    """(2,) mass times metres: since the start, in this tick."""
+    shipped_by: npt.NDArray[np.float64]
+    """(m,) since the start."""
+    robots: npt.NDArray[np.int64]
+    """(n, 3): refused messages; whether it rests; step in which it saw no weight left, or _NEVER."""
+    xy_m: npt.NDArray[np.float64]
+    """(m, 2) where robots are, world frame."""
+    views: npt.NDArray[np.int64]
+    """(n, N) the weight vector of each, in units."""
+    least: npt.NDArray[np.int64]
+    """(N,) the least of all views."""
+    true_left: npt.NDArray[np.int64]
+    """(N,) first weight minus everybody's spending; negative where a sample was filled twice."""
+
+
 @kernel
-def _pending(xy_m: np.ndarray, x: float, y: float, units: np.ndarray) -> float:
+def _lower(tally: Tally, place: int, sample: int, left: int) -> None:
+    """Put an entry into a view. A record that is not sound may let it rise."""
+    before = tally.least[sample]
+    tally.views[place, sample] = left
+    least = left
+    if left > before:
+        for other in range(tally.views.shape[0]):
+            least = min(least, tally.views[other, sample])
+    tally.least[sample] = least
+    tally.counts[_LEAST] += least - before
+
+
+@kernel
+def _ship(
+    tally: Tally, samples_m: np.ndarray, place: int, sample: int, units: int, whole: int
+) -> None:
+    dx = samples_m[sample, 0] - tally.xy_m[place, 0]
+    dy = samples_m[sample, 1] - tally.xy_m[place, 1]
+    cost = units * math.hypot(dx, dy) / whole
+    tally.shipped[_EVER] += cost
+    tally.shipped[_NOW] += cost
+    tally.shipped_by[place] += cost
+    tally.counts[_UNITS] += units
+    tally.true_left[sample] -= units
+
+
+@kernel
+def _follow(
+    _payload: bytes,
+    sizes: np.ndarray,
+    acts: np.ndarray,
+    poses_m: np.ndarray,
+    _heard: np.ndarray,
+    _sent: np.ndarray,
+    verdicts: np.ndarray,
+    pairs: np.ndarray,
+    counts: np.ndarray,
+    shipped: np.ndarray,
+    shipped_by: np.ndarray,
+    robots: np.ndarray,
+    xy_m: np.ndarray,
+    views: np.ndarray,
+    least: np.ndarray,
+    true_left: np.ndarray,
+    samples_m: np.ndarray,
+    whole: int,
+) -> None:
+    """Count one batch, see Reading and Tally. samples_m: (N, 2) as they are now."""
+    tally = Tally(counts, shipped, shipped_by, robots, xy_m, views, least, true_left)
+    counts[_FINDS] = 0
+    for row in range(sizes[of.VERDICTS]):
+        counts[_DROPS if verdicts[row, of.DUE_NS] == DROPPED else _DELIVERIES] += 1
+    for row in range(sizes[of.ACTS]):
+        act = acts[row]
+        place = act[of.PLACE]
+        if place < 0 or not act[of.PRESENT]:
+            continue
+        counts[_VIOLATIONS] += act[of.VIOLATIONS]
+        robots[place, 0] = act[of.REFUSED]
+        for i in range(act[of.LOWERED], act[of.LOWERED] + max(0, act[of.LOWERED_COUNT])):
+            _lower(tally, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS])
+        if place >= xy_m.shape[0]:  # the supervisor
+            continue
+        xy_m[place, 0], xy_m[place, 1] = poses_m[row, 0], poses_m[row, 1]
+        counts[_STEPS] += 1
+        counts[_BYTES_WEIGHTS] += act[of.WEIGHTS_BYTES]
+        counts[_BYTES_TOTAL] += act[of.WEIGHTS_BYTES] + act[of.BODY_BYTES]
+        counts[_FINDS] += act[of.FINDS]
+        if act[of.HEARD_COUNT] > 0 and counts[_FIRST_CONTACT] == _NEVER:
+            counts[_FIRST_CONTACT] = act[of.STEP]
+        if act[of.STATE] != State.EXPLORING.value:
+            robots[place, 1] = 1
+        if act[of.STATE] == State.FINISHED.value and robots[place, 2] == _NEVER:
+            robots[place, 2] = act[of.STEP]
+        if act[of.SPENT_COUNT] > 0 and not act[of.VOID]:
+            counts[_ENERGY] += 1
+            for i in range(act[of.SPENT], act[of.SPENT] + act[of.SPENT_COUNT]):
+                _ship(tally, samples_m, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS], whole)
+
+
+@kernel
+def _pending(
+    samples_m: np.ndarray,
+    xy_m: np.ndarray,
+    views: np.ndarray,
+    common: np.ndarray,
+    true_left: np.ndarray,
+    range_m: float,
+    centralized: bool,
+    way_m: np.ndarray,
+    paper: np.ndarray,
+    tight: np.ndarray,
+    local: np.ndarray,
+) -> None:
+    """The pending terms in units times metres: weight times the distance to a robot, over all samples.
+
+    way_m: (N,) room. For each robot in paper: by the common weights or its own view; in tight: by the
+    true rest; in local: by its own view, summed over the robots that are in its range (eq. 12).
+    """
+    robots = xy_m.shape[0]
+    local[:] = 0.0
+    for i in range(robots):
+        for j in range(samples_m.shape[0]):
+            dx = samples_m[j, 0] - xy_m[i, 0]
+            dy = samples_m[j, 1] - xy_m[i, 1]
+            way_m[j] = math.sqrt(dx * dx + dy * dy)
+        paper[i] = _weighed(common if centralized else views[i], way_m)
+        tight[i] = _weighed(true_left, way_m)
+        for k in range(0 if centralized else robots):
+            if k == i:
+                local[k] += paper[i]
+            elif math.hypot(xy_m[i, 0] - xy_m[k, 0], xy_m[i, 1] - xy_m[k, 1]) <= range_m:
+                local[k] += _weighed(views[k], way_m)
+
+
+@kernel
+def _weighed(units: np.ndarray, way_m: np.ndarray) -> float:
     total = 0.0
     for j in range(units.shape[0]):
-        if units[j] > 0:
-            dx = xy_m[j, 0] - x
-            dy = xy_m[j, 1] - y
-            total += units[j] * math.sqrt(dx * dx + dy * dy)
+        total += max(units[j], 0) * way_m[j]
     return total
-
-
-@kernel
-def _least(views: np.ndarray, out: np.ndarray) -> None:
-    for j in range(out.shape[0]):
-        least = views[0, j]
-        for k in range(1, views.shape[0]):
-            least = min(least, views[k, j])
-        out[j] = least
 
 
 class Metrics:
     """Follows the records of one run."""
 
-    def __init__(self) -> None:
+    def __init__(self, reader: Reader | None = None) -> None:
+        """reader: the one that another referee of the same run reads by."""
         self.rows: list[Row] = []
         self.finds: list[tuple[float, ParticipantId, int, float, float]] = []
         """(time, robot, target, x, y), world frame."""
+        self._reader = reader or Reader()
         self._opening: Opening | None = None
-        self._pairs = Pairs()
 
     def take(self, record: Record) -> None:
         """Follow one record."""
         if isinstance(record, Opening):
             self._open(record)
         elif isinstance(record, Batch):
-            self._follow(record)
+            self._follow(record, self._reader.read(record))
         elif isinstance(record, Ending):
             self._ending = record
             self._row()
 
     def _open(self, opening: Opening) -> None:
+        self._reader.read(opening)
         scenario, site = opening.scenario, opening.site
         self._opening, self._scenario, self._units = opening, scenario, opening.units
         self._period_ns = scenario.period_ns
@@ -181,144 +318,104 @@ class Metrics:
             opening.seed,
             Purpose.SAMPLE_WALK,
         )
-        self._names = scenario.roster
-        self._places = {name: i for i, name in enumerate(self._names)}
-        samples, robots = site.samples_m.shape[0], scenario.robots.count
+        names, samples, robots = scenario.roster, site.samples_m.shape[0], scenario.robots.count
         self._targets = site.targets_m.shape[0]
-        self._views = np.full((len(self._names), samples), self._units.sample, dtype=np.int64)
-        self._true_left = np.full(samples, self._units.sample, dtype=np.int64)
-        self._common = np.zeros(samples, dtype=np.int64)
-        self._xy_m = site.starts_m.copy()
+        self._tally = Tally(
+            counts=np.zeros(11, dtype=np.int64),
+            shipped=np.zeros(2),
+            shipped_by=np.zeros(robots),
+            robots=np.zeros((len(names), 3), dtype=np.int64),
+            xy_m=site.starts_m.copy(),
+            views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
+            least=np.full(samples, self._units.sample, dtype=np.int64),
+            true_left=np.full(samples, self._units.sample, dtype=np.int64),
+        )
+        self._tally.counts[_FIRST_CONTACT] = _NEVER
+        self._tally.counts[_LEAST] = self._units.whole
+        self._tally.robots[:, 2] = _NEVER
+        self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
+        self._way_m = np.zeros(samples)
+        self._terms = np.zeros((3, robots))
         size = samples * robots // _PAIRS_PER_ROW
         self._every = scenario.metrics.every or max(1, size)
-        self._shipped = 0.0
-        self._shipped_by = [0.0] * robots
-        self._shipped_now = 0.0
-        self._spent_units = 0
-        self._energy_spent = 0
-        self._deliveries = self._drops = self._out_of_range = self._violations = self._absences = 0
-        self._bytes_weights = self._bytes_total = self._steps = 0
-        self._refused: dict[ParticipantId, int] = {}
-        self._finished: dict[ParticipantId, int] = {}
-        self._resting: set[ParticipantId] = set()
-        self._first_contact: int | None = None
+        self._out_of_range = self._absences = 0
         self._ending = Ending(0, "cut")
         self._tick = 0
         for name, found in opening.first_look.items():
             self.finds += [(0.0, name, target, x, y) for target, x, y in found]
         self._row()
 
-    def _follow(self, batch: Batch) -> None:
+    def _follow(self, batch: Batch, reading: Reading) -> None:
         tick = batch.now_ns // self._period_ns
         if tick != self._tick:
             if self._tick and self._tick % self._every == 0:
                 self._row()
-            self._tick, self._shipped_now = tick, 0.0
+            self._tick, self._tally.shipped[_NOW] = tick, 0.0
         self._walk.advance(batch.now_ns)
         self._out_of_range += batch.out_of_range
         self._absences += len(batch.absent)
-        for verdict in batch.verdicts:
-            if verdict.due_ns == DROPPED:
-                self._drops += 1
-            else:
-                self._deliveries += 1
+        _follow(*reading, *self._arguments)
+        if self._tally.counts[_FINDS]:
+            self._note_finds(batch)
+
+    def _note_finds(self, batch: Batch) -> None:
         for act in batch.acts:
-            self._follow_act(act)
-
-    def _follow_act(self, act: Act) -> None:
-        outputs, ruling, place = act.outputs, act.ruling, self._places[act.name]
-        if outputs is None or ruling is None:
-            return
-        self._violations += len(ruling.violations)
-        self._refused[act.name] = outputs.refused
-        lowered = self._pairs.decode(outputs.lowered, self._views.shape[1])
-        if lowered is not None:
-            self._views[place, lowered[0]] = lowered[1]
-        if act.name == SUPERVISOR:
-            return
-        self._xy_m[place] = ruling.pose.x_m, ruling.pose.y_m
-        self._steps += 1
-        self._bytes_weights += len(outputs.weights)
-        self._bytes_total += len(outputs.weights) + sum(len(e.body) for e in outputs.outbox)
-        if act.heard and self._first_contact is None:
-            self._first_contact = outputs.step
-        if outputs.state is not State.EXPLORING:
-            self._resting.add(act.name)
-        if outputs.state is State.FINISHED:
-            self._finished.setdefault(act.name, outputs.step)
-        time_s = act.now_ns * 1e-9
-        self.finds += [(time_s, act.name, target, x, y) for target, x, y in ruling.found]
-        if outputs.spent and not {"step", "energy", "units"} & set(ruling.violations):
-            self._ship(place, outputs.spent)
-
-    def _ship(self, place: int, spent: bytes) -> None:
-        pairs = self._pairs.decode(spent, self._views.shape[1])
-        if pairs is None:
-            return
-        self._energy_spent += 1
-        x, y = self._xy_m[place].tolist()
-        for sample, units in zip(pairs[0].tolist(), pairs[1].tolist(), strict=True):
-            way_m = math.hypot(self._walk.xy_m[sample, 0] - x, self._walk.xy_m[sample, 1] - y)
-            cost = units * way_m / self._units.whole
-            self._shipped += cost
-            self._shipped_now += cost
-            self._shipped_by[place] += cost
-            self._spent_units += units
-            self._true_left[sample] -= units
-
-    def _mass_left(self) -> int:
-        """Units left in the common view: everybody's minimum, or with a ledger the truth."""
-        if self._scenario.merge == "ledger":
-            np.maximum(self._true_left, 0, out=self._common)
-        else:
-            _least(self._views, self._common)
-        return int(self._common.sum())
+            if act.ruling is not None and act.outputs is not None:
+                time_s = act.now_ns * 1e-9
+                self.finds += [(time_s, act.name, target, x, y) for target, x, y in act.ruling.found]
 
     def _row(self) -> None:
-        left = self._mass_left()
-        whole, robots = self._units.whole, len(self._xy_m)
-        places = [(i, *self._xy_m[i].tolist()) for i in range(robots)]
-        xy_m = self._walk.xy_m
-        pending = 0.0
-        for i, x, y in places:
-            units = self._common if self._scenario.centralized else self._views[i]
-            pending += _pending(xy_m, x, y, units) / whole
+        tally, scenario, whole = self._tally, self._scenario, self._units.whole
+        counts, robots = tally.counts.tolist(), len(tally.xy_m)
+        true_rest = np.maximum(tally.true_left, 0)
+        # The common view: everybody's minimum, or with a ledger the truth.
+        common = true_rest if scenario.merge == "ledger" else tally.least
+        left = int(true_rest.sum()) if scenario.merge == "ledger" else counts[_LEAST]
+        _pending(
+            self._walk.xy_m,
+            tally.xy_m,
+            tally.views,
+            common,
+            true_rest,
+            scenario.radio.range_m,
+            scenario.centralized,
+            self._way_m,
+            *self._terms,
+        )
+        paper, by_truth, _ = (self._terms / whole).tolist()
+        pending = sum(paper)
+        shipped, shipped_now = tally.shipped.tolist()
         tight = None
-        if int(np.maximum(self._true_left, 0).sum()) == whole - self._spent_units:
-            tight = self._shipped + sum(
-                _pending(xy_m, x, y, self._true_left) / whole / robots for _, x, y in places
-            )
-        local = [] if self._scenario.centralized else self._local_bounds()
+        if int(true_rest.sum()) == whole - counts[_UNITS]:
+            tight = shipped + sum(term / robots for term in by_truth)
+        local = [] if scenario.centralized else self._local_bounds()
         self.rows.append(
             Row(
                 tick=self._tick,
                 time_s=self._tick * self._period_ns * 1e-9,
-                energy_spent=self._energy_spent,
+                energy_spent=counts[_ENERGY],
                 detected=len(self.finds),
-                w_ub_paper=self._shipped + pending,
+                w_ub_paper=shipped + pending,
                 w_ub_tight=tight,
-                w_ub_instant=self._shipped_now + pending,
+                w_ub_instant=shipped_now + pending,
                 mass_left=left / whole,
-                mass_double_counted=(self._spent_units - (whole - left)) / whole,
-                links=links(self._xy_m, self._scenario.radio.range_m),
-                deliveries=self._deliveries,
-                drops=self._drops,
+                mass_double_counted=(counts[_UNITS] - (whole - left)) / whole,
+                links=links(tally.xy_m, scenario.radio.range_m),
+                deliveries=counts[_DELIVERIES],
+                drops=counts[_DROPS],
                 w_ub_local_min=min(local, default=None),
                 w_ub_local_max=max(local, default=None),
             )
         )
 
     def _local_bounds(self) -> list[float]:
-        """Eq. 12 for every robot."""
-        range_m, xy_m = self._scenario.radio.range_m, self._xy_m
+        """Eq. 12 for every robot, with the pending terms of this row."""
+        range_m, xy_m = self._scenario.radio.range_m, self._tally.xy_m
+        pending = (self._terms[2] / self._units.whole).tolist()
         bounds = []
         for k in range(len(xy_m)):
-            team = np.flatnonzero(np.hypot(*(xy_m - xy_m[k]).T) <= range_m).tolist()
-            pending = sum(
-                _pending(self._walk.xy_m, *xy_m[q].tolist(), self._views[k]) for q in team
-            )
-            shipped = sum(self._shipped_by[q] for q in team)
-            bounds.append(shipped + pending / self._units.whole)
+            near = np.hypot(*(xy_m - xy_m[k]).T) <= range_m
+            bounds.append(sum(self._tally.shipped_by[near].tolist()) + pending[k])
         return bounds
 
     def glance(self) -> Glance:
@@ -331,13 +428,13 @@ class Metrics:
         rate = (last.deliveries - before.deliveries) / elapsed_s if elapsed_s > 0.0 else 0.0
         return Glance(
             now_ns=round(last.time_s * 1e9),
-            energy_spent=self._energy_spent,
+            energy_spent=int(self._tally.counts[_ENERGY]),
             detected=len(self.finds),
             targets=self._targets,
             w_ub=last.w_ub_paper,
             links=last.links,
             messages_per_s=rate,
-            robots_done=len(self._resting),
+            robots_done=int(self._tally.robots[:, 1].sum()),
             mass_left=last.mass_left,
         )
 
@@ -353,9 +450,9 @@ class Metrics:
     ) -> Result:
         """The summary; call it after the last record. complaints: the checker's."""
         scenario, last = self._scenario, self.rows[-1]
-        robots = scenario.robots.count
-        finished = max(self._finished.values()) if len(self._finished) == robots else None
-        steps = max(1, self._steps)
+        counts, robots = self._tally.counts.tolist(), scenario.robots.count
+        finished = self._tally.robots[:robots, 2].tolist()
+        steps = max(1, counts[_STEPS])
         assert self._opening is not None
         return Result(
             scenario=scenario.name,
@@ -367,29 +464,29 @@ class Metrics:
             claims=scenario.claims,
             robots=robots,
             ticks=self._tick,
-            finished_tick=finished,
-            first_contact_tick=self._first_contact,
+            finished_tick=None if _NEVER in finished else max(finished),
+            first_contact_tick=None if counts[_FIRST_CONTACT] == _NEVER else counts[_FIRST_CONTACT],
             detected=len(self.finds),
             targets=self._targets,
             detection_rate=len(self.finds) / self._targets if self._targets else None,
             w_ub_start=self.rows[0].w_ub_paper,
             w_ub=Bounds(last.w_ub_paper, last.w_ub_tight, last.w_ub_instant),
             w1_exact=None,
-            energy_spent=self._energy_spent,
+            energy_spent=counts[_ENERGY],
             energy_total=scenario.steps_per_robot * robots,
             mass_left=last.mass_left,
             mass_double_counted=last.mass_double_counted,
             bytes_per_robot_tick=BytesPerRobotTick(
-                self._bytes_weights / steps, self._bytes_total / steps
+                counts[_BYTES_WEIGHTS] / steps, counts[_BYTES_TOTAL] / steps
             ),
-            deliveries=self._deliveries,
-            drops=self._drops,
+            deliveries=counts[_DELIVERIES],
+            drops=counts[_DROPS],
             out_of_range_refused=self._out_of_range,
-            messages_refused=sum(self._refused.values()) + refused_at_door,
+            messages_refused=int(self._tally.robots[:, 0].sum()) + refused_at_door,
             absences=self._absences,
             ended=self._ending.reason,
             record=record,
-            violations=self._violations + len(complaints),
+            violations=counts[_VIOLATIONS] + len(complaints),
             complaints=complaints[:10],
             digest=digest,
             wall_s=wall_s,
