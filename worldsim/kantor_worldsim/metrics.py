@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.kernels import kernel
+from kantor_protocol.kernels import kernel, sum_kernel
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import ParticipantId, State
 from kantor_protocol.walk import Walk
@@ -159,12 +159,15 @@ class Tally(NamedTuple):
     """(N,) the least of all views."""
     true_left: npt.NDArray[np.int64]
     """(N,) first weight minus everybody's spending; negative where a sample was filled twice."""
+    holders: npt.NDArray[np.int64]
+    """(N,) how many views still hold weight there, the truth counted as one."""
 
 
 @kernel
 def _lower(tally: Tally, place: int, sample: int, left: int) -> None:
     """Put an entry into a view. A record that is not sound may let it rise."""
     before = tally.least[sample]
+    tally.holders[sample] += (left > 0) - (tally.views[place, sample] > 0)
     tally.views[place, sample] = left
     least = left
     if left > before:
@@ -185,6 +188,7 @@ def _ship(
     tally.shipped[_NOW] += cost
     tally.shipped_by[place] += cost
     tally.counts[_UNITS] += units
+    tally.holders[sample] -= 0 < tally.true_left[sample] <= units
     tally.true_left[sample] -= units
 
 
@@ -206,11 +210,12 @@ def _follow(
     views: np.ndarray,
     least: np.ndarray,
     true_left: np.ndarray,
+    holders: np.ndarray,
     samples_m: np.ndarray,
     whole: int,
 ) -> None:
     """Count one batch, see Reading and Tally. samples_m: (N, 2) as they are now."""
-    tally = Tally(counts, shipped, shipped_by, robots, xy_m, views, least, true_left)
+    tally = Tally(counts, shipped, shipped_by, robots, xy_m, views, least, true_left, holders)
     counts[_FINDS] = 0
     for row in range(sizes[of.VERDICTS]):
         counts[_DROPS if verdicts[row, of.DUE_NS] == DROPPED else _DELIVERIES] += 1
@@ -242,47 +247,62 @@ def _follow(
                 _ship(tally, samples_m, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS], whole)
 
 
+@sum_kernel
+def _weighed(units: np.ndarray, way_m: np.ndarray) -> float:
+    total = 0.0
+    for j in range(units.shape[0]):
+        total += units[j] * way_m[j]
+    return total
+
+
 @kernel
 def _pending(
     samples_m: np.ndarray,
     xy_m: np.ndarray,
     views: np.ndarray,
     common: np.ndarray,
-    true_left: np.ndarray,
+    true_rest: np.ndarray,
+    holders: np.ndarray,
+    shipped_by: np.ndarray,
     range_m: float,
     centralized: bool,
+    whole: int,
     way_m: np.ndarray,
     paper: np.ndarray,
     tight: np.ndarray,
     local: np.ndarray,
 ) -> None:
-    """The pending terms in units times metres: weight times the distance to a robot, over all samples.
+    """The pending terms: mass times the distance to a robot, over all samples. way_m: (N,) room.
 
-    way_m: (N,) room. For each robot in paper: by the common weights or its own view; in tight: by the
-    true rest; in local: by its own view, summed over the robots that are in its range (eq. 12).
+    For each robot in paper: by the common weights or its own view; in tight: by the true rest; in
+    local: eq. 12, what the robots in its range have shipped and their terms by its own view.
     """
     robots = xy_m.shape[0]
-    local[:] = 0.0
+    for k in range(robots):
+        local[k] = 0.0
+        for i in range(robots):
+            if _hears(xy_m, i, k, range_m):
+                local[k] += shipped_by[i]
     for i in range(robots):
         for j in range(samples_m.shape[0]):
-            dx = samples_m[j, 0] - xy_m[i, 0]
-            dy = samples_m[j, 1] - xy_m[i, 1]
-            way_m[j] = math.sqrt(dx * dx + dy * dy)
-        paper[i] = _weighed(common if centralized else views[i], way_m)
-        tight[i] = _weighed(true_left, way_m)
+            way_m[j] = 0.0
+            if holders[j] > 0:  # a root costs more than all else here
+                dx = samples_m[j, 0] - xy_m[i, 0]
+                dy = samples_m[j, 1] - xy_m[i, 1]
+                way_m[j] = math.sqrt(dx * dx + dy * dy)
+        paper[i] = _weighed(common if centralized else views[i], way_m) / whole
+        tight[i] = _weighed(true_rest, way_m) / whole
         for k in range(0 if centralized else robots):
             if k == i:
                 local[k] += paper[i]
-            elif math.hypot(xy_m[i, 0] - xy_m[k, 0], xy_m[i, 1] - xy_m[k, 1]) <= range_m:
-                local[k] += _weighed(views[k], way_m)
+            elif _hears(xy_m, i, k, range_m):
+                local[k] += _weighed(views[k], way_m) / whole
 
 
 @kernel
-def _weighed(units: np.ndarray, way_m: np.ndarray) -> float:
-    total = 0.0
-    for j in range(units.shape[0]):
-        total += max(units[j], 0) * way_m[j]
-    return total
+def _hears(xy_m: np.ndarray, i: int, k: int, range_m: float) -> bool:
+    """Whether i is in the range of k, as it is in its own."""
+    return i == k or math.hypot(xy_m[i, 0] - xy_m[k, 0], xy_m[i, 1] - xy_m[k, 1]) <= range_m
 
 
 class Metrics:
@@ -329,6 +349,7 @@ class Metrics:
             views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
             least=np.full(samples, self._units.sample, dtype=np.int64),
             true_left=np.full(samples, self._units.sample, dtype=np.int64),
+            holders=np.full(samples, len(names) + 1, dtype=np.int64),
         )
         self._tally.counts[_FIRST_CONTACT] = _NEVER
         self._tally.counts[_LEAST] = self._units.whole
@@ -377,18 +398,22 @@ class Metrics:
             tally.views,
             common,
             true_rest,
+            tally.holders,
+            tally.shipped_by,
             scenario.radio.range_m,
             scenario.centralized,
+            whole,
             self._way_m,
             *self._terms,
         )
-        paper, by_truth, _ = (self._terms / whole).tolist()
+        paper, by_truth, local = self._terms.tolist()
         pending = sum(paper)
         shipped, shipped_now = tally.shipped.tolist()
         tight = None
         if int(true_rest.sum()) == whole - counts[_UNITS]:
             tight = shipped + sum(term / robots for term in by_truth)
-        local = [] if scenario.centralized else self._local_bounds()
+        if scenario.centralized:
+            local = []
         self.rows.append(
             Row(
                 tick=self._tick,
@@ -407,16 +432,6 @@ class Metrics:
                 w_ub_local_max=max(local, default=None),
             )
         )
-
-    def _local_bounds(self) -> list[float]:
-        """Eq. 12 for every robot, with the pending terms of this row."""
-        range_m, xy_m = self._scenario.radio.range_m, self._tally.xy_m
-        pending = (self._terms[2] / self._units.whole).tolist()
-        bounds = []
-        for k in range(len(xy_m)):
-            near = np.hypot(*(xy_m - xy_m[k]).T) <= range_m
-            bounds.append(sum(self._tally.shipped_by[near].tolist()) + pending[k])
-        return bounds
 
     def glance(self) -> Glance:
         """How the run stands, by the last row."""
