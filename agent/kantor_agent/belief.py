@@ -8,7 +8,7 @@ import numpy.typing as npt
 from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
 from kantor_protocol.kernels import kernel
 from kantor_protocol.messages import News
-from kantor_protocol.packing import Pairs, pack_pairs
+from kantor_protocol.packing import pack_pairs
 from kantor_protocol.replica import NOBODY, Manner, Replica, Store, spend
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, Weights
@@ -126,7 +126,6 @@ class Belief:
             units=np.zeros(most, dtype=np.int64),
         )
         self._packed = np.zeros(20 * most, dtype=np.uint8)
-        self._pairs = Pairs()
         store, manner = replica.store, replica.manner
         self.to_choose: tuple[Any, ...] = (
             *self.grid,
@@ -191,5 +190,4 @@ class Belief:
 
     def lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""
-        index = self.replica.lowered()
-        return self._pairs.encode(index, self.weights[index], index.shape[0])
+        return self.replica.packed_lowered()

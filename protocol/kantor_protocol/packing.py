@@ -31,7 +31,7 @@ def put_int(out: np.ndarray, at: int, value: int) -> int:
 
 
 @kernel
-def take_uint(buffer: np.ndarray, at: int) -> tuple[int, int]:
+def take_uint(buffer: bytes | np.ndarray, at: int) -> tuple[int, int]:
     """Read a value below 2**63 from `at`: (value, position after it), or (0, MALFORMED)."""
     value = 0
     shift = 0
@@ -48,7 +48,7 @@ def take_uint(buffer: np.ndarray, at: int) -> tuple[int, int]:
 
 
 @kernel
-def take_int(buffer: np.ndarray, at: int) -> tuple[int, int]:
+def take_int(buffer: bytes | np.ndarray, at: int) -> tuple[int, int]:
     """Read a signed value; see `take_uint`."""
     folded, at = take_uint(buffer, at)
     if folded & 1:
@@ -69,7 +69,7 @@ def pack_pairs(index: np.ndarray, value: np.ndarray, count: int, out: np.ndarray
 
 
 @kernel
-def unpack_pairs(buffer: np.ndarray, bound: int, index: np.ndarray, value: np.ndarray) -> int:
+def unpack_pairs(buffer: bytes, bound: int, index: np.ndarray, value: np.ndarray) -> int:
     """Read pairs until the buffer ends; their count, or MALFORMED.
 
     Malformed is a cut number, an index outside [0, bound), or more pairs than `index` holds.
@@ -77,7 +77,7 @@ def unpack_pairs(buffer: np.ndarray, bound: int, index: np.ndarray, value: np.nd
     at = 0
     before = 0
     count = 0
-    while at < buffer.shape[0]:
+    while at < len(buffer):
         step, at = take_int(buffer, at)
         amount, at = take_uint(buffer, at)
         before += step
@@ -115,7 +115,7 @@ class Pairs:
         if len(packed) > 2 * self._index.shape[0]:  # a pair takes two bytes at least
             self._index = np.zeros(len(packed), dtype=np.int64)
             self._value = np.zeros(len(packed), dtype=np.int64)
-        count = unpack_pairs(np.frombuffer(packed, dtype=np.uint8), bound, self._index, self._value)
+        count = unpack_pairs(packed, bound, self._index, self._value)
         if count < 0:
             return None
         return self._index[:count], self._value[:count]

@@ -32,11 +32,12 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.kernels import kernel
-from kantor_protocol.packing import put_int, put_uint, take_int, take_uint
+from kantor_protocol.packing import Pairs, put_int, put_uint, take_int, take_uint
 from kantor_protocol.weights import Units, Weights
 
 NOBODY = -1
 _MALFORMED, _NO_ROOM, _LEARNT = 0, 1, 2
+_NO_ROOM_TO_PACK = -1
 _ENTRIES_MAX = 4096
 """Log entries in one message; the rest follows with the next."""
 _CLAIM_LEASE_STEPS = 12
@@ -54,7 +55,7 @@ LENGTH_MAX = 1 << 40
 # Rows of Store.claims.
 _SAMPLE, _SINCE, _STAMP, _HEARD = 0, 1, 2, 3
 # Slots of Store.counters.
-_LOWERED, _STEP = 0, 1
+_LOWERED, _STEP, _HOLDING = 0, 1, 2
 
 
 class Store(NamedTuple):
@@ -81,7 +82,7 @@ class Store(NamedTuple):
     mark: npt.NDArray[np.int32]
     """(N,) the step at which an index was put into `lowered`."""
     counters: npt.NDArray[np.int64]
-    """(2,): how many in `lowered`; step."""
+    """(3,): how many in `lowered`; step; how many weights are above 0."""
 
 
 class Manner(NamedTuple):
@@ -103,6 +104,7 @@ class Manner(NamedTuple):
 
 @kernel
 def _lower(store: Store, index: int, value: int) -> None:
+    store.counters[_HOLDING] -= value <= 0 < store.weights[index]
     store.weights[index] = value
     if store.mark[index] != store.counters[_STEP]:
         store.mark[index] = np.int32(store.counters[_STEP])
@@ -142,16 +144,16 @@ def _merge_entry(store: Store, manner: Manner, origin: int, index: int, value: i
 
 
 @kernel
-def _walk_logs(store: Store, manner: Manner, logs: np.ndarray, source: int, apply: bool) -> int:
+def _walk_logs(store: Store, manner: Manner, logs: bytes, source: int, apply: bool) -> int:
     """Read all suffixes; apply what is new, or only check. The position at the end or negative."""
     ledger = manner.ledger
     at = 0
-    while at < logs.shape[0]:
+    while at < len(logs):
         origin, at = take_uint(logs, at)
         start, at = take_uint(logs, at)
         span, at = take_uint(logs, at)
         count, at = take_uint(logs, at)
-        if at < 0 or origin >= store.length.shape[0] or count > span or count > logs.shape[0]:
+        if at < 0 or origin >= store.length.shape[0] or count > span or count > len(logs):
             return -1
         if start > LENGTH_MAX or span > LENGTH_MAX:
             return -1
@@ -174,9 +176,9 @@ def _walk_logs(store: Store, manner: Manner, logs: np.ndarray, source: int, appl
 
 
 @kernel
-def _walk_claims(store: Store, manner: Manner, claims: np.ndarray, apply: bool) -> int:
+def _walk_claims(store: Store, manner: Manner, claims: bytes, apply: bool) -> int:
     at = 0
-    while at < claims.shape[0]:
+    while at < len(claims):
         origin, at = take_uint(claims, at)
         stamp, at = take_uint(claims, at)
         sample, at = take_uint(claims, at)
@@ -192,7 +194,7 @@ def _walk_claims(store: Store, manner: Manner, claims: np.ndarray, apply: bool) 
 
 
 @kernel
-def _walk_have(store: Store, manner: Manner, have: np.ndarray, source: int, apply: bool) -> int:
+def _walk_have(store: Store, manner: Manner, have: bytes, source: int, apply: bool) -> int:
     origins = store.length.shape[0]
     at = 0
     for slot in range(2 * origins if manner.claims else origins):
@@ -201,7 +203,7 @@ def _walk_have(store: Store, manner: Manner, have: np.ndarray, source: int, appl
             return -1
         if apply:
             store.known[source, slot] = max(store.known[source, slot], held)
-    return at if at == have.shape[0] else -1
+    return at if at == len(have) else -1
 
 
 @kernel
@@ -225,9 +227,9 @@ def _learn(
     mark: np.ndarray,
     counters: np.ndarray,
     law: np.ndarray,
-    have: np.ndarray,
-    logs: np.ndarray,
-    registers: np.ndarray,
+    have: bytes,
+    logs: bytes,
+    registers: bytes,
     source: int,
 ) -> int:
     """Check a message whole, then apply it whole; no change when it is malformed or too long.
@@ -257,7 +259,7 @@ def _learn(
     longest = 0
     for origin in range(length.shape[0]):
         longest = max(longest, length[origin])
-    if (longest if manner.ledger else length[manner.me]) + logs.shape[0] // 2 > log_index.shape[1]:
+    if (longest if manner.ledger else length[manner.me]) + len(logs) // 2 > log_index.shape[1]:
         return _NO_ROOM
     _walk_have(store, manner, have, source, True)
     _walk_logs(store, manner, logs, source, True)
@@ -465,6 +467,23 @@ def claim(claims: np.ndarray, counters: np.ndarray, me: int, sample: int, now_ns
     claims[_STAMP, me] = counters[_STEP]
 
 
+@kernel
+def _pack_lowered(
+    weights: np.ndarray, lowered: np.ndarray, counters: np.ndarray, out: np.ndarray
+) -> int:
+    """Pairs (sample, units left) in the order in which they fell; the bytes used, or that they are too many."""
+    count = counters[_LOWERED]
+    if 20 * count > out.shape[0]:
+        return _NO_ROOM_TO_PACK
+    at = 0
+    before = 0
+    for i in range(count):
+        at = put_int(out, at, lowered[i] - before)
+        at = put_uint(out, at, weights[lowered[i]])
+        before = lowered[i]
+    return at
+
+
 class Replica:
     """What one participant holds of everybody's state, and what it tells others.
 
@@ -508,7 +527,7 @@ class Replica:
             claims=np.zeros((4, origins), dtype=np.int64),
             lowered=np.zeros(samples, dtype=np.int64),
             mark=np.zeros(samples, dtype=np.int32),
-            counters=np.array([0, 1], dtype=np.int64),
+            counters=np.array([0, 1, samples], dtype=np.int64),
         )
         self.store.sending[1:3] = -1 - self.manner.patience
         self.store.claims[_SAMPLE] = NOBODY
@@ -523,6 +542,11 @@ class Replica:
         """(N,) units left in this participant's view."""
         return self.store.weights
 
+    @property
+    def empty(self) -> bool:
+        """Whether no sample has weight left in this participant's view."""
+        return bool(self.store.counters[_HOLDING] == 0)
+
     def entries(self, origin: int) -> list[tuple[int, int]]:
         """The held log of an origin, as (sample, value); with min only the own log is held."""
         row, length = (origin if self.manner.ledger else 0), int(self.store.length[origin])
@@ -531,11 +555,10 @@ class Replica:
 
     def learn(self, source: int, have: bytes, logs: bytes, claims: bytes) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
-        parts = [np.frombuffer(part, dtype=np.uint8) for part in (have, logs, claims)]
-        outcome = _learn(*self._fields, *parts, source)
+        outcome = _learn(*self._fields, have, logs, claims, source)
         if outcome == _NO_ROOM:
             self.reserve(len(logs) // 2)
-            outcome = _learn(*self._fields, *parts, source)
+            outcome = _learn(*self._fields, have, logs, claims, source)
         return outcome == _LEARNT
 
     def reserve(self, entries: int) -> None:
@@ -568,16 +591,21 @@ class Replica:
     def compose(self, target: int = NOBODY) -> tuple[bytes, bytes, bytes]:
         """(have, logs, claims) for one message to everybody, or to one participant."""
         end_of_have, end_of_logs, end = _compose(*self._fields, self._out, self._room, target)
-        out = self._out
-        return (
-            out[:end_of_have].tobytes(),
-            out[end_of_have:end_of_logs].tobytes(),
-            out[end_of_logs:end].tobytes(),
-        )
+        told = self._out[:end].tobytes()
+        return told[:end_of_have], told[end_of_have:end_of_logs], told[end_of_logs:]
 
     def lowered(self) -> npt.NDArray[np.int64]:
         """Samples whose weight fell in this step, each once; a view valid until `end_step`."""
         return self.store.lowered[: self.store.counters[_LOWERED]]
+
+    def packed_lowered(self) -> bytes:
+        """Packed pairs (sample, units left) of what fell in this step."""
+        store = self.store
+        used = _pack_lowered(store.weights, store.lowered, store.counters, self._out)
+        if used == _NO_ROOM_TO_PACK:
+            index = self.lowered()
+            return Pairs().encode(index, store.weights[index], index.shape[0])
+        return self._out[:used].tobytes()
 
     def end_step(self) -> None:
         """Begin the next step."""
