@@ -11,6 +11,7 @@ import numpy.typing as npt
 from kantor_protocol.kernels import kernel
 
 MALFORMED = -1
+_SUM_MAX = 1 << 62
 
 
 @kernel
@@ -87,6 +88,22 @@ def unpack_pairs(buffer: bytes, bound: int, index: np.ndarray, value: np.ndarray
         value[count] = amount
         count += 1
     return count
+
+
+@kernel
+def sum_pairs(buffer: bytes, bound: int) -> int:
+    """The sum of all values, or MALFORMED, see `unpack_pairs`; also when it passes 2**62."""
+    at = 0
+    index = 0
+    total = 0
+    while at < len(buffer):
+        step, at = take_int(buffer, at)
+        amount, at = take_uint(buffer, at)
+        index += step
+        if at < 0 or index < 0 or index >= bound or amount > _SUM_MAX - total:
+            return MALFORMED
+        total += amount
+    return total
 
 
 class Pairs:
