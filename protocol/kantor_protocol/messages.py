@@ -185,7 +185,12 @@ def decode_news(body: bytes) -> News:
     """The body of an envelope. Raises RefusedError."""
     if len(body) > BODY_BYTES_MAX:
         raise RefusedError(f"body of {len(body)} bytes")
-    news: News = _checked(_NEWS, body)
+    try:
+        news: News = _NEWS.decode(body)
+    except _UNDECODABLE as error:
+        raise RefusedError(str(error)) from None
+    if news.version != VERSION:
+        raise RefusedError(f"version {news.version}, this is {VERSION}")
     if not (math.isfinite(news.x_m) and math.isfinite(news.y_m)) or news.step < 0:
         raise RefusedError("news without a finite place")
     return news
@@ -250,10 +255,13 @@ def check_outputs(outputs: Outputs) -> None:
             raise RefusedError("outputs with an oversized body")
 
 
+_UNDECODABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+
+
 def _decoded(decoder: msgspec.msgpack.Decoder[Any], payload: bytes) -> Any:
     try:
         return decoder.decode(payload)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except _UNDECODABLE as error:
         raise RefusedError(str(error)) from None
 
 

@@ -36,7 +36,7 @@ from kantor_protocol.packing import Pairs, put_int, put_uint, take_int, take_uin
 from kantor_protocol.weights import Units, Weights
 
 NOBODY = -1
-_MALFORMED, _NO_ROOM, _LEARNT = 0, 1, 2
+_LEARNT, _MALFORMED = 0, -1
 _NO_ROOM_TO_PACK = -1
 _ENTRIES_MAX = 4096
 """Log entries in one message; the rest follows with the next."""
@@ -145,9 +145,14 @@ def _merge_entry(store: Store, manner: Manner, origin: int, index: int, value: i
 
 @kernel
 def _walk_logs(store: Store, manner: Manner, logs: bytes, source: int, apply: bool) -> int:
-    """Read all suffixes; apply what is new, or only check. The position at the end or negative."""
+    """Read all suffixes; apply what is new, or only check.
+
+    Returns how many entries some log may then hold, or a negative number when malformed.
+    """
     ledger = manner.ledger
     at = 0
+    entries = 0
+    longest = 0
     while at < len(logs):
         origin, at = take_uint(logs, at)
         start, at = take_uint(logs, at)
@@ -160,6 +165,11 @@ def _walk_logs(store: Store, manner: Manner, logs: bytes, source: int, apply: bo
         if (ledger and count != span) or (not ledger and origin != source):
             return -1
         held = store.length[origin]
+        entries += count
+        if not ledger:
+            longest = store.length[manner.me] + entries
+        elif start <= held + entries:  # it may follow on another suffix in this message
+            longest = max(longest, start + span)
         fresh = apply and origin != manner.me and (not ledger or start <= held)
         index = 0
         for i in range(count):
@@ -172,7 +182,7 @@ def _walk_logs(store: Store, manner: Manner, logs: bytes, source: int, apply: bo
                 _merge_entry(store, manner, origin, index, value)
         if fresh and not ledger and start <= held:
             store.length[origin] = max(held, start + span)
-    return at
+    return longest
 
 
 @kernel
@@ -232,8 +242,9 @@ def _learn(
     registers: bytes,
     source: int,
 ) -> int:
-    """Check a message whole, then apply it whole; no change when it is malformed or too long.
+    """Check a message whole, then apply it whole.
 
+    Returns _LEARNT; or _MALFORMED or the length that logs must have room for, and nothing changed.
     Store and Manner come field by field, see `kernels`.
     """
     store = Store(
@@ -250,17 +261,15 @@ def _learn(
         counters,
     )
     manner = _manner(law)
+    longest = _walk_logs(store, manner, logs, source, False)
     if (
-        _walk_have(store, manner, have, source, False) < 0
-        or _walk_logs(store, manner, logs, source, False) < 0
+        longest < 0
+        or _walk_have(store, manner, have, source, False) < 0
         or _walk_claims(store, manner, registers, False) < 0
     ):
         return _MALFORMED
-    longest = 0
-    for origin in range(length.shape[0]):
-        longest = max(longest, length[origin])
-    if (longest if manner.ledger else length[manner.me]) + len(logs) // 2 > log_index.shape[1]:
-        return _NO_ROOM
+    if longest > log_index.shape[1]:
+        return longest
     _walk_have(store, manner, have, source, True)
     _walk_logs(store, manner, logs, source, True)
     if manner.claims:
@@ -556,21 +565,23 @@ class Replica:
     def learn(self, source: int, have: bytes, logs: bytes, claims: bytes) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
         outcome = _learn(*self._fields, have, logs, claims, source)
-        if outcome == _NO_ROOM:
-            self.reserve(len(logs) // 2)
+        if outcome > _LEARNT:
+            self._lengthen(outcome)
             outcome = _learn(*self._fields, have, logs, claims, source)
-        return outcome == _LEARNT
+        return bool(outcome == _LEARNT)
 
     def reserve(self, entries: int) -> None:
         """Make room for this many more entries in every log."""
         written = self.store.length if self.manner.ledger else self.store.length[self.manner.me]
-        needed = int(written.max()) + entries
-        capacity = self.store.log_index.shape[1]
+        self._lengthen(int(written.max()) + entries)
+
+    def _lengthen(self, needed: int) -> None:
+        """Make room for this many entries in every log."""
+        rows, capacity = self.store.log_index.shape
         if needed <= capacity:
             return
         while capacity < needed:
             capacity *= 2
-        rows = self.store.log_index.shape[0]
         grown = [np.zeros((rows, capacity), dtype=np.int32) for _ in range(2)]
         for new, old in zip(grown, (self.store.log_index, self.store.log_value), strict=True):
             new[:, : old.shape[1]] = old
