@@ -293,12 +293,11 @@ def _find_neighbours(store: Store, manner: Manner, target: int, out: np.ndarray)
 
 
 @kernel
-def _neighbours_lack(store: Store, neighbours: np.ndarray, slot: int) -> int:
+def _neighbours_lack(store: Store, neighbours: np.ndarray, origin: int, slot: int) -> int:
     """The least that any of them is known to hold in a slot of `known`; -1 if there is none.
 
     The origin of the slot itself does not count: it holds its own state.
     """
-    origin = slot % store.length.shape[0]
     least = -1
     for other in neighbours:
         if other != origin:
@@ -314,7 +313,7 @@ def _start_of_suffix(
     """First entry to send of an origin's log; its length when nothing is to be sent."""
     me, relay, patience = manner.me, manner.relay, manner.patience
     length = store.length[origin]
-    least = _neighbours_lack(store, neighbours, origin)
+    least = _neighbours_lack(store, neighbours, origin, origin)
     if least < 0 and target < 0 and manner.beacon:
         return 0
     if least < 0:
@@ -373,7 +372,7 @@ def _put_claims(
         ):
             continue
         if origin != me:
-            least = _neighbours_lack(store, neighbours, origins + origin)
+            least = _neighbours_lack(store, neighbours, origin, origins + origin)
             slack = 0 if relay else _CLAIM_RENEWAL_STEPS
             if least < 0 or least + slack >= stamp:
                 continue

@@ -33,7 +33,8 @@ _COMPLAINTS_MAX = 100
 _UNHEARD, _NEVER_SENT, _FOR_ANOTHER, _TOO_FAR = 0, 1, 2, 3
 _STEP, _SPEED, _GARBLED_SPENT, _POINT, _BUDGET, _MISCOUNT = 4, 5, 6, 7, 8, 9
 _GARBLED_LOWERED, _RISE, _BELOW, _UNREADABLE, _LOG = 10, 11, 12, 13, 14
-_NO_ROOM = -1
+_NO_LOGS, _NO_POSTED, _NO_FLIGHTS = -1, -2, -3
+_GROWING = {_NO_LOGS: "logs", _NO_POSTED: "posted", _NO_FLIGHTS: "flights"}
 
 _WORDS = {
     _UNHEARD: ("delivery", "heard {message}, which was not delivered"),
@@ -113,17 +114,17 @@ def _note(
 
 
 @kernel
-def _has_room(state: State, sizes: np.ndarray) -> bool:
-    """Whether a batch of these sizes fits behind what is held of anybody."""
+def _lacking(state: State, sizes: np.ndarray) -> int:
+    """Which array has no room for a batch of these sizes behind what is held of anybody, or 0."""
     for who in range(state.book.shape[0]):
         book = state.book[who]
-        if (
-            book[_ENTRIES] + sizes[of.PAIRS] > state.logs.shape[1]
-            or book[_POSTED] + sizes[of.ALL_SENT] > state.posted.shape[1]
-            or book[_FLYING] + sizes[of.VERDICTS] > state.flights.shape[1]
-        ):
-            return False
-    return True
+        if book[_ENTRIES] + sizes[of.PAIRS] > state.logs.shape[1]:
+            return _NO_LOGS
+        if book[_POSTED] + sizes[of.ALL_SENT] > state.posted.shape[1]:
+            return _NO_POSTED
+        if book[_FLYING] + sizes[of.VERDICTS] > state.flights.shape[1]:
+            return _NO_FLIGHTS
+    return 0
 
 
 @kernel
@@ -356,7 +357,7 @@ def _check(
     supervisor_range_m: float,
     now_ns: int,
 ) -> int:
-    """Follow one batch; how many faults it has, or _NO_ROOM and nothing has changed."""
+    """Follow one batch; how many faults it has, or which array has no room, and nothing has changed."""
     reading = Reading(payload, sizes, acts, ruled_m, heard, sent, verdicts, pairs)
     state = State(
         book,
@@ -381,8 +382,9 @@ def _check(
         range_m,
         supervisor_range_m,
     )
-    if not _has_room(state, sizes):
-        return _NO_ROOM
+    lacking = _lacking(state, sizes)
+    if lacking < 0:
+        return lacking
     found[0] = 0
     for row in range(sizes[of.ACTS]):
         if acts[row, of.PLACE] >= 0:
@@ -500,8 +502,8 @@ class Checker:
         self._now_ns = batch.now_ns
         reading = self._reader.read(batch)
         faults = _check(*reading, *self._arguments, batch.now_ns)
-        while faults == _NO_ROOM:
-            self._make_room()
+        while faults < 0:
+            self._lengthen(_GROWING[faults])
             faults = _check(*reading, *self._arguments, batch.now_ns)
         if faults:
             self._put_into_words(batch, faults)
@@ -511,18 +513,11 @@ class Checker:
             elif act.outputs is not None and act.ruling is not None:
                 self._check_act(act)
 
-    def _make_room(self) -> None:
-        """Double what grows with the run."""
-        state = self._state
-        grown = {
-            name: np.concatenate((rows, np.zeros_like(rows)), axis=1)
-            for name, rows in (
-                ("logs", state.logs),
-                ("posted", state.posted),
-                ("flights", state.flights),
-            )
-        }
-        self._state = state._replace(**grown)
+    def _lengthen(self, name: str) -> None:
+        """Double one of the arrays that grow with the run."""
+        rows = getattr(self._state, name)
+        longer = np.concatenate((rows, np.zeros_like(rows)), axis=1)
+        self._state = self._state._replace(**{name: longer})
         self._arguments = (*self._state, *self._law)
 
     def _put_into_words(self, batch: Batch, faults: int) -> None:

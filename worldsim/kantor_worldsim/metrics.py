@@ -38,6 +38,9 @@ from kantor_worldsim.records import Batch, Ending, Opening, Record
 _PAIRS_PER_ROW = 200_000
 """Robot-sample distances that one row of metrics may cost when the period is chosen by size."""
 
+_BLOCK = 1024
+"""Samples that a row of metrics takes at a time."""
+
 
 class Row(NamedTuple):
     """One row of metrics.csv."""
@@ -147,10 +150,10 @@ class Tally(NamedTuple):
     deliveries, drops, step of the first contact or _NEVER, units in `least`, finds in this batch."""
     shipped: npt.NDArray[np.float64]
     """(2,) mass times metres: since the start, in this tick."""
+    standing: npt.NDArray[np.int64]
+    """(n, 3): refused messages; whether it rests; step in which it saw no weight left, or _NEVER."""
     shipped_by: npt.NDArray[np.float64]
     """(m,) since the start."""
-    robots: npt.NDArray[np.int64]
-    """(n, 3): refused messages; whether it rests; step in which it saw no weight left, or _NEVER."""
     xy_m: npt.NDArray[np.float64]
     """(m, 2) where robots are, world frame."""
     views: npt.NDArray[np.int64]
@@ -204,8 +207,8 @@ def _follow(
     pairs: np.ndarray,
     counts: np.ndarray,
     shipped: np.ndarray,
+    standing: np.ndarray,
     shipped_by: np.ndarray,
-    robots: np.ndarray,
     xy_m: np.ndarray,
     views: np.ndarray,
     least: np.ndarray,
@@ -215,7 +218,7 @@ def _follow(
     whole: int,
 ) -> None:
     """Count one batch, see Reading and Tally. samples_m: (N, 2) as they are now."""
-    tally = Tally(counts, shipped, shipped_by, robots, xy_m, views, least, true_left, holders)
+    tally = Tally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left, holders)
     counts[_FINDS] = 0
     for row in range(sizes[of.VERDICTS]):
         counts[_DROPS if verdicts[row, of.DUE_NS] == DROPPED else _DELIVERIES] += 1
@@ -225,7 +228,7 @@ def _follow(
         if place < 0 or not act[of.PRESENT]:
             continue
         counts[_VIOLATIONS] += act[of.VIOLATIONS]
-        robots[place, 0] = act[of.REFUSED]
+        standing[place, 0] = act[of.REFUSED]
         for i in range(act[of.LOWERED], act[of.LOWERED] + max(0, act[of.LOWERED_COUNT])):
             _lower(tally, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS])
         if place >= xy_m.shape[0]:  # the supervisor
@@ -238,9 +241,9 @@ def _follow(
         if act[of.HEARD_COUNT] > 0 and counts[_FIRST_CONTACT] == _NEVER:
             counts[_FIRST_CONTACT] = act[of.STEP]
         if act[of.STATE] != State.EXPLORING.value:
-            robots[place, 1] = 1
-        if act[of.STATE] == State.FINISHED.value and robots[place, 2] == _NEVER:
-            robots[place, 2] = act[of.STEP]
+            standing[place, 1] = 1
+        if act[of.STATE] == State.FINISHED.value and standing[place, 2] == _NEVER:
+            standing[place, 2] = act[of.STEP]
         if act[of.SPENT_COUNT] > 0 and not act[of.VOID]:
             counts[_ENERGY] += 1
             for i in range(act[of.SPENT], act[of.SPENT] + act[of.SPENT_COUNT]):
@@ -256,47 +259,71 @@ def _weighed(units: np.ndarray, way_m: np.ndarray) -> float:
 
 
 @kernel
-def _pending(
-    samples_m: np.ndarray,
+def _measure(
+    samples_m: np.ndarray, holders: np.ndarray, x_m: float, y_m: float, way_m: np.ndarray
+) -> None:
+    """Distances from a place to the samples that anybody still holds weight on; 0 to the others."""
+    for j in range(samples_m.shape[0]):
+        way_m[j] = 0.0
+        if holders[j] > 0:  # a root costs more than all else in a row of metrics
+            dx = samples_m[j, 0] - x_m
+            dy = samples_m[j, 1] - y_m
+            way_m[j] = math.sqrt(dx * dx + dy * dy)
+
+
+@kernel
+def _sum_up(
+    shipped_by: np.ndarray,
     xy_m: np.ndarray,
     views: np.ndarray,
-    common: np.ndarray,
-    true_rest: np.ndarray,
+    least: np.ndarray,
+    true_left: np.ndarray,
     holders: np.ndarray,
-    shipped_by: np.ndarray,
+    samples_m: np.ndarray,
+    whole: int,
     range_m: float,
     centralized: bool,
-    whole: int,
+    ledger: bool,
     way_m: np.ndarray,
+    true_rest: np.ndarray,
     paper: np.ndarray,
     tight: np.ndarray,
     local: np.ndarray,
-) -> None:
-    """The pending terms: mass times the distance to a robot, over all samples. way_m: (N,) room.
+) -> int:
+    """The pending terms, mass times the distance to a robot, over all samples; the true rest in units.
 
     For each robot in paper: by the common weights or its own view; in tight: by the true rest; in
     local: eq. 12, what the robots in its range have shipped and their terms by its own view.
+    way_m, true_rest: room for one block of samples, which stays in the cache while all robots and
+    views meet in it.
     """
     robots = xy_m.shape[0]
+    rest = 0
+    paper[:] = 0.0
+    tight[:] = 0.0
+    local[:] = 0.0
     for k in range(robots):
-        local[k] = 0.0
         for i in range(robots):
             if _hears(xy_m, i, k, range_m):
                 local[k] += shipped_by[i]
-    for i in range(robots):
-        for j in range(samples_m.shape[0]):
-            way_m[j] = 0.0
-            if holders[j] > 0:  # a root costs more than all else here
-                dx = samples_m[j, 0] - xy_m[i, 0]
-                dy = samples_m[j, 1] - xy_m[i, 1]
-                way_m[j] = math.sqrt(dx * dx + dy * dy)
-        paper[i] = _weighed(common if centralized else views[i], way_m) / whole
-        tight[i] = _weighed(true_rest, way_m) / whole
-        for k in range(0 if centralized else robots):
-            if k == i:
-                local[k] += paper[i]
-            elif _hears(xy_m, i, k, range_m):
-                local[k] += _weighed(views[k], way_m) / whole
+    for first in range(0, samples_m.shape[0], way_m.shape[0]):
+        last = min(first + way_m.shape[0], samples_m.shape[0])
+        for j in range(first, last):
+            true_rest[j - first] = max(true_left[j], 0)
+            rest += true_rest[j - first]
+        common = true_rest if ledger else least[first:last]
+        for i in range(robots):
+            way = way_m[: last - first]
+            _measure(samples_m[first:last], holders[first:last], xy_m[i, 0], xy_m[i, 1], way)
+            own = _weighed(views[i, first:last], way) / whole
+            tight[i] += _weighed(true_rest[: last - first], way) / whole
+            paper[i] += _weighed(common[: last - first], way) / whole if centralized else own
+            for k in range(0 if centralized else robots):
+                if k == i:
+                    local[k] += own
+                elif _hears(xy_m, i, k, range_m):
+                    local[k] += _weighed(views[k, first:last], way) / whole
+    return rest
 
 
 @kernel
@@ -343,8 +370,8 @@ class Metrics:
         self._tally = Tally(
             counts=np.zeros(11, dtype=np.int64),
             shipped=np.zeros(2),
+            standing=np.zeros((len(names), 3), dtype=np.int64),
             shipped_by=np.zeros(robots),
-            robots=np.zeros((len(names), 3), dtype=np.int64),
             xy_m=site.starts_m.copy(),
             views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
             least=np.full(samples, self._units.sample, dtype=np.int64),
@@ -353,10 +380,20 @@ class Metrics:
         )
         self._tally.counts[_FIRST_CONTACT] = _NEVER
         self._tally.counts[_LEAST] = self._units.whole
-        self._tally.robots[:, 2] = _NEVER
+        self._tally.standing[:, 2] = _NEVER
         self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
-        self._way_m = np.zeros(samples)
         self._terms = np.zeros((3, robots))
+        self._to_sum_up = (
+            *self._tally[3:],
+            self._walk.xy_m,
+            self._units.whole,
+            scenario.radio.range_m,
+            scenario.centralized,
+            scenario.merge == "ledger",
+            np.zeros(_BLOCK),
+            np.zeros(_BLOCK, dtype=np.int64),
+            *self._terms,
+        )
         size = samples * robots // _PAIRS_PER_ROW
         self._every = scenario.metrics.every or max(1, size)
         self._out_of_range = self._absences = 0
@@ -388,29 +425,14 @@ class Metrics:
     def _row(self) -> None:
         tally, scenario, whole = self._tally, self._scenario, self._units.whole
         counts, robots = tally.counts.tolist(), len(tally.xy_m)
-        true_rest = np.maximum(tally.true_left, 0)
+        true_rest = _sum_up(*self._to_sum_up)
         # The common view: everybody's minimum, or with a ledger the truth.
-        common = true_rest if scenario.merge == "ledger" else tally.least
-        left = int(true_rest.sum()) if scenario.merge == "ledger" else counts[_LEAST]
-        _pending(
-            self._walk.xy_m,
-            tally.xy_m,
-            tally.views,
-            common,
-            true_rest,
-            tally.holders,
-            tally.shipped_by,
-            scenario.radio.range_m,
-            scenario.centralized,
-            whole,
-            self._way_m,
-            *self._terms,
-        )
+        left = true_rest if scenario.merge == "ledger" else counts[_LEAST]
         paper, by_truth, local = self._terms.tolist()
         pending = sum(paper)
         shipped, shipped_now = tally.shipped.tolist()
         tight = None
-        if int(true_rest.sum()) == whole - counts[_UNITS]:
+        if true_rest == whole - counts[_UNITS]:
             tight = shipped + sum(term / robots for term in by_truth)
         if scenario.centralized:
             local = []
@@ -449,7 +471,7 @@ class Metrics:
             w_ub=last.w_ub_paper,
             links=last.links,
             messages_per_s=rate,
-            robots_done=int(self._tally.robots[:, 1].sum()),
+            robots_done=int(self._tally.standing[:, 1].sum()),
             mass_left=last.mass_left,
         )
 
@@ -466,7 +488,7 @@ class Metrics:
         """The summary; call it after the last record. complaints: the checker's."""
         scenario, last = self._scenario, self.rows[-1]
         counts, robots = self._tally.counts.tolist(), scenario.robots.count
-        finished = self._tally.robots[:robots, 2].tolist()
+        finished = self._tally.standing[:robots, 2].tolist()
         steps = max(1, counts[_STEPS])
         assert self._opening is not None
         return Result(
@@ -497,7 +519,7 @@ class Metrics:
             deliveries=counts[_DELIVERIES],
             drops=counts[_DROPS],
             out_of_range_refused=self._out_of_range,
-            messages_refused=int(self._tally.robots[:, 0].sum()) + refused_at_door,
+            messages_refused=int(self._tally.standing[:, 0].sum()) + refused_at_door,
             absences=self._absences,
             ended=self._ending.reason,
             record=record,
