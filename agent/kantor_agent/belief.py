@@ -9,7 +9,7 @@ from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_e
 from kantor_protocol.kernels import kernel
 from kantor_protocol.messages import News
 from kantor_protocol.packing import pack_pairs
-from kantor_protocol.replica import NOBODY, Manner, Replica, Store, spend
+from kantor_protocol.replica import LOWERED, NOBODY, Manner, Replica, Store, spend
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, Weights
 
@@ -105,6 +105,25 @@ def _ship_packed(
     return used
 
 
+@kernel
+def _drop_empty(
+    xy_m: np.ndarray,
+    order: np.ndarray,
+    slot: np.ndarray,
+    cell: np.ndarray,
+    first: np.ndarray,
+    alive: np.ndarray,
+    frame: np.ndarray,
+    levels: int,
+    weights: np.ndarray,
+    lowered: np.ndarray,
+    counters: np.ndarray,
+) -> None:
+    """Take the samples that this step has emptied out of the grid."""
+    grid = Grid(xy_m, order, slot, cell, first, alive, frame, levels)
+    remove_empty(grid, weights, lowered[: counters[LOWERED]])
+
+
 class Belief:
     """The replica of everybody's spending, with the samples in space.
 
@@ -136,6 +155,7 @@ class Belief:
             manner.me if manner.claims else NOBODY,
         )
         """Grid, weights and claims as arguments of a planner's kernel; see `kernels.kernel`."""
+        self._to_drop = (*self.grid, store.weights, store.lowered, store.counters)
         self._store = replica.store
         self._to_ship = self._arguments()
 
@@ -164,9 +184,7 @@ class Belief:
         if self._walk.advance(now_ns):
             build(self.grid, self.weights)
             return
-        lowered = self.replica.lowered()
-        if lowered.size:
-            remove_empty(self.grid, self.weights, lowered)
+        _drop_empty(*self._to_drop)
 
     def spend(self, x_m: float, y_m: float) -> bytes:
         """Ship one robot point from here (Prop. 1); packed pairs (sample, units), nearest first."""

@@ -55,7 +55,7 @@ LENGTH_MAX = 1 << 40
 # Rows of Store.claims.
 _SAMPLE, _SINCE, _STAMP, _HEARD = 0, 1, 2, 3
 # Slots of Store.counters.
-_LOWERED, _STEP, _HOLDING = 0, 1, 2
+LOWERED, _STEP, _HOLDING = 0, 1, 2
 
 
 class Store(NamedTuple):
@@ -108,8 +108,8 @@ def _lower(store: Store, index: int, value: int) -> None:
     store.weights[index] = value
     if store.mark[index] != store.counters[_STEP]:
         store.mark[index] = np.int32(store.counters[_STEP])
-        store.lowered[store.counters[_LOWERED]] = index
-        store.counters[_LOWERED] += 1
+        store.lowered[store.counters[LOWERED]] = index
+        store.counters[LOWERED] += 1
 
 
 @kernel
@@ -204,16 +204,26 @@ def _walk_claims(store: Store, manner: Manner, claims: bytes, apply: bool) -> in
 
 
 @kernel
-def _walk_have(store: Store, manner: Manner, have: bytes, source: int, apply: bool) -> int:
-    origins = store.length.shape[0]
+def _is_vector(store: Store, manner: Manner, have: bytes) -> bool:
+    """Whether these are as many numbers as a version vector has, told by their last bytes."""
+    numbers = 0
+    length = 0
+    for i in range(len(have)):
+        length += 1
+        if have[i] < 128:
+            numbers += 1
+            length = 0
+        elif length >= 9:  # see `take_uint`
+            return False
+    return length == 0 and numbers == store.length.shape[0] * (2 if manner.claims else 1)
+
+
+@kernel
+def _apply_have(store: Store, manner: Manner, have: bytes, source: int) -> None:
     at = 0
-    for slot in range(2 * origins if manner.claims else origins):
+    for slot in range(store.length.shape[0] * (2 if manner.claims else 1)):
         held, at = take_uint(have, at)
-        if at < 0:
-            return -1
-        if apply:
-            store.known[source, slot] = max(store.known[source, slot], held)
-    return at if at == len(have) else -1
+        store.known[source, slot] = max(store.known[source, slot], held)
 
 
 @kernel
@@ -264,13 +274,13 @@ def _learn(
     longest = _walk_logs(store, manner, logs, source, False)
     if (
         longest < 0
-        or _walk_have(store, manner, have, source, False) < 0
+        or not _is_vector(store, manner, have)
         or _walk_claims(store, manner, registers, False) < 0
     ):
         return _MALFORMED
     if longest > log_index.shape[1]:
         return longest
-    _walk_have(store, manner, have, source, True)
+    _apply_have(store, manner, have, source)
     _walk_logs(store, manner, logs, source, True)
     if manner.claims:
         _walk_claims(store, manner, registers, True)
@@ -480,7 +490,7 @@ def _pack_lowered(
     weights: np.ndarray, lowered: np.ndarray, counters: np.ndarray, out: np.ndarray
 ) -> int:
     """Pairs (sample, units left) in the order in which they fell; the bytes used, or that they are too many."""
-    count = counters[_LOWERED]
+    count = counters[LOWERED]
     if 20 * count > out.shape[0]:
         return _NO_ROOM_TO_PACK
     at = 0
@@ -606,7 +616,7 @@ class Replica:
 
     def lowered(self) -> npt.NDArray[np.int64]:
         """Samples whose weight fell in this step, each once; a view valid until `end_step`."""
-        return self.store.lowered[: self.store.counters[_LOWERED]]
+        return self.store.lowered[: self.store.counters[LOWERED]]
 
     def packed_lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""
@@ -619,7 +629,7 @@ class Replica:
 
     def end_step(self) -> None:
         """Begin the next step."""
-        self.store.counters[_LOWERED] = 0
+        self.store.counters[LOWERED] = 0
         self.store.counters[_STEP] += 1
 
 

@@ -27,7 +27,7 @@ _SENT = struct.Struct("=qqqq")
 _ARRIVAL = itemgetter(0, 1, 2)
 
 
-class Verdict(msgspec.Struct, frozen=True, array_like=True):
+class Verdict(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What the channel decided on one copy of an envelope for one receiver within range."""
 
     source: ParticipantId

@@ -90,7 +90,7 @@ class Journal:
         """Write one record. payload: the record encoded, if somebody has done so already."""
         payload = payload or encode_record(record)
         self.digest.add(payload)
-        if isinstance(record, Batch | Ending):
+        if isinstance(record, (Batch, Ending)):
             self._time_ns = record.now_ns
         self._write(RECORD_TOPIC, payload)
 

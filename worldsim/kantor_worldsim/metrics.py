@@ -32,7 +32,7 @@ from kantor_protocol.machine import ParticipantId, State
 from kantor_protocol.walk import Walk
 from kantor_worldsim import reading as of
 from kantor_worldsim.channel import DROPPED, links
-from kantor_worldsim.reading import Reader, Reading
+from kantor_worldsim.reading import Reader
 from kantor_worldsim.records import Batch, Ending, Opening, Record
 
 _PAIRS_PER_ROW = 200_000
@@ -137,7 +137,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
 # Slots of Tally.counts and Tally.shipped.
 _VIOLATIONS, _STEPS, _BYTES_WEIGHTS, _BYTES_TOTAL, _ENERGY, _UNITS = 0, 1, 2, 3, 4, 5
-_DELIVERIES, _DROPS, _FIRST_CONTACT, _LEAST, _FINDS = 6, 7, 8, 9, 10
+_DELIVERIES, _DROPS, _FIRST_CONTACT, _LEAST = 6, 7, 8, 9
 _EVER, _NOW = 0, 1
 _NEVER = -1
 
@@ -146,8 +146,8 @@ class Tally(NamedTuple):
     """What is counted batch by batch. n participants, of them m robots; N samples."""
 
     counts: npt.NDArray[np.int64]
-    """(11,): violations, robot-steps, bytes on weights keys and in all, points and units shipped,
-    deliveries, drops, step of the first contact or _NEVER, units in `least`, finds in this batch."""
+    """(10,): violations, robot-steps, bytes on weights keys and in all, points and units shipped,
+    deliveries, drops, step of the first contact or _NEVER, units in `least`."""
     shipped: npt.NDArray[np.float64]
     """(2,) mass times metres: since the start, in this tick."""
     standing: npt.NDArray[np.int64]
@@ -216,10 +216,13 @@ def _follow(
     holders: np.ndarray,
     samples_m: np.ndarray,
     whole: int,
-) -> None:
-    """Count one batch, see Reading and Tally. samples_m: (N, 2) as they are now."""
+) -> int:
+    """Count one batch, see Reading and Tally; how many targets were found in it.
+
+    samples_m: (N, 2) as they are now.
+    """
     tally = Tally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left, holders)
-    counts[_FINDS] = 0
+    finds = 0
     for row in range(sizes[of.VERDICTS]):
         counts[_DROPS if verdicts[row, of.DUE_NS] == DROPPED else _DELIVERIES] += 1
     for row in range(sizes[of.ACTS]):
@@ -237,7 +240,7 @@ def _follow(
         counts[_STEPS] += 1
         counts[_BYTES_WEIGHTS] += act[of.WEIGHTS_BYTES]
         counts[_BYTES_TOTAL] += act[of.WEIGHTS_BYTES] + act[of.BODY_BYTES]
-        counts[_FINDS] += act[of.FINDS]
+        finds += act[of.FINDS]
         if act[of.HEARD_COUNT] > 0 and counts[_FIRST_CONTACT] == _NEVER:
             counts[_FIRST_CONTACT] = act[of.STEP]
         if act[of.STATE] != State.EXPLORING.value:
@@ -248,6 +251,7 @@ def _follow(
             counts[_ENERGY] += 1
             for i in range(act[of.SPENT], act[of.SPENT] + act[of.SPENT_COUNT]):
                 _ship(tally, samples_m, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS], whole)
+    return finds
 
 
 @sum_kernel
@@ -348,7 +352,7 @@ class Metrics:
         if isinstance(record, Opening):
             self._open(record)
         elif isinstance(record, Batch):
-            self._follow(record, self._reader.read(record))
+            self._follow(record)
         elif isinstance(record, Ending):
             self._ending = record
             self._row()
@@ -368,7 +372,7 @@ class Metrics:
         names, samples, robots = scenario.roster, site.samples_m.shape[0], scenario.robots.count
         self._targets = site.targets_m.shape[0]
         self._tally = Tally(
-            counts=np.zeros(11, dtype=np.int64),
+            counts=np.zeros(10, dtype=np.int64),
             shipped=np.zeros(2),
             standing=np.zeros((len(names), 3), dtype=np.int64),
             shipped_by=np.zeros(robots),
@@ -403,7 +407,7 @@ class Metrics:
             self.finds += [(0.0, name, target, x, y) for target, x, y in found]
         self._row()
 
-    def _follow(self, batch: Batch, reading: Reading) -> None:
+    def _follow(self, batch: Batch) -> None:
         tick = batch.now_ns // self._period_ns
         if tick != self._tick:
             if self._tick and self._tick % self._every == 0:
@@ -412,8 +416,7 @@ class Metrics:
         self._walk.advance(batch.now_ns)
         self._out_of_range += batch.out_of_range
         self._absences += len(batch.absent)
-        _follow(*reading, *self._arguments)
-        if self._tally.counts[_FINDS]:
+        if _follow(*self._reader.read(batch), *self._arguments):
             self._note_finds(batch)
 
     def _note_finds(self, batch: Batch) -> None:

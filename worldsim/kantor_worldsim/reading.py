@@ -7,7 +7,7 @@ Whoever needs a text (a complaint, a name) still has the record itself.
 The kernels here are total: whatever the bytes, they stay inside them.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -415,21 +415,24 @@ class Reader:
         self._record: Record | None = None
         self._make_room(1 << 12)
 
-    def read(self, record: Record) -> Reading:
-        """The record's bytes and, of a batch, its tables. The first record must be an opening."""
+    def read(self, record: Record) -> tuple[Any, ...]:
+        """The record's bytes and, of a batch, its tables: a Reading as arguments of a kernel.
+
+        The first record must be an opening.
+        """
         if record is self._record:
             return self._reading
         payload = encode_record(record)
-        if isinstance(record, Opening):
+        if isinstance(record, Batch):
+            if len(payload) > self._bytes:
+                self._make_room(2 * len(payload))
+            at = _read_batch(payload, *self._tables, self._pose_bits, *self._bounds)
+            assert at > 0, "what msgspec has encoded can be read"
+        elif isinstance(record, Opening):
             scenario = record.scenario
             supervisor = scenario.robots.count if scenario.centralized else STRANGER
             self._bounds = (scenario.robots.count, supervisor, record.samples_m.shape[0])
-        if len(payload) > self._bytes:
-            self._make_room(2 * len(payload))
-        self._reading = Reading(payload, *self._tables)
-        if isinstance(record, Batch):
-            at = _read_batch(payload, *self._tables, self._pose_bits, *self._bounds)
-            assert at > 0, "what msgspec has encoded can be read"
+        self._reading = (payload, *self._tables)
         self._record = record
         return self._reading
 

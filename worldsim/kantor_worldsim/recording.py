@@ -75,7 +75,7 @@ class Recording:
 
     def take(self, record: Record) -> None:
         """Follow one record."""
-        self.journal.take(record, self._reader.read(record).payload)
+        self.journal.take(record, self._reader.read(record)[0])
         self.metrics.take(record)
         self.checker.take(record)
         for row in self.metrics.rows[self._rows :]:

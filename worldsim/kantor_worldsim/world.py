@@ -41,7 +41,7 @@ class Site(NamedTuple):
         )
 
 
-class Ruling(msgspec.Struct, frozen=True, array_like=True):
+class Ruling(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What the world made of a participant's step."""
 
     pose: Pose
