@@ -122,6 +122,7 @@ class WeightsSubscriber:
         self.weights: Weights | None = None
         """None until the first keyframe, and again after a gap until the next one."""
         self._sequence = 0
+        self._pairs = Pairs()
         self._decoder = msgspec.msgpack.Decoder(WeightsMessage)
 
     def take(self, payload: bytes) -> bool:
@@ -141,10 +142,17 @@ class WeightsSubscriber:
             self.weights is None
             or message.base != self._sequence
             or message.size != self.weights.shape[0]
-        ) or not _apply(self.weights, message.content):
+        ) or not self._apply(self.weights, message.content):
             self.weights = None
             return False
         self._sequence = message.sequence
+        return True
+
+    def _apply(self, weights: Weights, content: bytes) -> bool:
+        pairs = self._pairs.decode(content, weights.shape[0])
+        if pairs is None or bool(np.any(pairs[1] > weights[pairs[0]])):
+            return False
+        weights[pairs[0]] = pairs[1]
         return True
 
 
@@ -164,11 +172,3 @@ def _from_keyframe(content: bytes, size: int) -> Weights | None:
         if len(raw) == size * kind.itemsize:
             return np.frombuffer(raw, dtype=kind).astype(np.int64)
     return None
-
-
-def _apply(weights: Weights, content: bytes) -> bool:
-    pairs = Pairs().decode(content, weights.shape[0])
-    if pairs is None or bool(np.any(pairs[1] > weights[pairs[0]])):
-        return False
-    weights[pairs[0]] = pairs[1]
-    return True

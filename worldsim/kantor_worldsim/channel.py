@@ -178,18 +178,18 @@ class Channel:
         self._xy_m[row, 0] = pose.x_m
         self._xy_m[row, 1] = pose.y_m
 
-    def transmit(self, sent: Sequence[Sent]) -> tuple[tuple[Verdict, ...], int]:
+    def transmit(self, sent: Sequence[Sent]) -> tuple[list[Verdict], int]:
         """Rule on envelopes by the poses as they are now; also how many receivers were too far.
 
         Deliveries wait in the channel until `take`.
         """
         if not sent:
-            return (), 0
+            return [], 0
         self._make_room(len(sent))
         for i, (now_ns, envelope) in enumerate(sent):
             target = self._targets.get(envelope.target, len(self._roster))
             source, sequence = self._places[envelope.source], envelope.sequence
-            _SENT.pack_into(self._sent, _SENT.size * i, now_ns, source, sequence, target)
+            _SENT.pack_into(self._sent.data, _SENT.size * i, now_ns, source, sequence, target)
         count, out_of_range = _transmit(
             *self._law, self._xy_m, self._sent, len(sent), self._supervisor, self._ruled
         )
@@ -200,7 +200,7 @@ class Channel:
             verdicts.append(Verdict(source, sequence, target, due_ns))
             if due_ns != DROPPED:
                 self._under_way[target].append((due_ns, self._places[source], sequence, envelope))
-        return tuple(verdicts), out_of_range
+        return verdicts, out_of_range
 
     def take(self, name: ParticipantId, now_ns: int) -> tuple[Envelope, ...]:
         """What has arrived at a participant by now, in order of (arrival, source, sequence)."""

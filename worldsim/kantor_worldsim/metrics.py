@@ -315,14 +315,17 @@ def _sum_up(
         for j in range(first, last):
             true_rest[j - first] = max(true_left[j], 0)
             rest += true_rest[j - first]
-        common = true_rest if ledger else least[first:last]
         for i in range(robots):
             way = way_m[: last - first]
             _measure(samples_m[first:last], holders[first:last], xy_m[i, 0], xy_m[i, 1], way)
+            by_truth = _weighed(true_rest[: last - first], way) / whole
+            tight[i] += by_truth
+            if centralized:
+                paper[i] += by_truth if ledger else _weighed(least[first:last], way) / whole
+                continue
             own = _weighed(views[i, first:last], way) / whole
-            tight[i] += _weighed(true_rest[: last - first], way) / whole
-            paper[i] += _weighed(common[: last - first], way) / whole if centralized else own
-            for k in range(0 if centralized else robots):
+            paper[i] += own
+            for k in range(robots):
                 if k == i:
                     local[k] += own
                 elif _hears(xy_m, i, k, range_m):
@@ -423,7 +426,9 @@ class Metrics:
         for act in batch.acts:
             if act.ruling is not None and act.outputs is not None:
                 time_s = act.now_ns * 1e-9
-                self.finds += [(time_s, act.name, target, x, y) for target, x, y in act.ruling.found]
+                self.finds += [
+                    (time_s, act.name, target, x, y) for target, x, y in act.ruling.found
+                ]
 
     def _row(self) -> None:
         tally, scenario, whole = self._tally, self._scenario, self._units.whole

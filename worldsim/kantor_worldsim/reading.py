@@ -75,7 +75,7 @@ _MALFORMED = -1
 def _big_endian(payload: bytes, at: int, size: int) -> int:
     value = 0
     for i in range(at, at + size):
-        value = value << 8 | np.int64(payload[i])
+        value = value << 8 | int(payload[i])
     return value
 
 
@@ -89,7 +89,7 @@ def head_of(payload: bytes, at: int) -> tuple[int, int, int]:
     size = len(payload)
     if at < 0 or at >= size:
         return SIMPLE, 0, _MALFORMED
-    first = np.int64(payload[at])
+    first = int(payload[at])
     at += 1
     if first < 0x80:
         return NUMBER, first, at
@@ -119,7 +119,21 @@ _WIDTHS = np.array([0, 0, 0, 0, 1, 2, 4, 1, 2, 4, 4, 8, 1, 2, 4, 8, 1, 2, 4, 8, 
                     1, 2, 4, 2, 4, 2, 4])  # fmt: skip
 """Bytes of the number after a first byte of 0xc0 … 0xdf."""
 _KINDS = np.repeat(
-    [MAP, ARRAY, TEXT, SIMPLE, BYTES, EXTENSION, SINGLE, FLOAT, NUMBER, EXTENSION, TEXT, ARRAY, MAP],
+    [
+        MAP,
+        ARRAY,
+        TEXT,
+        SIMPLE,
+        BYTES,
+        EXTENSION,
+        SINGLE,
+        FLOAT,
+        NUMBER,
+        EXTENSION,
+        TEXT,
+        ARRAY,
+        MAP,
+    ],
     [16, 16, 32, 4, 3, 3, 1, 1, 8, 5, 3, 2, 2],
 )
 """Kind by a first byte of 0x80 … 0xdf."""
@@ -209,7 +223,7 @@ def _place(tables: Tables, at: int) -> tuple[int, int]:
         return STRANGER, after
     number = 0
     for i in range(at + 1, after):
-        digit = np.int64(payload[i]) - 48
+        digit = int(payload[i]) - 48
         if not 0 <= digit <= 9 or (number == 0 and digit == 0):
             return STRANGER, after
         number = 10 * number + digit
@@ -413,6 +427,9 @@ class Reader:
 
     def __init__(self) -> None:
         self._record: Record | None = None
+        self._reading: tuple[Any, ...] = ()
+        self._bounds = (0, STRANGER, 0)
+        """Robots, place of the supervisor, samples."""
         self._make_room(1 << 12)
 
     def read(self, record: Record) -> tuple[Any, ...]:

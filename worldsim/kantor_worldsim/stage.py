@@ -75,7 +75,8 @@ class Stage:
         self.now_ns = max(self.now_ns, now_ns)
         sound = [(name, inputs, self._sound(name, outputs)) for name, inputs, outputs in steps]
         sent = [Sent(now_ns, e) for _, _, outputs in sound if outputs for e in outputs.outbox]
-        verdicts, out_of_range = self.channel.transmit(sent)
+        ruled, out_of_range = self.channel.transmit(sent)
+        verdicts = tuple(ruled)
         acts = tuple([self._act(name, inputs, outputs) for name, inputs, outputs in sound])
         absent = tuple([act.name for act in acts if act.outputs is None])
         self._tell(Batch(now_ns, acts, verdicts, out_of_range, absent))
