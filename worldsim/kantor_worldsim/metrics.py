@@ -162,15 +162,12 @@ class Tally(NamedTuple):
     """(N,) the least of all views."""
     true_left: npt.NDArray[np.int64]
     """(N,) first weight minus everybody's spending; negative where a sample was filled twice."""
-    holders: npt.NDArray[np.int64]
-    """(N,) how many views still hold weight there, the truth counted as one."""
 
 
 @kernel
 def _lower(tally: Tally, place: int, sample: int, left: int) -> None:
     """Put an entry into a view. A record that is not sound may let it rise."""
     before = tally.least[sample]
-    tally.holders[sample] += (left > 0) - (tally.views[place, sample] > 0)
     tally.views[place, sample] = left
     least = left
     if left > before:
@@ -191,7 +188,6 @@ def _ship(
     tally.shipped[_NOW] += cost
     tally.shipped_by[place] += cost
     tally.counts[_UNITS] += units
-    tally.holders[sample] -= 0 < tally.true_left[sample] <= units
     tally.true_left[sample] -= units
 
 
@@ -213,7 +209,6 @@ def _follow(
     views: np.ndarray,
     least: np.ndarray,
     true_left: np.ndarray,
-    holders: np.ndarray,
     samples_m: np.ndarray,
     whole: int,
 ) -> int:
@@ -221,7 +216,7 @@ def _follow(
 
     samples_m: (N, 2) as they are now.
     """
-    tally = Tally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left, holders)
+    tally = Tally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left)
     finds = 0
     for row in range(sizes[of.VERDICTS]):
         counts[_DROPS if verdicts[row, of.DUE_NS] == DROPPED else _DELIVERIES] += 1
@@ -263,16 +258,14 @@ def _weighed(units: np.ndarray, way_m: np.ndarray) -> float:
 
 
 @kernel
-def _measure(
-    samples_m: np.ndarray, holders: np.ndarray, x_m: float, y_m: float, way_m: np.ndarray
-) -> None:
-    """Distances from a place to the samples that anybody still holds weight on; 0 to the others."""
+def _measure(samples_m: np.ndarray, x_m: float, y_m: float, way_m: np.ndarray) -> None:
+    """Distances from a place to samples. Two plain loops, since the compiler then takes many at a time."""
     for j in range(samples_m.shape[0]):
-        way_m[j] = 0.0
-        if holders[j] > 0:  # a root costs more than all else in a row of metrics
-            dx = samples_m[j, 0] - x_m
-            dy = samples_m[j, 1] - y_m
-            way_m[j] = math.sqrt(dx * dx + dy * dy)
+        dx = samples_m[j, 0] - x_m
+        dy = samples_m[j, 1] - y_m
+        way_m[j] = dx * dx + dy * dy
+    for j in range(samples_m.shape[0]):
+        way_m[j] = math.sqrt(way_m[j])
 
 
 @kernel
@@ -282,12 +275,12 @@ def _sum_up(
     views: np.ndarray,
     least: np.ndarray,
     true_left: np.ndarray,
-    holders: np.ndarray,
     samples_m: np.ndarray,
     whole: int,
     range_m: float,
     centralized: bool,
     ledger: bool,
+    near: np.ndarray,
     way_m: np.ndarray,
     true_rest: np.ndarray,
     paper: np.ndarray,
@@ -298,7 +291,7 @@ def _sum_up(
 
     For each robot in paper: by the common weights or its own view; in tight: by the true rest; in
     local: eq. 12, what the robots in its range have shipped and their terms by its own view.
-    way_m, true_rest: room for one block of samples, which stays in the cache while all robots and
+    near: (m, m) room for who is in whose range. way_m, true_rest: room for one block of samples, which stays in the cache while all robots and
     views meet in it.
     """
     robots = xy_m.shape[0]
@@ -308,7 +301,9 @@ def _sum_up(
     local[:] = 0.0
     for k in range(robots):
         for i in range(robots):
-            if _hears(xy_m, i, k, range_m):
+            apart_m = math.hypot(xy_m[i, 0] - xy_m[k, 0], xy_m[i, 1] - xy_m[k, 1])
+            near[i, k] = i == k or apart_m <= range_m
+            if near[i, k]:
                 local[k] += shipped_by[i]
     for first in range(0, samples_m.shape[0], way_m.shape[0]):
         last = min(first + way_m.shape[0], samples_m.shape[0])
@@ -317,7 +312,7 @@ def _sum_up(
             rest += true_rest[j - first]
         for i in range(robots):
             way = way_m[: last - first]
-            _measure(samples_m[first:last], holders[first:last], xy_m[i, 0], xy_m[i, 1], way)
+            _measure(samples_m[first:last], xy_m[i, 0], xy_m[i, 1], way)
             by_truth = _weighed(true_rest[: last - first], way) / whole
             tight[i] += by_truth
             if centralized:
@@ -328,15 +323,9 @@ def _sum_up(
             for k in range(robots):
                 if k == i:
                     local[k] += own
-                elif _hears(xy_m, i, k, range_m):
+                elif near[i, k]:
                     local[k] += _weighed(views[k, first:last], way) / whole
     return rest
-
-
-@kernel
-def _hears(xy_m: np.ndarray, i: int, k: int, range_m: float) -> bool:
-    """Whether i is in the range of k, as it is in its own."""
-    return i == k or math.hypot(xy_m[i, 0] - xy_m[k, 0], xy_m[i, 1] - xy_m[k, 1]) <= range_m
 
 
 class Metrics:
@@ -383,7 +372,6 @@ class Metrics:
             views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
             least=np.full(samples, self._units.sample, dtype=np.int64),
             true_left=np.full(samples, self._units.sample, dtype=np.int64),
-            holders=np.full(samples, len(names) + 1, dtype=np.int64),
         )
         self._tally.counts[_FIRST_CONTACT] = _NEVER
         self._tally.counts[_LEAST] = self._units.whole
@@ -397,6 +385,7 @@ class Metrics:
             scenario.radio.range_m,
             scenario.centralized,
             scenario.merge == "ledger",
+            np.zeros((robots, robots), dtype=np.bool_),
             np.zeros(_BLOCK),
             np.zeros(_BLOCK, dtype=np.int64),
             *self._terms,
