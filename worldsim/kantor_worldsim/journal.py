@@ -35,8 +35,7 @@ class Digest:
 
     def add(self, payload: bytes) -> None:
         """Add one encoded record."""
-        self._hash.update(len(payload).to_bytes(8, "little"))
-        self._hash.update(payload)
+        self._hash.update(len(payload).to_bytes(8, "little") + payload)
         self.records += 1
 
     @property
