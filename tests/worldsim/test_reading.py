@@ -269,3 +269,22 @@ def test_record_holds_more_fields_some_day(played: Play) -> None:
 
     assert of._read_batch(payload, sizes, *tables, bits, 3, of.STRANGER, 60) > 0
     assert tabled(Reading(payload, sizes, *tables)) == told
+
+
+@examples(300)
+@given(changes=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), max_size=4))
+def test_garbled_batch_stays_within_its_tables(changes: list[tuple[int, int]]) -> None:
+    """No bytes lead outside: rows behind the tables stay as they were."""
+    small = msgspec.structs.replace(ODD, acts=(ODD.acts[0], ODD.acts[2]))
+    payload = bytearray(encode_record(small))
+    for at, byte in changes:
+        payload[at % len(payload)] = byte
+    rows = len(payload) // 2 + 1
+    around = [np.full((rows + 8, columns), 77, dtype=np.int64) for columns in (20, 2, 5, 4, 2)]
+    acts, heard, sent, verdicts, pairs = (table[:rows] for table in around)
+    poses_m = np.zeros((rows, 2))
+    sizes, bits = np.zeros(5, dtype=np.int64), poses_m.view(np.int64)
+    tables = (sizes, acts, poses_m, heard, sent, verdicts, pairs, bits)
+    of._read_batch(bytes(payload), *tables, 3, of.STRANGER, 60)
+
+    assert all(bool((table[rows:] == 77).all()) for table in around)

@@ -33,14 +33,15 @@ _COMPLAINTS_MAX = 100
 _UNHEARD, _NEVER_SENT, _FOR_ANOTHER, _TOO_FAR = 0, 1, 2, 3
 _STEP, _SPEED, _GARBLED_SPENT, _POINT, _BUDGET, _MISCOUNT = 4, 5, 6, 7, 8, 9
 _GARBLED_LOWERED, _RISE, _BELOW, _UNREADABLE, _LOG = 10, 11, 12, 13, 14
+_OF_VERDICTS = (_NEVER_SENT, _FOR_ANOTHER, _TOO_FAR)
 _NO_LOGS, _NO_POSTED, _NO_FLIGHTS = -1, -2, -3
 _GROWING = {_NO_LOGS: "logs", _NO_POSTED: "posted", _NO_FLIGHTS: "flights"}
 
 _WORDS = {
-    _UNHEARD: ("delivery", "heard {message}, which was not delivered"),
-    _NEVER_SENT: ("delivery", "{message} was never sent"),
+    _UNHEARD: ("delivery", "heard {what}, which was not delivered"),
+    _NEVER_SENT: ("delivery", "{what} was never sent"),
     _FOR_ANOTHER: ("delivery", "delivered what was for somebody else"),
-    _TOO_FAR: ("range", "{message} over {x:.6g} m"),
+    _TOO_FAR: ("range", "{what} over {x:.6g} m"),
     _STEP: ("order", "step {a}, expected {b}"),
     _SPEED: ("speed", "moved {x:.6g} m, allowed {y:.6g} m"),
     _GARBLED_SPENT: ("energy", "spending that does not decode"),
@@ -50,7 +51,7 @@ _WORDS = {
     _GARBLED_LOWERED: ("weights", "entries that do not decode"),
     _RISE: ("weights", "sample {item} from {a} to {b} units"),
     _BELOW: ("credit", "its view of sample {item} is below the truth"),
-    _UNREADABLE: ("ledger", "sends what nobody can read{why}"),
+    _UNREADABLE: ("ledger", "sends what nobody can read{what}"),
     _LOG: ("ledger", "its log from {a} on is not what it consumed"),
 }
 """Rule and text of each fault."""
@@ -236,9 +237,10 @@ def _check_energy(state: State, law: Law, reading: Reading, row: int) -> None:
         sample, units = reading.pairs[i, of.SAMPLE], reading.pairs[i, of.UNITS]
         shipped += units
         state.consumed[sample] += units
-        state.logs[who, book[_ENTRIES], 0] = sample
-        state.logs[who, book[_ENTRIES], 1] = units
-        book[_ENTRIES] += 1
+        if law.ledger:
+            state.logs[who, book[_ENTRIES], 0] = sample
+            state.logs[who, book[_ENTRIES], 1] = units
+            book[_ENTRIES] += 1
     book[_POINTS] += act[of.SPENT_COUNT] > 0
     points = book[_POINTS]
     if shipped > law.point_units:
@@ -292,9 +294,8 @@ def _check_ledger(state: State, reading: Reading, row: int, item: int) -> None:
             units, at = take_uint(payload, at)
             sample += step
             if origin == who:
-                sound = told < state.book[who, _ENTRIES]
                 if not (
-                    sound
+                    told < state.book[who, _ENTRIES]
                     and state.logs[who, told, 0] == sample
                     and state.logs[who, told, 1] == units
                 ):
@@ -522,25 +523,11 @@ class Checker:
 
     def _put_into_words(self, batch: Batch, faults: int) -> None:
         noted = min(faults, _COMPLAINTS_MAX)
-        rows = self._state.faults[:noted].tolist()
-        for (fault, row, item, a, b), (x, y) in zip(
-            rows, self._state.lengths_m[:noted].tolist(), strict=True
-        ):
+        rows, lengths_m = self._state.faults[:noted], self._state.lengths_m[:noted]
+        for (fault, row, item, a, b), (x, y) in zip(rows.tolist(), lengths_m.tolist(), strict=True):
             rule, text = _WORDS[fault]
-            who, message, why = batch.acts[0].name if batch.acts else "record", "", ""
-            if fault in (_NEVER_SENT, _FOR_ANOTHER, _TOO_FAR):
-                verdict = batch.verdicts[row]
-                who, message = verdict.target, f"{verdict.source}#{verdict.sequence}"
-            else:
-                who = batch.acts[row].name
-            if fault == _UNHEARD:
-                source, sequence = batch.acts[row].heard[item]
-                message = f"{source}#{sequence}"
-            elif fault == _UNREADABLE:
-                why = _why_unreadable(batch.acts[row], item)
-            self._complain(
-                rule, who, text.format(message=message, why=why, item=item, a=a, b=b, x=x, y=y)
-            )
+            who, what = _concerned(batch, fault, row, item)
+            self._complain(rule, who, text.format(what=what, item=item, a=a, b=b, x=x, y=y))
         self.count += faults - noted
 
     def _check_act(self, act: Act) -> None:
@@ -619,14 +606,21 @@ class Checker:
             )
 
 
-def _why_unreadable(act: Act, item: int) -> str:
-    """What the codec says of an envelope, after a colon, if it says anything."""
-    assert act.outputs is not None
-    try:
-        decode_news(act.outputs.outbox[item].body)
-    except RefusedError as error:
-        return f": {error}"
-    return ""
+def _concerned(batch: Batch, fault: int, row: int, item: int) -> tuple[str, str]:
+    """Whom a fault is about; and which envelope, or what the codec says of it."""
+    if fault in _OF_VERDICTS:
+        verdict = batch.verdicts[row]
+        return verdict.target, f"{verdict.source}#{verdict.sequence}"
+    act = batch.acts[row]
+    if fault == _UNHEARD:
+        source, sequence = act.heard[item]
+        return act.name, f"{source}#{sequence}"
+    if fault == _UNREADABLE and act.outputs is not None:
+        try:
+            decode_news(act.outputs.outbox[item].body)
+        except RefusedError as error:
+            return act.name, f": {error}"
+    return act.name, ""
 
 
 def check(records: Iterable[Record]) -> Checker:

@@ -4,7 +4,7 @@ Metrics and checker follow every act of a run. Walking its Structs in Python cos
 do; the encoded record, which the journal needs anyway, holds the same and is read in a microsecond.
 Whoever needs a text (a complaint, a name) still has the record itself.
 
-The kernels here are total: whatever the bytes, they stay inside them.
+The kernels here are total: whatever the bytes, they stay inside them and inside the tables.
 """
 
 from typing import Any, NamedTuple
@@ -69,6 +69,7 @@ class Reading(NamedTuple):
 # Msgpack. Kinds of a value by what its head says; SIMPLE: nil and truth values.
 SIMPLE, NUMBER, FLOAT, SINGLE, TEXT, BYTES, EXTENSION, ARRAY, MAP = 0, 1, 2, 3, 4, 5, 6, 7, 8
 _MALFORMED = -1
+_ANY = 1 << 32
 
 
 @kernel
@@ -161,9 +162,12 @@ def _number(payload: bytes, at: int) -> tuple[int, int]:
 
 
 @kernel
-def _array(payload: bytes, at: int) -> tuple[int, int]:
+def _array(payload: bytes, at: int, room: int) -> tuple[int, int]:
+    """(items, position of the first) of an array of at most `room` items; otherwise (0, malformed)."""
     kind, items, at = head_of(payload, at)
-    return items, at if kind == ARRAY else _MALFORMED
+    if kind != ARRAY or at < 0 or items > room:
+        return 0, _MALFORMED
+    return items, at
 
 
 class Tables(NamedTuple):
@@ -254,9 +258,9 @@ def _read_pairs(tables: Tables, at: int, bound: int) -> tuple[int, int]:
 @kernel
 def _read_heard(tables: Tables, act: np.ndarray, at: int) -> int:
     act[HEARD] = tables.sizes[ALL_HEARD]
-    act[HEARD_COUNT], at = _array(tables.payload, at)
+    act[HEARD_COUNT], at = _array(tables.payload, at, tables.heard.shape[0] - act[HEARD])
     for row in range(act[HEARD], act[HEARD] + act[HEARD_COUNT]):
-        _, at = _array(tables.payload, at)
+        _, at = _array(tables.payload, at, _ANY)
         tables.heard[row, SOURCE], at = _place(tables, at)
         tables.heard[row, SEQUENCE], at = _number(tables.payload, at)
     tables.sizes[ALL_HEARD] += act[HEARD_COUNT]
@@ -267,10 +271,10 @@ def _read_heard(tables: Tables, act: np.ndarray, at: int) -> int:
 def _read_outbox(tables: Tables, act: np.ndarray, at: int) -> int:
     act[SENT] = tables.sizes[ALL_SENT]
     act[BODY_BYTES] = 0
-    act[SENT_COUNT], at = _array(tables.payload, at)
+    act[SENT_COUNT], at = _array(tables.payload, at, tables.sent.shape[0] - act[SENT])
     for row in range(act[SENT], act[SENT] + act[SENT_COUNT]):
         sent = tables.sent[row]
-        _, at = _array(tables.payload, at)
+        _, at = _array(tables.payload, at, _ANY)
         sent[SOURCE], at = _place(tables, at)
         sent[SEQUENCE], at = _number(tables.payload, at)
         sent[TARGET], at = _place(tables, at)
@@ -309,16 +313,18 @@ def _read_ruling(tables: Tables, act: np.ndarray, row: int, at: int) -> int:
     act[PRESENT] &= kind == ARRAY
     if kind != ARRAY:
         return at
-    numbers, at = _array(tables.payload, at)
+    numbers, at = _array(tables.payload, at, _ANY)
     at = _read_metres(tables, row, 0, at)
     at = _read_metres(tables, row, 1, at)
     at = skip(tables.payload, at, numbers - 2)
-    act[FINDS], at = _array(tables.payload, at)
+    act[FINDS], at = _array(tables.payload, at, _ANY)
     at = skip(tables.payload, at, act[FINDS])
-    act[VIOLATIONS], at = _array(tables.payload, at)
+    act[VIOLATIONS], at = _array(tables.payload, at, _ANY)
     act[VOID] = 0
     for _ in range(act[VIOLATIONS]):
-        _, size, at = head_of(tables.payload, at)
+        kind, size, at = head_of(tables.payload, at)
+        if kind != TEXT:
+            return _MALFORMED
         for text in _REFUSALS:
             act[VOID] |= _reads(tables.payload, at, size, text)
         at += size
@@ -358,12 +364,12 @@ def _read_batch(
         supervisor,
     )
     sizes[:] = 0
-    fields, at = _array(payload, 0)
+    fields, at = _array(payload, 0, _ANY)
     at = skip(payload, at, 2)  # tag, now_ns
-    sizes[ACTS], at = _array(payload, at)
+    sizes[ACTS], at = _array(payload, at, acts.shape[0])
     for i in range(sizes[ACTS]):
         act = acts[i]
-        fields, at = _array(payload, at)
+        fields, at = _array(payload, at, _ANY)
         act[PLACE], at = _place(tables, at)
         act[NOW_NS], at = _number(payload, at)
         at = skip(payload, at, 1)  # observation
@@ -373,9 +379,9 @@ def _read_batch(
         at = skip(payload, at, fields - 6)
         if at < 0:
             return _MALFORMED
-    sizes[VERDICTS], at = _array(payload, at)
+    sizes[VERDICTS], at = _array(payload, at, verdicts.shape[0])
     for i in range(sizes[VERDICTS]):
-        fields, at = _array(payload, at)
+        fields, at = _array(payload, at, _ANY)
         verdicts[i, SOURCE], at = _place(tables, at)
         verdicts[i, SEQUENCE], at = _number(payload, at)
         verdicts[i, TARGET], at = _place(tables, at)
@@ -400,7 +406,7 @@ def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int
     refused = (0, 0, 0, _MALFORMED)
     if end - at > BODY_BYTES_MAX:
         return refused
-    fields, at = _array(payload, at)
+    fields, at = _array(payload, at, _ANY)
     tag, at = _number(payload, at)
     version, at = _number(payload, at)
     step, at = _number(payload, at)
