@@ -167,7 +167,7 @@ class Belief:
     @property
     def empty(self) -> bool:
         """Whether no sample has weight left."""
-        return bool(self.grid.alive[0] == 0)
+        return self.grid.alive.item(0) == 0
 
     def nearest(self, x_m: float, y_m: float, count: int) -> npt.NDArray[np.int64]:
         """The samples with weight that are nearest to a place, nearest first; at most `count`."""

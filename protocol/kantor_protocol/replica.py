@@ -502,6 +502,12 @@ def _pack_lowered(
     return at
 
 
+@kernel
+def _end_step(counters: np.ndarray) -> None:
+    counters[LOWERED] = 0
+    counters[_STEP] += 1
+
+
 class Replica:
     """What one participant holds of everybody's state, and what it tells others.
 
@@ -563,7 +569,7 @@ class Replica:
     @property
     def empty(self) -> bool:
         """Whether no sample has weight left in this participant's view."""
-        return bool(self.store.counters[_HOLDING] == 0)
+        return self.store.counters.item(_HOLDING) == 0
 
     def entries(self, origin: int) -> list[tuple[int, int]]:
         """The held log of an origin, as (sample, value); with min only the own log is held."""
@@ -616,7 +622,7 @@ class Replica:
 
     def lowered(self) -> npt.NDArray[np.int64]:
         """Samples whose weight fell in this step, each once; a view valid until `end_step`."""
-        return self.store.lowered[: self.store.counters[LOWERED]]
+        return self.store.lowered[: self.store.counters.item(LOWERED)]
 
     def packed_lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""
@@ -629,8 +635,7 @@ class Replica:
 
     def end_step(self) -> None:
         """Begin the next step."""
-        self.store.counters[LOWERED] = 0
-        self.store.counters[_STEP] += 1
+        _end_step(self.store.counters)
 
 
 @kernel

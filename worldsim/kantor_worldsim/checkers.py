@@ -57,15 +57,25 @@ _WORDS = {
 """Rule and text of each fault."""
 
 # Columns of State.book.
-_STEPS, _ABSENCES, _MOVED_NS, _POINTS, _ENTRIES, _POSTED, _FLYING, _TOLD = 0, 1, 2, 3, 4, 5, 6, 7
+_STEPS, _ABSENCES, _MOVED_NS, _POINTS, _ENTRIES, _POSTED, _FLYING, _TOLD, _COMING = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+)
 
 
 class State(NamedTuple):
     """What the kernels keep of the run so far. n participants, N samples."""
 
     book: npt.NDArray[np.int64]
-    """(n, 8): last step, absences since, time of the last move, points shipped; rows used of its
-    logs, posted and flights; whether it has sent a version vector."""
+    """(n, 11): last step, absences since, time of the last move, points shipped; rows used of its
+    logs, posted and flights; whether it has sent a version vector; rows that this batch brings."""
     poses_m: npt.NDArray[np.float64]
     """(n, 2) world frame."""
     views: npt.NDArray[np.int64]
@@ -115,15 +125,26 @@ def _note(
 
 
 @kernel
-def _lacking(state: State, sizes: np.ndarray) -> int:
-    """Which array has no room for a batch of these sizes behind what is held of anybody, or 0."""
-    for who in range(state.book.shape[0]):
-        book = state.book[who]
-        if book[_ENTRIES] + sizes[of.PAIRS] > state.logs.shape[1]:
+def _lacking(state: State, reading: Reading) -> int:
+    """Which array has no room for this batch behind what is held of somebody, or 0."""
+    book = state.book
+    book[:, _COMING:] = 0
+    for row in range(reading.sizes[of.ACTS]):
+        act = reading.acts[row]
+        if act[of.PLACE] >= 0 and act[of.PRESENT]:
+            book[act[of.PLACE], _COMING] += max(0, act[of.SPENT_COUNT])
+    for row in range(reading.sizes[of.ALL_SENT]):
+        if reading.sent[row, of.SOURCE] >= 0:
+            book[reading.sent[row, of.SOURCE], _COMING + 1] += 1
+    for row in range(reading.sizes[of.VERDICTS]):
+        if reading.verdicts[row, of.TARGET] >= 0:
+            book[reading.verdicts[row, of.TARGET], _COMING + 2] += 1
+    for who in range(book.shape[0]):
+        if book[who, _ENTRIES] + book[who, _COMING] > state.logs.shape[1]:
             return _NO_LOGS
-        if book[_POSTED] + sizes[of.ALL_SENT] > state.posted.shape[1]:
+        if book[who, _POSTED] + book[who, _COMING + 1] > state.posted.shape[1]:
             return _NO_POSTED
-        if book[_FLYING] + sizes[of.VERDICTS] > state.flights.shape[1]:
+        if book[who, _FLYING] + book[who, _COMING + 2] > state.flights.shape[1]:
             return _NO_FLIGHTS
     return 0
 
@@ -383,7 +404,7 @@ def _check(
         range_m,
         supervisor_range_m,
     )
-    lacking = _lacking(state, sizes)
+    lacking = _lacking(state, reading)
     if lacking < 0:
         return lacking
     found[0] = 0
@@ -407,6 +428,17 @@ def _check(
         for item in range(acts[row, of.SENT_COUNT] if ledger else 0):
             _check_ledger(state, reading, row, item)
     return found[0]
+
+
+@kernel
+def _equals(weights: np.ndarray, views: np.ndarray, who: int) -> bool:
+    """Whether a published vector is the view of a participant, entry for entry."""
+    if weights.shape[0] != views.shape[1]:
+        return False
+    differing = 0
+    for j in range(weights.shape[0]):
+        differing += weights[j] != views[who, j]
+    return differing == 0
 
 
 class Checker:
@@ -483,7 +515,7 @@ class Checker:
         poses_m[-1] = scenario.supervisor_m
         poses_m[: scenario.robots.count] = site.starts_m
         self._state = State(
-            book=np.zeros((len(names), 8), dtype=np.int64),
+            book=np.zeros((len(names), 11), dtype=np.int64),
             poses_m=poses_m,
             views=np.full((len(names), self._samples), self._units.sample, dtype=np.int64),
             consumed=np.zeros(self._samples, dtype=np.int64),
@@ -542,10 +574,12 @@ class Checker:
         self._check_goal(act.name, outputs.goal, outputs.spent)
 
     def _check_published(self, name: ParticipantId, weights: bytes) -> None:
-        subscriber, view = self._subscribers[name], self._state.views[self._places[name]]
+        subscriber, views = self._subscribers[name], self._state.views
         if not subscriber.take(weights):
             self._complain("weights", name, "publishes a vector that cannot be rebuilt")
-        elif subscriber.weights is None or not np.array_equal(subscriber.weights, view):
+        elif subscriber.weights is None or not _equals(
+            subscriber.weights, views, self._places[name]
+        ):
             self._complain("weights", name, "publishes a vector that is not its own")
 
     def _check_goal(
@@ -556,11 +590,14 @@ class Checker:
             return
         if self._samples_by_place is None:
             self._samples_by_place = self._index_samples()
-        samples = self._samples_by_place.get(goal)
-        view = self._state.views[self._places[name]]
-        if samples is None:
+        samples = self._samples_by_place.get(goal, [])
+        place, units = self._places[name], self._state.views.item
+        for sample in samples:
+            if units(place, sample) > 0:
+                return
+        if not samples:
             self._complain("goal", name, f"{goal} is no sample")
-        elif not any(view[j] > 0 for j in samples) and not self._ships(spent, samples):
+        elif not self._ships(spent, samples):
             self._complain("goal", name, f"{goal} has no weight left in its view")
 
     def _ships(self, spent: bytes, samples: list[int]) -> bool:

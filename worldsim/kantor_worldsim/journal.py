@@ -91,7 +91,8 @@ class Journal:
         self.digest.add(payload)
         if isinstance(record, (Batch, Ending)):
             self._time_ns = record.now_ns
-        self._write(RECORD_TOPIC, payload)
+        if self._file is not None:
+            self._write(RECORD_TOPIC, payload)
 
     def take_row(self, row: Row) -> None:
         """Write one row of metrics, for viewers; it is not part of the digest."""

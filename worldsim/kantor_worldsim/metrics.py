@@ -167,14 +167,15 @@ class Tally(NamedTuple):
 @kernel
 def _lower(tally: Tally, place: int, sample: int, left: int) -> None:
     """Put an entry into a view. A record that is not sound may let it rise."""
-    before = tally.least[sample]
+    before, least = tally.views[place, sample], tally.least[sample]
     tally.views[place, sample] = left
-    least = left
-    if left > before:
+    lower = min(left, least)
+    if left > before == least:
+        lower = left
         for other in range(tally.views.shape[0]):
-            least = min(least, tally.views[other, sample])
-    tally.least[sample] = least
-    tally.counts[_LEAST] += least - before
+            lower = min(lower, tally.views[other, sample])
+    tally.least[sample] = lower
+    tally.counts[_LEAST] += lower - least
 
 
 @kernel

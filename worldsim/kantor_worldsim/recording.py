@@ -78,6 +78,10 @@ class Recording:
         self.journal.take(record, self._reader.read(record)[0])
         self.metrics.take(record)
         self.checker.take(record)
+        if len(self.metrics.rows) > self._rows:
+            self._write_rows()
+
+    def _write_rows(self) -> None:
         for row in self.metrics.rows[self._rows :]:
             self.journal.take_row(row)
             if self._table is not None:
