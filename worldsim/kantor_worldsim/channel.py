@@ -189,7 +189,7 @@ class Channel:
         for i, (now_ns, envelope) in enumerate(sent):
             target = self._targets.get(envelope.target, len(self._roster))
             source, sequence = self._places[envelope.source], envelope.sequence
-            _SENT.pack_into(self._sent.data, _SENT.size * i, now_ns, source, sequence, target)
+            _SENT.pack_into(self._sent_bytes, _SENT.size * i, now_ns, source, sequence, target)
         count, out_of_range = _transmit(
             *self._law, self._xy_m, self._sent, len(sent), self._supervisor, self._ruled
         )
@@ -225,6 +225,7 @@ class Channel:
     def _make_room(self, envelopes: int) -> None:
         if self._sent.shape[0] < envelopes:
             self._sent = np.zeros((2 * envelopes, 4), dtype=np.int64)
+            self._sent_bytes = self._sent.data
             self._ruled = np.zeros((3, 4 * envelopes * len(self._roster)), dtype=np.int64)
 
 

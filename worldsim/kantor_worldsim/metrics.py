@@ -431,7 +431,7 @@ class Metrics:
         shipped, shipped_now = tally.shipped.tolist()
         tight = None
         if true_rest == whole - counts[_UNITS]:
-            tight = shipped + sum(term / robots for term in by_truth)
+            tight = shipped + sum([term / robots for term in by_truth])
         if scenario.centralized:
             local = []
         self.rows.append(
