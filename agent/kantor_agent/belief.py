@@ -8,9 +8,9 @@ import numpy.typing as npt
 from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
 from kantor_protocol.kernels import kernel
 from kantor_protocol.messages import News
-from kantor_protocol.packing import Pairs, pack_pairs
+from kantor_protocol.packing import pack_pairs
 from kantor_protocol.registers import Registers
-from kantor_protocol.replica import NOBODY, Manner, Replica, Store, spend
+from kantor_protocol.replica import LOWERED, NOBODY, Manner, Replica, Store, spend
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, Weights
 
@@ -106,6 +106,25 @@ def _ship_packed(
     return used
 
 
+@kernel
+def _drop_empty(
+    xy_m: np.ndarray,
+    order: np.ndarray,
+    slot: np.ndarray,
+    cell: np.ndarray,
+    first: np.ndarray,
+    alive: np.ndarray,
+    frame: np.ndarray,
+    levels: int,
+    weights: np.ndarray,
+    lowered: np.ndarray,
+    counters: np.ndarray,
+) -> None:
+    """Take the samples that this step has emptied out of the grid."""
+    grid = Grid(xy_m, order, slot, cell, first, alive, frame, levels)
+    remove_empty(grid, weights, lowered[: counters[LOWERED]])
+
+
 class Belief:
     """The replica of everybody's spending, with the samples in space.
 
@@ -127,7 +146,6 @@ class Belief:
             units=np.zeros(most, dtype=np.int64),
         )
         self._packed = np.zeros(20 * most, dtype=np.uint8)
-        self._pairs = Pairs()
         store, manner = replica.store, replica.manner
         self.to_choose: tuple[Any, ...] = (
             *self.grid,
@@ -138,6 +156,7 @@ class Belief:
             manner.me if manner.claims else NOBODY,
         )
         """Grid, weights and claims as arguments of a planner's kernel; see `kernels.kernel`."""
+        self._to_drop = (*self.grid, store.weights, store.lowered, store.counters)
         self._store = replica.store
         self._to_ship = self._arguments()
 
@@ -159,7 +178,7 @@ class Belief:
     @property
     def empty(self) -> bool:
         """Whether no sample has weight left."""
-        return bool(self.grid.alive[0] == 0)
+        return self.grid.alive.item(0) == 0
 
     def nearest(self, x_m: float, y_m: float, count: int) -> npt.NDArray[np.int64]:
         """The samples with weight that are nearest to a place, nearest first; at most `count`."""
@@ -176,9 +195,7 @@ class Belief:
         if self._walk.advance(now_ns):
             build(self.grid, self.weights)
             return
-        lowered = self.replica.lowered()
-        if lowered.size:
-            remove_empty(self.grid, self.weights, lowered)
+        _drop_empty(*self._to_drop)
 
     def spend(self, x_m: float, y_m: float) -> bytes:
         """Ship one robot point from here (Prop. 1); packed pairs (sample, units), nearest first."""
@@ -202,5 +219,4 @@ class Belief:
 
     def lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""
-        index = self.replica.lowered()
-        return self._pairs.encode(index, self.weights[index], index.shape[0])
+        return self.replica.packed_lowered()

@@ -2,6 +2,8 @@
 
 Input is a value, output is a value, and the same machine with the same inputs gives the same
 outputs. Time is an argument (simulated integer nanoseconds); nothing else reaches a machine.
+
+The records are out of the garbage collector's sight (`gc=False`): frozen values hold no cycles.
 """
 
 import enum
@@ -29,7 +31,7 @@ class State(enum.IntEnum):
     """Its energy is spent; it stands and keeps relaying."""
 
 
-class Pose(msgspec.Struct, frozen=True, array_like=True):
+class Pose(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """Where a body is, in the world frame (x right, y up, heading counter-clockwise from x)."""
 
     x_m: float
@@ -38,7 +40,7 @@ class Pose(msgspec.Struct, frozen=True, array_like=True):
     speed_m_s: float = 0.0
 
 
-class Envelope(msgspec.Struct, frozen=True, array_like=True):
+class Envelope(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One radio transmission. (source, sequence) is unique in a run."""
 
     source: ParticipantId
@@ -49,7 +51,7 @@ class Envelope(msgspec.Struct, frozen=True, array_like=True):
     """An encoded message; the radio does not look inside."""
 
 
-class Observation(msgspec.Struct, frozen=True, array_like=True):
+class Observation(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What the world tells a participant about itself."""
 
     step: int
@@ -60,7 +62,7 @@ class Observation(msgspec.Struct, frozen=True, array_like=True):
     """Targets that its sensor found since the last observation."""
 
 
-class Inputs(msgspec.Struct, frozen=True, array_like=True):
+class Inputs(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What reached a participant since its last step."""
 
     now_ns: int
@@ -69,7 +71,7 @@ class Inputs(msgspec.Struct, frozen=True, array_like=True):
     """In order of arrival."""
 
 
-class Outputs(msgspec.Struct, frozen=True, array_like=True):
+class Outputs(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What a participant did in one step."""
 
     step: int

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from kantor_protocol.kernels import kernel
 
 MALFORMED = -1
+_SUM_MAX = 1 << 62
 
 
 @kernel
@@ -31,13 +32,13 @@ def put_int(out: np.ndarray, at: int, value: int) -> int:
 
 
 @kernel
-def take_uint(buffer: np.ndarray, at: int) -> tuple[int, int]:
+def take_uint(buffer: bytes | np.ndarray, at: int) -> tuple[int, int]:
     """Read a value below 2**63 from `at`: (value, position after it), or (0, MALFORMED)."""
     value = 0
     shift = 0
     if at < 0:
         return 0, MALFORMED
-    while at < buffer.shape[0] and shift < 63:
+    while at < len(buffer) and shift < 63:
         byte = np.int64(buffer[at])
         at += 1
         value |= int((byte & 127) << shift)
@@ -48,7 +49,7 @@ def take_uint(buffer: np.ndarray, at: int) -> tuple[int, int]:
 
 
 @kernel
-def take_int(buffer: np.ndarray, at: int) -> tuple[int, int]:
+def take_int(buffer: bytes | np.ndarray, at: int) -> tuple[int, int]:
     """Read a signed value; see `take_uint`."""
     folded, at = take_uint(buffer, at)
     if folded & 1:
@@ -69,7 +70,7 @@ def pack_pairs(index: np.ndarray, value: np.ndarray, count: int, out: np.ndarray
 
 
 @kernel
-def unpack_pairs(buffer: np.ndarray, bound: int, index: np.ndarray, value: np.ndarray) -> int:
+def unpack_pairs(buffer: bytes, bound: int, index: np.ndarray, value: np.ndarray) -> int:
     """Read pairs until the buffer ends; their count, or MALFORMED.
 
     Malformed is a cut number, an index outside [0, bound), or more pairs than `index` holds.
@@ -77,7 +78,7 @@ def unpack_pairs(buffer: np.ndarray, bound: int, index: np.ndarray, value: np.nd
     at = 0
     before = 0
     count = 0
-    while at < buffer.shape[0]:
+    while at < len(buffer):
         step, at = take_int(buffer, at)
         amount, at = take_uint(buffer, at)
         before += step
@@ -87,6 +88,22 @@ def unpack_pairs(buffer: np.ndarray, bound: int, index: np.ndarray, value: np.nd
         value[count] = amount
         count += 1
     return count
+
+
+@kernel
+def sum_pairs(buffer: bytes, bound: int) -> int:
+    """The sum of all values, or MALFORMED, see `unpack_pairs`; also when it passes 2**62."""
+    at = 0
+    index = 0
+    total = 0
+    while at < len(buffer):
+        step, at = take_int(buffer, at)
+        amount, at = take_uint(buffer, at)
+        index += step
+        if at < 0 or index < 0 or index >= bound or amount > _SUM_MAX - total:
+            return MALFORMED
+        total += amount
+    return total
 
 
 class Pairs:
@@ -115,7 +132,7 @@ class Pairs:
         if len(packed) > 2 * self._index.shape[0]:  # a pair takes two bytes at least
             self._index = np.zeros(len(packed), dtype=np.int64)
             self._value = np.zeros(len(packed), dtype=np.int64)
-        count = unpack_pairs(np.frombuffer(packed, dtype=np.uint8), bound, self._index, self._value)
+        count = unpack_pairs(packed, bound, self._index, self._value)
         if count < 0:
             return None
         return self._index[:count], self._value[:count]

@@ -33,12 +33,13 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.kernels import kernel
-from kantor_protocol.packing import put_int, put_uint, take_int, take_uint
+from kantor_protocol.packing import Pairs, put_int, put_uint, take_int, take_uint
 from kantor_protocol.registers import Registers
 from kantor_protocol.weights import Units, Weights
 
 NOBODY = -1
-_MALFORMED, _NO_ROOM, _LEARNT = 0, 1, 2
+_LEARNT, _MALFORMED = 0, -1
+_NO_ROOM_TO_PACK = -1
 _ENTRIES_MAX = 4096
 """Log entries in one message; the rest follows with the next."""
 _CLAIM_LEASE_STEPS = 12
@@ -50,13 +51,13 @@ _FRESH_STEPS = 4
 
 _REPEATED = 32
 """So many unacknowledged entries are repeated with every message, so that one loss costs nothing."""
-_LENGTH_MAX = 1 << 40
+LENGTH_MAX = 1 << 40
 """No log is longer; it keeps sums of positions within 64 bits."""
 
 # Rows of Store.claims.
 _SAMPLE, _SINCE, _STAMP, _HEARD = 0, 1, 2, 3
 # Slots of Store.counters.
-_LOWERED, _STEP = 0, 1
+LOWERED, _STEP, _HOLDING = 0, 1, 2
 
 
 class Store(NamedTuple):
@@ -83,7 +84,7 @@ class Store(NamedTuple):
     mark: npt.NDArray[np.int32]
     """(N,) the step at which an index was put into `lowered`."""
     counters: npt.NDArray[np.int64]
-    """(2,): how many in `lowered`; step."""
+    """(3,): how many in `lowered`; step; how many weights are above 0."""
 
 
 class Manner(NamedTuple):
@@ -105,11 +106,12 @@ class Manner(NamedTuple):
 
 @kernel
 def _lower(store: Store, index: int, value: int) -> None:
+    store.counters[_HOLDING] -= value <= 0 < store.weights[index]
     store.weights[index] = value
     if store.mark[index] != store.counters[_STEP]:
         store.mark[index] = np.int32(store.counters[_STEP])
-        store.lowered[store.counters[_LOWERED]] = index
-        store.counters[_LOWERED] += 1
+        store.lowered[store.counters[LOWERED]] = index
+        store.counters[LOWERED] += 1
 
 
 @kernel
@@ -144,22 +146,32 @@ def _merge_entry(store: Store, manner: Manner, origin: int, index: int, value: i
 
 
 @kernel
-def _walk_logs(store: Store, manner: Manner, logs: np.ndarray, source: int, apply: bool) -> int:
-    """Read all suffixes; apply what is new, or only check. The position at the end or negative."""
+def _walk_logs(store: Store, manner: Manner, logs: bytes, source: int, apply: bool) -> int:
+    """Read all suffixes; apply what is new, or only check.
+
+    Returns how many entries some log may then hold, or a negative number when malformed.
+    """
     ledger = manner.ledger
     at = 0
-    while at < logs.shape[0]:
+    entries = 0
+    longest = 0
+    while at < len(logs):
         origin, at = take_uint(logs, at)
         start, at = take_uint(logs, at)
         span, at = take_uint(logs, at)
         count, at = take_uint(logs, at)
-        if at < 0 or origin >= store.length.shape[0] or count > span or count > logs.shape[0]:
+        if at < 0 or origin >= store.length.shape[0] or count > span or count > len(logs):
             return -1
-        if start > _LENGTH_MAX or span > _LENGTH_MAX:
+        if start > LENGTH_MAX or span > LENGTH_MAX:
             return -1
         if (ledger and count != span) or (not ledger and origin != source):
             return -1
         held = store.length[origin]
+        entries += count
+        if not ledger:
+            longest = store.length[manner.me] + entries
+        elif start <= held + entries:  # it may follow on another suffix in this message
+            longest = max(longest, start + span)
         fresh = apply and origin != manner.me and (not ledger or start <= held)
         index = 0
         for i in range(count):
@@ -172,13 +184,13 @@ def _walk_logs(store: Store, manner: Manner, logs: np.ndarray, source: int, appl
                 _merge_entry(store, manner, origin, index, value)
         if fresh and not ledger and start <= held:
             store.length[origin] = max(held, start + span)
-    return at
+    return longest
 
 
 @kernel
-def _walk_claims(store: Store, manner: Manner, claims: np.ndarray, apply: bool) -> int:
+def _walk_claims(store: Store, manner: Manner, claims: bytes, apply: bool) -> int:
     at = 0
-    while at < claims.shape[0]:
+    while at < len(claims):
         origin, at = take_uint(claims, at)
         stamp, at = take_uint(claims, at)
         sample, at = take_uint(claims, at)
@@ -194,16 +206,26 @@ def _walk_claims(store: Store, manner: Manner, claims: np.ndarray, apply: bool) 
 
 
 @kernel
-def _walk_have(store: Store, manner: Manner, have: np.ndarray, source: int, apply: bool) -> int:
-    origins = store.length.shape[0]
+def _is_vector(store: Store, manner: Manner, have: bytes) -> bool:
+    """Whether these are as many numbers as a version vector has, told by their last bytes."""
+    numbers = 0
+    length = 0
+    for i in range(len(have)):
+        length += 1
+        if have[i] < 128:
+            numbers += 1
+            length = 0
+        elif length >= 9:  # see `take_uint`
+            return False
+    return length == 0 and numbers == store.length.shape[0] * (2 if manner.claims else 1)
+
+
+@kernel
+def _apply_have(store: Store, manner: Manner, have: bytes, source: int) -> None:
     at = 0
-    for slot in range(2 * origins if manner.claims else origins):
+    for slot in range(store.length.shape[0] * (2 if manner.claims else 1)):
         held, at = take_uint(have, at)
-        if at < 0:
-            return -1
-        if apply:
-            store.known[source, slot] = max(store.known[source, slot], held)
-    return at if at == have.shape[0] else -1
+        store.known[source, slot] = max(store.known[source, slot], held)
 
 
 @kernel
@@ -227,13 +249,14 @@ def _learn(
     mark: np.ndarray,
     counters: np.ndarray,
     law: np.ndarray,
-    have: np.ndarray,
-    logs: np.ndarray,
-    registers: np.ndarray,
+    have: bytes,
+    logs: bytes,
+    registers: bytes,
     source: int,
 ) -> int:
-    """Check a message whole, then apply it whole; no change when it is malformed or too long.
+    """Check a message whole, then apply it whole.
 
+    Returns _LEARNT; or _MALFORMED or the length that logs must have room for, and nothing changed.
     Store and Manner come field by field, see `kernels`.
     """
     store = Store(
@@ -250,18 +273,16 @@ def _learn(
         counters,
     )
     manner = _manner(law)
+    longest = _walk_logs(store, manner, logs, source, False)
     if (
-        _walk_have(store, manner, have, source, False) < 0
-        or _walk_logs(store, manner, logs, source, False) < 0
+        longest < 0
+        or not _is_vector(store, manner, have)
         or _walk_claims(store, manner, registers, False) < 0
     ):
         return _MALFORMED
-    longest = 0
-    for origin in range(length.shape[0]):
-        longest = max(longest, length[origin])
-    if (longest if manner.ledger else length[manner.me]) + logs.shape[0] // 2 > log_index.shape[1]:
-        return _NO_ROOM
-    _walk_have(store, manner, have, source, True)
+    if longest > log_index.shape[1]:
+        return longest
+    _apply_have(store, manner, have, source)
     _walk_logs(store, manner, logs, source, True)
     if manner.claims:
         _walk_claims(store, manner, registers, True)
@@ -284,12 +305,11 @@ def _find_neighbours(store: Store, manner: Manner, target: int, out: np.ndarray)
 
 
 @kernel
-def _neighbours_lack(store: Store, neighbours: np.ndarray, slot: int) -> int:
+def _neighbours_lack(store: Store, neighbours: np.ndarray, origin: int, slot: int) -> int:
     """The least that any of them is known to hold in a slot of `known`; -1 if there is none.
 
     The origin of the slot itself does not count: it holds its own state.
     """
-    origin = slot % store.length.shape[0]
     least = -1
     for other in neighbours:
         if other != origin:
@@ -305,7 +325,7 @@ def _start_of_suffix(
     """First entry to send of an origin's log; its length when nothing is to be sent."""
     me, relay, patience = manner.me, manner.relay, manner.patience
     length = store.length[origin]
-    least = _neighbours_lack(store, neighbours, origin)
+    least = _neighbours_lack(store, neighbours, origin, origin)
     if least < 0 and target < 0 and manner.beacon:
         return 0
     if least < 0:
@@ -364,7 +384,7 @@ def _put_claims(
         ):
             continue
         if origin != me:
-            least = _neighbours_lack(store, neighbours, origins + origin)
+            least = _neighbours_lack(store, neighbours, origin, origins + origin)
             slack = 0 if relay else _CLAIM_RENEWAL_STEPS
             if least < 0 or least + slack >= stamp:
                 continue
@@ -467,6 +487,29 @@ def claim(claims: np.ndarray, counters: np.ndarray, me: int, sample: int, now_ns
     claims[_STAMP, me] = counters[_STEP]
 
 
+@kernel
+def _pack_lowered(
+    weights: np.ndarray, lowered: np.ndarray, counters: np.ndarray, out: np.ndarray
+) -> int:
+    """Pairs (sample, units left) in the order in which they fell; the bytes used, or that they are too many."""
+    count = counters[LOWERED]
+    if 20 * count > out.shape[0]:
+        return _NO_ROOM_TO_PACK
+    at = 0
+    before = 0
+    for i in range(count):
+        at = put_int(out, at, lowered[i] - before)
+        at = put_uint(out, at, weights[lowered[i]])
+        before = lowered[i]
+    return at
+
+
+@kernel
+def _end_step(counters: np.ndarray) -> None:
+    counters[LOWERED] = 0
+    counters[_STEP] += 1
+
+
 class Replica:
     """What one participant holds of everybody's state, and what it tells others.
 
@@ -515,7 +558,7 @@ class Replica:
             claims=np.zeros((4, origins), dtype=np.int64),
             lowered=np.zeros(samples, dtype=np.int64),
             mark=np.zeros(samples, dtype=np.int32),
-            counters=np.array([0, 1], dtype=np.int64),
+            counters=np.array([0, 1, samples], dtype=np.int64),
         )
         self.store.sending[1:3] = -1 - self.manner.patience
         self.store.claims[_SAMPLE] = NOBODY
@@ -530,6 +573,11 @@ class Replica:
         """(N,) units left in this participant's view."""
         return self.store.weights
 
+    @property
+    def empty(self) -> bool:
+        """Whether no sample has weight left in this participant's view."""
+        return self.store.counters.item(_HOLDING) == 0
+
     def entries(self, origin: int) -> list[tuple[int, int]]:
         """The held log of an origin, as (sample, value); with min only the own log is held."""
         row, length = (origin if self.manner.ledger else 0), int(self.store.length[origin])
@@ -542,25 +590,26 @@ class Replica:
         """Take in a message; False, and nothing changed, when it is malformed."""
         if registers and not self.registers.sound(registers):
             return False
-        parts = [np.frombuffer(part, dtype=np.uint8) for part in (have, logs, claims)]
-        outcome = _learn(*self._fields, *parts, source)
-        if outcome == _NO_ROOM:
-            self.reserve(len(logs) // 2)
-            outcome = _learn(*self._fields, *parts, source)
+        outcome = _learn(*self._fields, have, logs, claims, source)
+        if outcome > _LEARNT:
+            self._lengthen(outcome)
+            outcome = _learn(*self._fields, have, logs, claims, source)
         if outcome == _LEARNT and registers:
             self.registers.learn(source, registers)
-        return outcome == _LEARNT
+        return bool(outcome == _LEARNT)
 
     def reserve(self, entries: int) -> None:
         """Make room for this many more entries in every log."""
         written = self.store.length if self.manner.ledger else self.store.length[self.manner.me]
-        needed = int(written.max()) + entries
-        capacity = self.store.log_index.shape[1]
+        self._lengthen(int(written.max()) + entries)
+
+    def _lengthen(self, needed: int) -> None:
+        """Make room for this many entries in every log."""
+        rows, capacity = self.store.log_index.shape
         if needed <= capacity:
             return
         while capacity < needed:
             capacity *= 2
-        rows = self.store.log_index.shape[0]
         grown = [np.zeros((rows, capacity), dtype=np.int32) for _ in range(2)]
         for new, old in zip(grown, (self.store.log_index, self.store.log_value), strict=True):
             new[:, : old.shape[1]] = old
@@ -581,21 +630,25 @@ class Replica:
     def compose(self, target: int = NOBODY) -> tuple[bytes, bytes, bytes]:
         """(have, logs, claims) for one message to everybody, or to one participant."""
         end_of_have, end_of_logs, end = _compose(*self._fields, self._out, self._room, target)
-        out = self._out
-        return (
-            out[:end_of_have].tobytes(),
-            out[end_of_have:end_of_logs].tobytes(),
-            out[end_of_logs:end].tobytes(),
-        )
+        told = self._out[:end].tobytes()
+        return told[:end_of_have], told[end_of_have:end_of_logs], told[end_of_logs:]
 
     def lowered(self) -> npt.NDArray[np.int64]:
         """Samples whose weight fell in this step, each once; a view valid until `end_step`."""
-        return self.store.lowered[: self.store.counters[_LOWERED]]
+        return self.store.lowered[: self.store.counters.item(LOWERED)]
+
+    def packed_lowered(self) -> bytes:
+        """Packed pairs (sample, units left) of what fell in this step."""
+        store = self.store
+        used = _pack_lowered(store.weights, store.lowered, store.counters, self._out)
+        if used == _NO_ROOM_TO_PACK:
+            index = self.lowered()
+            return Pairs().encode(index, store.weights[index], index.shape[0])
+        return self._out[:used].tobytes()
 
     def end_step(self) -> None:
         """Begin the next step."""
-        self.store.counters[_LOWERED] = 0
-        self.store.counters[_STEP] += 1
+        _end_step(self.store.counters)
         self.registers.end_step()
 
 
@@ -609,7 +662,7 @@ def _read_logs(logs: np.ndarray, rows: np.ndarray) -> int:
         _span, at = take_uint(logs, at)
         count, at = take_uint(logs, at)
         index = 0
-        if at < 0 or start > _LENGTH_MAX or count > logs.shape[0]:
+        if at < 0 or start > LENGTH_MAX or count > logs.shape[0]:
             return -1
         for i in range(count):
             step, at = take_int(logs, at)

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from kantor_protocol.kernels import kernel
 from kantor_protocol.packing import Pairs
 
 Weights = npt.NDArray[np.int64]
@@ -50,6 +51,20 @@ class WeightsMessage(msgspec.Struct, frozen=True, array_like=True, tag=20):
     each with its new value, as LEB128 pairs."""
 
 
+@kernel
+def _note(
+    lowered: np.ndarray, changed: np.ndarray, count: int, noted_in: np.ndarray, message: int
+) -> int:
+    """Put indices that this message does not have yet behind changed[:count]; how many there are."""
+    for i in range(lowered.shape[0]):
+        j = lowered[i]
+        if noted_in[j] != message:
+            noted_in[j] = message
+            changed[count] = j
+            count += 1
+    return count
+
+
 class WeightsPublisher:
     """Gathers what fell in a weight vector and turns it into messages."""
 
@@ -63,7 +78,10 @@ class WeightsPublisher:
         self._keyframe_every = keyframe_every
         self._steps = 0
         self._sequence = 0
-        self._changed: list[npt.NDArray[np.int64]] = []
+        self._changed = np.zeros(weights.shape[0], dtype=np.int64)
+        self._count = 0
+        self._noted_in = np.zeros(weights.shape[0], dtype=np.int64)
+        self._pairs = Pairs()
 
     def step(self, lowered: npt.NDArray[np.int64], *, last: bool) -> bytes:
         """Note the indices that fell; the encoded message when one is due, else nothing.
@@ -71,24 +89,30 @@ class WeightsPublisher:
         last: nothing will fall any more, so a message is due now.
         """
         if lowered.size:
-            self._changed.append(lowered.copy())
-        due = self._steps % self._every == 0 or (last and bool(self._changed))
+            self._count = _note(
+                lowered, self._changed, self._count, self._noted_in, self._sequence + 1
+            )
+        due = self._steps % self._every == 0 or (last and self._count > 0)
         self._steps += 1
         if not due:
             return b""
         keyframe = self._sequence % self._keyframe_every == 0
         self._sequence += 1
-        content = None if keyframe else _changes(self._weights, self._changed)
-        self._changed = []
+        content = _keyframe(self._weights) if keyframe else self._changes()
+        self._count = 0
         return msgspec.msgpack.encode(
             WeightsMessage(
                 version=1,
                 sequence=self._sequence,
-                base=0 if content is None else self._sequence - 1,
+                base=0 if keyframe else self._sequence - 1,
                 size=self._weights.shape[0],
-                content=_keyframe(self._weights) if content is None else content,
+                content=content,
             )
         )
+
+    def _changes(self) -> bytes:
+        index = np.sort(self._changed[: self._count])
+        return self._pairs.encode(index, self._weights[index], self._count)
 
 
 class WeightsSubscriber:
@@ -98,6 +122,7 @@ class WeightsSubscriber:
         self.weights: Weights | None = None
         """None until the first keyframe, and again after a gap until the next one."""
         self._sequence = 0
+        self._pairs = Pairs()
         self._decoder = msgspec.msgpack.Decoder(WeightsMessage)
 
     def take(self, payload: bytes) -> bool:
@@ -117,10 +142,17 @@ class WeightsSubscriber:
             self.weights is None
             or message.base != self._sequence
             or message.size != self.weights.shape[0]
-        ) or not _apply(self.weights, message.content):
+        ) or not self._apply(self.weights, message.content):
             self.weights = None
             return False
         self._sequence = message.sequence
+        return True
+
+    def _apply(self, weights: Weights, content: bytes) -> bool:
+        pairs = self._pairs.decode(content, weights.shape[0])
+        if pairs is None or bool(np.any(pairs[1] > weights[pairs[0]])):
+            return False
+        weights[pairs[0]] = pairs[1]
         return True
 
 
@@ -140,18 +172,3 @@ def _from_keyframe(content: bytes, size: int) -> Weights | None:
         if len(raw) == size * kind.itemsize:
             return np.frombuffer(raw, dtype=kind).astype(np.int64)
     return None
-
-
-def _changes(weights: Weights, changed: list[npt.NDArray[np.int64]]) -> bytes:
-    if not changed:
-        return b""
-    index = np.unique(np.concatenate(changed))
-    return Pairs(index.shape[0]).encode(index, weights[index], index.shape[0])
-
-
-def _apply(weights: Weights, content: bytes) -> bool:
-    pairs = Pairs().decode(content, weights.shape[0])
-    if pairs is None or bool(np.any(pairs[1] > weights[pairs[0]])):
-        return False
-    weights[pairs[0]] = pairs[1]
-    return True

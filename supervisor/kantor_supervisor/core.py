@@ -13,7 +13,6 @@ from kantor_protocol.machine import (
     State,
 )
 from kantor_protocol.messages import News
-from kantor_protocol.packing import Pairs
 from kantor_protocol.radio import Radio, replica_of
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.weights import Units, WeightsPublisher
@@ -32,7 +31,6 @@ class Supervisor:
             scenario.publish.weights_every,
             scenario.publish.keyframe_every,
         )
-        self._pairs = Pairs()
         self._pose = Pose(*scenario.supervisor_m)
         self._step = 0
 
@@ -40,13 +38,12 @@ class Supervisor:
         """Take in what the robots sent, tell everybody what they lack."""
         self._step += 1
         self._radio.hear(inputs.inbox, self._learn)
-        fallen = self._replica.lowered()
-        finished = not self._replica.weights.any()
+        finished = self._replica.empty
         outputs = Outputs(
             step=self._step,
             pose=self._pose,
-            lowered=self._pairs.encode(fallen, self._replica.weights[fallen], fallen.shape[0]),
-            weights=self._publisher.step(fallen, last=finished),
+            lowered=self._replica.packed_lowered(),
+            weights=self._publisher.step(self._replica.lowered(), last=finished),
             outbox=(self._radio.say(self._replica, EVERYBODY, self._step, self._pose),),
             state=State.FINISHED if finished else State.EXPLORING,
             refused=self._radio.refused,

@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.packing import MALFORMED, Pairs, put_int, put_uint, take_int, take_uint
+from kantor_protocol.packing import (
+    MALFORMED,
+    Pairs,
+    put_int,
+    put_uint,
+    sum_pairs,
+    take_int,
+    take_uint,
+)
 from strategies import COUNTS, examples
 
 BOUND = 5000
@@ -125,3 +133,12 @@ def test_room_grows_with_what_comes() -> None:
 
     assert arrays is not None
     assert [a.tolist() for a in arrays] == [index.tolist(), index.tolist()]
+
+
+@given(content=st.binary(max_size=60) | PAIRS.map(packed), bound=st.integers(1, 2 * BOUND))
+def test_sum_is_that_of_the_pairs(content: bytes, bound: int) -> None:
+    """Summed without unpacking: the same, or malformed, or more than anybody may ship."""
+    pairs = unpacked(content, bound)
+    total = MALFORMED if pairs is None else sum(value for _, value in pairs)
+
+    assert sum_pairs(content, bound) == (total if total <= 2**62 else MALFORMED)

@@ -172,6 +172,16 @@ def test_ledger_counts_what_was_really_shipped() -> None:
     assert [row.mass_double_counted for row in rows] == [0.0, 0.0, 0.25]
 
 
+def test_mass_left_is_that_of_the_least_view_even_if_views_rise() -> None:
+    """A record that is not sound is measured as it stands: the minimum over all views, sample by sample."""
+    line = Line()
+    line.play(line.act("r1", 10.0, 0, 0), line.act("r2", 10.0, 0, 1))
+    line.play(line.act("r1", 10.0, 0, 2), line.act("r2", 10.0, 1, 1))
+    line.play(line.act("r2", 10.0, 0, 2))
+
+    assert [row.mass_left for row in line.rows()] == [1.0, 0.5, 0.5, 0.75]
+
+
 @pytest.mark.parametrize("violation", ["step", "energy", "units"])
 def test_refused_spending_counts_for_nothing(violation: str) -> None:
     """What the world did not let happen is neither shipped nor energy."""

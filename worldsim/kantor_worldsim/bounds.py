@@ -16,9 +16,22 @@ from kantor_protocol.kernels import kernel
 
 _RATE = 0.05
 """How far a price moves, as a share of the mean distance, for an excess of one share."""
+_BLOCK = 512
+"""Samples whose distances to all robots are taken at a time."""
 _ROUNDS_FIRST = 50
 _PAIRS = 5_000_000
 """Robot-sample distances that one plan may cost."""
+
+
+@kernel
+def measure(samples_m: np.ndarray, x_m: float, y_m: float, way_m: np.ndarray) -> None:
+    """Distances from a place to samples. Two plain loops, since the compiler then takes many at a time."""
+    for j in range(samples_m.shape[0]):
+        dx = samples_m[j, 0] - x_m
+        dy = samples_m[j, 1] - y_m
+        way_m[j] = dx * dx + dy * dy
+    for j in range(samples_m.shape[0]):
+        way_m[j] = math.sqrt(way_m[j])
 
 
 @kernel
@@ -29,33 +42,34 @@ def _bid(
     prices_m: np.ndarray,
     loads: np.ndarray,
     ways: np.ndarray,
+    block_m: np.ndarray,
 ) -> None:
     """Let every sample with mass left choose its robot.
 
     Fills loads (n,), the units that chose a robot, and ways (n, n): of those, units times distance to
-    each robot.
+    each robot. block_m: (n, B) room for the distances of one block of samples.
     """
     robots = robots_m.shape[0]
     for k in range(robots):
         loads[k] = 0.0
         for q in range(robots):
             ways[k, q] = 0.0
-    for j in range(xy_m.shape[0]):
-        if left[j] <= 0:
-            continue
-        best = 0
-        least_m = math.inf
+    for first in range(0, xy_m.shape[0], block_m.shape[1]):
+        last = min(first + block_m.shape[1], xy_m.shape[0])
         for k in range(robots):
-            dx = xy_m[j, 0] - robots_m[k, 0]
-            dy = xy_m[j, 1] - robots_m[k, 1]
-            net_m = math.sqrt(dx * dx + dy * dy) - prices_m[k]
-            if net_m < least_m:
-                best, least_m = k, net_m
-        loads[best] += left[j]
-        for k in range(robots):
-            dx = xy_m[j, 0] - robots_m[k, 0]
-            dy = xy_m[j, 1] - robots_m[k, 1]
-            ways[best, k] += left[j] * math.sqrt(dx * dx + dy * dy)
+            measure(xy_m[first:last], robots_m[k, 0], robots_m[k, 1], block_m[k])
+        for j in range(first, last):
+            if left[j] <= 0:
+                continue
+            best = 0
+            least_m = math.inf
+            for k in range(robots):
+                net_m = block_m[k, j - first] - prices_m[k]
+                if net_m < least_m:
+                    best, least_m = k, net_m
+            loads[best] += left[j]
+            for k in range(robots):
+                ways[best, k] += left[j] * block_m[k, j - first]
 
 
 @kernel
@@ -91,6 +105,7 @@ class Auction:
         self._prices_m = np.zeros(robots)
         self._loads = np.zeros(robots)
         self._ways = np.zeros((robots, robots))
+        self._block_m = np.zeros((robots, _BLOCK))
         affordable = max(1, _PAIRS // (robots * samples))
         self._rounds = min(_ROUNDS_FIRST, affordable)
         self._rounds_later = min(every, _ROUNDS_FIRST, affordable)
@@ -104,7 +119,7 @@ class Auction:
         """Units times metres to ship `left` (N,) from the robots (n, 2) to the samples (N, 2)."""
         cost = math.inf
         for _ in range(self._rounds):
-            _bid(xy_m, robots_m, left, self._prices_m, self._loads, self._ways)
+            _bid(xy_m, robots_m, left, self._prices_m, self._loads, self._ways, self._block_m)
             cost = min(cost, _settle(self._loads, self._ways, self._prices_m))
         self._rounds = self._rounds_later
         return cost

@@ -1,42 +1,448 @@
-"""Referees that read only the record. Each rule is one method; each can fail, and a test shows how.
+"""Referees that read only the record. Each rule can fail, and a test shows how.
 
 A complaint is one line: rule, time, who, what. A run is clean when there is none.
+
+Rules on numbers are kernels over the tables of a batch (`reading.py`). A fault is noted as a row of
+numbers and put into words afterwards, with the record at hand: a sound run, which is nearly every run,
+then costs little more than reading it.
 """
 
 import math
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from kantor_protocol.kernels import kernel
-from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, Outputs, ParticipantId, Pose
+from kantor_protocol.machine import Outputs, ParticipantId, Pose
 from kantor_protocol.messages import RefusedError, decode_news
 from kantor_protocol.modes import rectangle_of, visit_at
-from kantor_protocol.packing import Pairs
+from kantor_protocol.packing import Pairs, take_int, take_uint
 from kantor_protocol.registers import read_register
-from kantor_protocol.replica import read_have, read_logs
+from kantor_protocol.replica import LENGTH_MAX
 from kantor_protocol.weights import WeightsSubscriber
-from kantor_worldsim.channel import DROPPED, Verdict
+from kantor_worldsim import reading as of
+from kantor_worldsim.channel import DROPPED
 from kantor_worldsim.exact import ROUNDING
 from kantor_worldsim.metrics import Row
+from kantor_worldsim.reading import Reader, Reading
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
 from kantor_worldsim.world import SPEED_TOLERANCE
 
 _COMPLAINTS_MAX = 100
 """A broken record is broken; further complaints only count."""
 
+# Faults that kernels find.
+_UNHEARD, _NEVER_SENT, _FOR_ANOTHER, _TOO_FAR = 0, 1, 2, 3
+_STEP, _SPEED, _GARBLED_SPENT, _POINT, _BUDGET, _MISCOUNT = 4, 5, 6, 7, 8, 9
+_GARBLED_LOWERED, _RISE, _BELOW, _UNREADABLE, _LOG = 10, 11, 12, 13, 14
+_OF_VERDICTS = (_NEVER_SENT, _FOR_ANOTHER, _TOO_FAR)
+_NO_LOGS, _NO_POSTED, _NO_FLIGHTS = -1, -2, -3
+_GROWING = {_NO_LOGS: "logs", _NO_POSTED: "posted", _NO_FLIGHTS: "flights"}
+
+_WORDS = {
+    _UNHEARD: ("delivery", "heard {what}, which was not delivered"),
+    _NEVER_SENT: ("delivery", "{what} was never sent"),
+    _FOR_ANOTHER: ("delivery", "delivered what was for somebody else"),
+    _TOO_FAR: ("range", "{what} over {x:.6g} m"),
+    _STEP: ("order", "step {a}, expected {b}"),
+    _SPEED: ("speed", "moved {x:.6g} m, allowed {y:.6g} m"),
+    _GARBLED_SPENT: ("energy", "spending that does not decode"),
+    _POINT: ("energy", "{a} units in one point"),
+    _BUDGET: ("energy", "{a} points shipped"),
+    _MISCOUNT: ("energy", "counts {a} of {b} points"),
+    _GARBLED_LOWERED: ("weights", "entries that do not decode"),
+    _RISE: ("weights", "sample {item} from {a} to {b} units"),
+    _BELOW: ("credit", "its view of sample {item} is below the truth"),
+    _UNREADABLE: ("ledger", "sends what nobody can read{what}"),
+    _LOG: ("ledger", "its log from {a} on is not what it consumed"),
+}
+"""Rule and text of each fault."""
+
+# Columns of State.book.
+_STEPS, _ABSENCES, _MOVED_NS, _POINTS, _ENTRIES, _POSTED, _FLYING, _TOLD, _COMING = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+)
+
+
+class State(NamedTuple):
+    """What the kernels keep of the run so far. n participants, N samples."""
+
+    book: npt.NDArray[np.int64]
+    """(n, 11): last step, absences since, time of the last move, points shipped; rows used of its
+    logs, posted and flights; whether it has sent a version vector; rows that this batch brings."""
+    poses_m: npt.NDArray[np.float64]
+    """(n, 2) world frame."""
+    views: npt.NDArray[np.int64]
+    """(n, N) the weight vector of each, in units."""
+    consumed: npt.NDArray[np.int64]
+    """(N,) units shipped by all."""
+    logs: npt.NDArray[np.int64]
+    """(n, rows, 2): sample, units; what each has consumed."""
+    posted: npt.NDArray[np.int64]
+    """(n, rows, 2): sequence, target of what each has sent."""
+    flights: npt.NDArray[np.int64]
+    """(n, rows, 3): source, sequence, due_ns of what is on its way to each."""
+    have: npt.NDArray[np.int64]
+    """(n, n) log lengths that each said last it holds."""
+    faults: npt.NDArray[np.int64]
+    """(rows, 5): fault, act or verdict, item of it, two numbers."""
+    lengths_m: npt.NDArray[np.float64]
+    """(rows, 2): lengths of the fault."""
+    found: npt.NDArray[np.int64]
+    """(1,) how many faults this batch has."""
+
+
+class Law(NamedTuple):
+    """What the scenario allows."""
+
+    sample_units: int
+    point_units: int
+    budget: int
+    ledger: bool
+    supervisor: int
+    """Its place, or a place that nobody has."""
+    speed_m_s: float
+    range_m: float
+    supervisor_range_m: float
+
 
 @kernel
-def _fall(
-    view: np.ndarray, consumed: np.ndarray, whole: int, sample: np.ndarray, left: np.ndarray
-) -> bool:
-    """Put entries into a view; whether each one fell, and none below what the truth leaves."""
-    sound = True
-    for i in range(sample.shape[0]):
-        j = sample[i]
-        sound = sound and left[i] < view[j] and left[i] >= whole - consumed[j]
-        view[j] = left[i]
-    return sound
+def _note(
+    state: State, fault: int, row: int, item: int, a: int, b: int, x_m: float, y_m: float
+) -> None:
+    at = state.found[0]
+    state.found[0] += 1
+    if at < state.faults.shape[0]:
+        noted = state.faults[at]
+        noted[0], noted[1], noted[2], noted[3], noted[4] = fault, row, item, a, b
+        state.lengths_m[at, 0], state.lengths_m[at, 1] = x_m, y_m
+
+
+@kernel
+def _lacking(state: State, reading: Reading) -> int:
+    """Which array has no room for this batch behind what is held of somebody, or 0."""
+    book = state.book
+    book[:, _COMING:] = 0
+    for row in range(reading.sizes[of.ACTS]):
+        act = reading.acts[row]
+        if act[of.PLACE] >= 0 and act[of.PRESENT]:
+            book[act[of.PLACE], _COMING] += max(0, act[of.SPENT_COUNT])
+    for row in range(reading.sizes[of.ALL_SENT]):
+        if reading.sent[row, of.SOURCE] >= 0:
+            book[reading.sent[row, of.SOURCE], _COMING + 1] += 1
+    for row in range(reading.sizes[of.VERDICTS]):
+        if reading.verdicts[row, of.TARGET] >= 0:
+            book[reading.verdicts[row, of.TARGET], _COMING + 2] += 1
+    for who in range(book.shape[0]):
+        if book[who, _ENTRIES] + book[who, _COMING] > state.logs.shape[1]:
+            return _NO_LOGS
+        if book[who, _POSTED] + book[who, _COMING + 1] > state.posted.shape[1]:
+            return _NO_POSTED
+        if book[who, _FLYING] + book[who, _COMING + 2] > state.flights.shape[1]:
+            return _NO_FLIGHTS
+    return 0
+
+
+@kernel
+def _check_inbox(state: State, reading: Reading, row: int, now_ns: int) -> None:
+    act = reading.acts[row]
+    who = act[of.PLACE]
+    flights = state.flights[who]
+    for item in range(act[of.HEARD_COUNT]):
+        heard = reading.heard[act[of.HEARD] + item]
+        first = -1  # the copy that arrived first
+        for i in range(state.book[who, _FLYING]):
+            if (
+                flights[i, 0] == heard[of.SOURCE]
+                and flights[i, 1] == heard[of.SEQUENCE]
+                and flights[i, 2] <= now_ns
+                and (first < 0 or flights[i, 2] < flights[first, 2])
+            ):
+                first = i
+        if first < 0:
+            _note(state, _UNHEARD, row, item, 0, 0, 0.0, 0.0)
+            continue
+        state.book[who, _FLYING] -= 1
+        last = state.book[who, _FLYING]
+        for column in range(3):
+            flights[first, column] = flights[last, column]
+
+
+@kernel
+def _post(state: State, reading: Reading, row: int) -> None:
+    act = reading.acts[row]
+    for sent in range(act[of.SENT], act[of.SENT] + act[of.SENT_COUNT]):
+        source = reading.sent[sent, of.SOURCE]
+        if source >= 0:
+            posted = state.posted[source, state.book[source, _POSTED]]
+            posted[0], posted[1] = reading.sent[sent, of.SEQUENCE], reading.sent[sent, of.TARGET]
+            state.book[source, _POSTED] += 1
+
+
+@kernel
+def _find_posted(state: State, source: int, sequence: int) -> int:
+    """The row in which a source has sent something under this number last; negative if it has not."""
+    if source >= 0:
+        for i in range(state.book[source, _POSTED] - 1, -1, -1):
+            if state.posted[source, i, 0] == sequence:
+                return i
+    return -1
+
+
+@kernel
+def _check_verdict(state: State, law: Law, reading: Reading, row: int) -> None:
+    verdict = reading.verdicts[row]
+    source, sequence = verdict[of.SOURCE], verdict[of.SEQUENCE]
+    receiver, due_ns = verdict[of.TARGET], verdict[of.DUE_NS]
+    at = _find_posted(state, source, sequence)
+    if at < 0 or receiver < 0:
+        _note(state, _NEVER_SENT, row, 0, 0, 0, 0.0, 0.0)
+        return
+    target = state.posted[source, at, 1]
+    if target not in (of.EVERYBODY_PLACE, receiver):
+        _note(state, _FOR_ANOTHER, row, 0, 0, 0, 0.0, 0.0)
+    if due_ns == DROPPED:
+        return
+    by_supervisor = law.supervisor in (source, receiver)
+    range_m = law.supervisor_range_m if by_supervisor else law.range_m
+    dx = state.poses_m[receiver, 0] - state.poses_m[source, 0]
+    dy = state.poses_m[receiver, 1] - state.poses_m[source, 1]
+    if not dx * dx + dy * dy <= range_m * range_m:
+        _note(state, _TOO_FAR, row, 0, 0, 0, math.hypot(dx, dy), 0.0)
+    flight = state.flights[receiver, state.book[receiver, _FLYING]]
+    flight[0], flight[1], flight[2] = source, sequence, due_ns
+    state.book[receiver, _FLYING] += 1
+
+
+@kernel
+def _check_order(state: State, reading: Reading, row: int) -> None:
+    act = reading.acts[row]
+    book = state.book[act[of.PLACE]]
+    expected = book[_STEPS] + 1
+    if not expected <= act[of.STEP] <= expected + book[_ABSENCES]:
+        _note(state, _STEP, row, 0, act[of.STEP], expected, 0.0, 0.0)
+    book[_STEPS], book[_ABSENCES] = act[of.STEP], 0
+
+
+@kernel
+def _check_speed(state: State, law: Law, reading: Reading, row: int) -> None:
+    act = reading.acts[row]
+    who = act[of.PLACE]
+    elapsed_ns = act[of.NOW_NS] - state.book[who, _MOVED_NS]
+    limit_m_s = 0.0 if who == law.supervisor else law.speed_m_s
+    limit_m = limit_m_s * elapsed_ns * 1e-9 * (1.0 + 2.0 * SPEED_TOLERANCE)
+    x_m, y_m = reading.poses_m[row, 0], reading.poses_m[row, 1]
+    way_m = math.hypot(x_m - state.poses_m[who, 0], y_m - state.poses_m[who, 1])
+    if not way_m <= limit_m:
+        _note(state, _SPEED, row, 0, 0, 0, way_m, limit_m)
+    state.book[who, _MOVED_NS] = act[of.NOW_NS]
+    state.poses_m[who, 0], state.poses_m[who, 1] = x_m, y_m
+
+
+@kernel
+def _check_energy(state: State, law: Law, reading: Reading, row: int) -> None:
+    act = reading.acts[row]
+    who = act[of.PLACE]
+    book = state.book[who]
+    if act[of.SPENT_COUNT] == of.NOT_DECODED:
+        _note(state, _GARBLED_SPENT, row, 0, 0, 0, 0.0, 0.0)
+        return
+    shipped = 0
+    for i in range(act[of.SPENT], act[of.SPENT] + act[of.SPENT_COUNT]):
+        sample, units = reading.pairs[i, of.SAMPLE], reading.pairs[i, of.UNITS]
+        shipped += units
+        state.consumed[sample] += units
+        if law.ledger:
+            state.logs[who, book[_ENTRIES], 0] = sample
+            state.logs[who, book[_ENTRIES], 1] = units
+            book[_ENTRIES] += 1
+    book[_POINTS] += act[of.SPENT_COUNT] > 0
+    points = book[_POINTS]
+    if shipped > law.point_units:
+        _note(state, _POINT, row, 0, shipped, 0, 0.0, 0.0)
+    if points > law.budget:
+        _note(state, _BUDGET, row, 0, points, 0, 0.0, 0.0)
+    if act[of.ENERGY] < points and who != law.supervisor:
+        _note(state, _MISCOUNT, row, 0, act[of.ENERGY], points, 0.0, 0.0)
+
+
+@kernel
+def _check_weights(state: State, law: Law, reading: Reading, row: int) -> None:
+    act = reading.acts[row]
+    view = state.views[act[of.PLACE]]
+    if act[of.LOWERED_COUNT] == of.NOT_DECODED:
+        _note(state, _GARBLED_LOWERED, row, 0, 0, 0, 0.0, 0.0)
+    for i in range(act[of.LOWERED], act[of.LOWERED] + max(0, act[of.LOWERED_COUNT])):
+        sample, left = reading.pairs[i, of.SAMPLE], reading.pairs[i, of.UNITS]
+        if left >= view[sample]:
+            _note(state, _RISE, row, sample, view[sample], left, 0.0, 0.0)
+        if left < law.sample_units - state.consumed[sample]:
+            _note(state, _BELOW, row, sample, 0, 0, 0.0, 0.0)
+        view[sample] = left
+
+
+@kernel
+def _check_ledger(state: State, reading: Reading, row: int, item: int) -> None:
+    """Own entries that a participant sends are the ones it consumed, one for one."""
+    who = reading.acts[row, of.PLACE]
+    sent = reading.sent[reading.acts[row, of.SENT] + item]
+    payload = reading.payload
+    have, have_end, at, end = of.parts_of_news(payload, sent[of.BODY], sent[of.BODY_END])
+    if end < 0 or not _is_log(payload, at, end) or not _is_vector(state, payload, have, have_end):
+        _note(state, _UNREADABLE, row, item, 0, 0, 0.0, 0.0)
+        return
+    for origin in range(state.have.shape[1]):
+        state.have[who, origin], have = take_uint(payload, have)
+    state.book[who, _TOLD] = 1
+    told = -1
+    start = 0
+    while at < end:
+        origin, at = take_uint(payload, at)
+        first, at = take_uint(payload, at)
+        _span, at = take_uint(payload, at)
+        count, at = take_uint(payload, at)
+        if origin == who and told < 0 and count > 0:
+            start, told = first, first
+        sample = 0
+        for _ in range(count):
+            step, at = take_int(payload, at)
+            units, at = take_uint(payload, at)
+            sample += step
+            if origin == who:
+                if not (
+                    told < state.book[who, _ENTRIES]
+                    and state.logs[who, told, 0] == sample
+                    and state.logs[who, told, 1] == units
+                ):
+                    _note(state, _LOG, row, item, start, 0, 0.0, 0.0)
+                    return
+                told += 1
+
+
+@kernel
+def _is_log(payload: bytes, at: int, end: int) -> bool:
+    """Whether payload[at:end] is a row of suffixes, see News.logs."""
+    while 0 <= at < end:
+        _origin, at = take_uint(payload, at)
+        start, at = take_uint(payload, at)
+        _span, at = take_uint(payload, at)
+        count, at = take_uint(payload, at)
+        if at < 0 or start > LENGTH_MAX or count > end - at:
+            return False
+        for _ in range(2 * count):
+            _value, at = take_uint(payload, at)
+    return at == end
+
+
+@kernel
+def _is_vector(state: State, payload: bytes, at: int, end: int) -> bool:
+    """Whether payload[at:end] begins with a log length for every participant."""
+    for _ in range(state.have.shape[1]):
+        _length, at = take_uint(payload, at)
+    return 0 <= at <= end
+
+
+@kernel
+def _check(
+    payload: bytes,
+    sizes: np.ndarray,
+    acts: np.ndarray,
+    ruled_m: np.ndarray,
+    heard: np.ndarray,
+    sent: np.ndarray,
+    verdicts: np.ndarray,
+    pairs: np.ndarray,
+    book: np.ndarray,
+    poses_m: np.ndarray,
+    views: np.ndarray,
+    consumed: np.ndarray,
+    logs: np.ndarray,
+    posted: np.ndarray,
+    flights: np.ndarray,
+    have: np.ndarray,
+    faults: np.ndarray,
+    lengths_m: np.ndarray,
+    found: np.ndarray,
+    sample_units: int,
+    point_units: int,
+    budget: int,
+    ledger: bool,
+    supervisor: int,
+    speed_m_s: float,
+    range_m: float,
+    supervisor_range_m: float,
+    now_ns: int,
+) -> int:
+    """Follow one batch; how many faults it has, or which array has no room, and nothing has changed."""
+    reading = Reading(payload, sizes, acts, ruled_m, heard, sent, verdicts, pairs)
+    state = State(
+        book,
+        poses_m,
+        views,
+        consumed,
+        logs,
+        posted,
+        flights,
+        have,
+        faults,
+        lengths_m,
+        found,
+    )
+    law = Law(
+        sample_units,
+        point_units,
+        budget,
+        ledger,
+        supervisor,
+        speed_m_s,
+        range_m,
+        supervisor_range_m,
+    )
+    lacking = _lacking(state, reading)
+    if lacking < 0:
+        return lacking
+    found[0] = 0
+    for row in range(sizes[of.ACTS]):
+        if acts[row, of.PLACE] >= 0:
+            _check_inbox(state, reading, row, now_ns)
+            _post(state, reading, row)
+    for row in range(sizes[of.VERDICTS]):
+        _check_verdict(state, law, reading, row)
+    for row in range(sizes[of.ACTS]):
+        who = acts[row, of.PLACE]
+        if who < 0:
+            continue
+        if not acts[row, of.PRESENT]:
+            book[who, _ABSENCES] += 1
+            continue
+        _check_order(state, reading, row)
+        _check_speed(state, law, reading, row)
+        _check_energy(state, law, reading, row)
+        _check_weights(state, law, reading, row)
+        for item in range(acts[row, of.SENT_COUNT] if ledger else 0):
+            _check_ledger(state, reading, row, item)
+    return found[0]
+
+
+@kernel
+def _equals(weights: np.ndarray, views: np.ndarray, who: int) -> bool:
+    """Whether a published vector is the view of a participant, entry for entry."""
+    if weights.shape[0] != views.shape[1]:
+        return False
+    differing = 0
+    for j in range(weights.shape[0]):
+        differing += weights[j] != views[who, j]
+    return differing == 0
 
 
 class Checker:
@@ -61,10 +467,12 @@ class Checker:
     ruling      the world found no fault of its own
     """
 
-    def __init__(self) -> None:
+    def __init__(self, reader: Reader | None = None) -> None:
+        """reader: the one that another referee of the same run reads by."""
         self.complaints: list[str] = []
         self.count = 0
         """All complaints, also those beyond the ones that are kept."""
+        self._reader = reader or Reader()
         self._opening: Opening | None = None
         self._ended = False
         self._now_ns = 0
@@ -103,124 +511,105 @@ class Checker:
             self.complaints.append(f"{rule}: t={self._now_ns * 1e-9:.3f} s: {who}: {what}")
 
     def _open(self, opening: Opening) -> None:
+        self._reader.read(opening)
         scenario, site = opening.scenario, opening.site
         self._opening, self._scenario, self._units = opening, scenario, opening.units
         self._samples = site.samples_m.shape[0]
         names = scenario.roster
         self._places = {name: i for i, name in enumerate(names)}
-        starts = [Pose(float(x), float(y)) for x, y in site.starts_m]
-        if scenario.centralized:
-            starts.append(Pose(*scenario.supervisor_m))
-        self._poses = dict(zip(names, starts, strict=True))
-        self._moved_ns = dict.fromkeys(names, 0)
-        self._steps = dict.fromkeys(names, 0)
-        self._points = dict.fromkeys(names, 0)
-        self._views = np.full((len(names), self._samples), self._units.sample, dtype=np.int64)
-        self._own_spent: dict[ParticipantId, list[list[int]]] = {name: [] for name in names}
         self._subscribers = {name: WeightsSubscriber() for name in names}
-        self._have: dict[ParticipantId, list[int]] = {}
-        self._consumed = np.zeros(self._samples, dtype=np.int64)
-        self._absences = dict.fromkeys(names, 0)
+        self._samples_by_place = None
+        self._law = Law(
+            sample_units=self._units.sample,
+            point_units=self._units.point,
+            budget=scenario.steps_per_robot,
+            ledger=scenario.merge == "ledger",
+            supervisor=scenario.robots.count,
+            speed_m_s=scenario.vehicle.speed_m_s,
+            range_m=scenario.radio.range_m,
+            supervisor_range_m=scenario.supervisor.range_m,
+        )
+        poses_m = np.zeros((len(names), 2))
+        poses_m[-1] = scenario.supervisor_m
+        poses_m[: scenario.robots.count] = site.starts_m
+        self._state = State(
+            book=np.zeros((len(names), 11), dtype=np.int64),
+            poses_m=poses_m,
+            views=np.full((len(names), self._samples), self._units.sample, dtype=np.int64),
+            consumed=np.zeros(self._samples, dtype=np.int64),
+            logs=np.zeros((len(names), 256, 2), dtype=np.int64),
+            posted=np.zeros((len(names), 256, 2), dtype=np.int64),
+            flights=np.zeros((len(names), 64, 3), dtype=np.int64),
+            have=np.zeros((len(names), len(names)), dtype=np.int64),
+            faults=np.zeros((_COMPLAINTS_MAX, 5), dtype=np.int64),
+            lengths_m=np.zeros((_COMPLAINTS_MAX, 2)),
+            found=np.zeros(1, dtype=np.int64),
+        )
+        self._arguments = (*self._state, *self._law)
         self._registers = np.zeros((len(names), scenario.register_width), dtype=np.int64)
         self._rectangle = rectangle_of(scenario.domain)
-        self._said = dict(self._poses)
+        self._said: dict[ParticipantId, Pose] = {}
         self._missed: set[ParticipantId] = set()
-        self._in_flight: dict[tuple[ParticipantId, int, ParticipantId], list[int]] = {}
-        self._sent: dict[tuple[ParticipantId, int], ParticipantId] = {}
 
     def _check(self, batch: Batch) -> None:
         if batch.now_ns < self._now_ns:
             self._complain("order", "record", f"time runs back to {batch.now_ns * 1e-9:.3f} s")
         self._now_ns = batch.now_ns
-        acts = [act for act in batch.acts if act.name in self._places]
-        for stranger in (act.name for act in batch.acts if act.name not in self._places):
-            self._complain("order", stranger, "not in the roster")
-        for act in acts:
-            self._check_inbox(act)
-            for envelope in act.outputs.outbox if act.outputs else ():
-                self._sent[envelope.source, envelope.sequence] = envelope.target
-        for verdict in batch.verdicts:
-            self._check_verdict(verdict)
-        for act in acts:
-            if act.outputs is None or act.ruling is None:
-                self._absences[act.name] += 1
-                self._missed.add(act.name)
-            else:
+        reading = self._reader.read(batch)
+        faults = _check(*reading, *self._arguments, batch.now_ns)
+        while faults < 0:
+            self._lengthen(_GROWING[faults])
+            faults = _check(*reading, *self._arguments, batch.now_ns)
+        if faults:
+            self._put_into_words(batch, faults)
+        for act in batch.acts:
+            if act.name not in self._places:
+                self._complain("order", act.name, "not in the roster")
+            elif act.outputs is not None and act.ruling is not None:
                 self._check_act(act)
+            else:
+                self._missed.add(act.name)
 
-    def _check_inbox(self, act: Act) -> None:
-        for source, sequence in act.heard:
-            key = (source, sequence, act.name)
-            due = self._in_flight.get(key, [])
-            arrived = [moment for moment in due if moment <= self._now_ns]
-            if not arrived:
-                self._complain(
-                    "delivery", act.name, f"heard {source}#{sequence}, which was not delivered"
-                )
-                continue
-            due.remove(min(arrived))
-            if not due:
-                del self._in_flight[key]
+    def _lengthen(self, name: str) -> None:
+        """Double one of the arrays that grow with the run."""
+        rows = getattr(self._state, name)
+        longer = np.concatenate((rows, np.zeros_like(rows)), axis=1)
+        self._state = self._state._replace(**{name: longer})
+        self._arguments = (*self._state, *self._law)
+
+    def _put_into_words(self, batch: Batch, faults: int) -> None:
+        noted = min(faults, _COMPLAINTS_MAX)
+        rows, lengths_m = self._state.faults[:noted], self._state.lengths_m[:noted]
+        for (fault, row, item, a, b), (x, y) in zip(rows.tolist(), lengths_m.tolist(), strict=True):
+            rule, text = _WORDS[fault]
+            who, what = _concerned(batch, fault, row, item)
+            self._complain(rule, who, text.format(what=what, item=item, a=a, b=b, x=x, y=y))
+        self.count += faults - noted
 
     def _check_act(self, act: Act) -> None:
+        """The rules that need more than numbers."""
         outputs, ruling = act.outputs, act.ruling
         assert outputs is not None
         assert ruling is not None
         for violation in ruling.violations:
             self._complain("ruling", act.name, f"the world refused its {violation}")
-        expected = self._steps[act.name] + 1
-        if not expected <= outputs.step <= expected + self._absences[act.name]:
-            self._complain("order", act.name, f"step {outputs.step}, expected {expected}")
-        self._check_speed(act.name, act.now_ns, ruling.pose)
-        spent = self._check_energy(act.name, outputs.spent, outputs.energy_spent)
-        self._check_weights(act.name, outputs.lowered)
-        self._check_published(act.name, outputs.weights)
-        self._check_goal(act.name, outputs.goal, spent)
-        self._check_register(act, outputs, chose=bool(spent))
-        self._steps[act.name], self._absences[act.name] = outputs.step, 0
-        self._moved_ns[act.name] = act.now_ns
-        self._poses[act.name] = ruling.pose
-        for envelope in outputs.outbox:
-            self._check_ledger(act.name, envelope)
-
-    def _check_speed(self, name: ParticipantId, now_ns: int, pose: Pose) -> None:
-        before, elapsed_ns = self._poses[name], now_ns - self._moved_ns[name]
-        limit_m_s = 0.0 if name == SUPERVISOR else self._scenario.vehicle.speed_m_s
-        limit_m = limit_m_s * elapsed_ns * 1e-9 * (1.0 + 2.0 * SPEED_TOLERANCE)
-        way_m = math.hypot(pose.x_m - before.x_m, pose.y_m - before.y_m)
-        if not way_m <= limit_m:
-            self._complain("speed", name, f"moved {way_m:.6g} m, allowed {limit_m:.6g} m")
-
-    def _check_weights(self, name: ParticipantId, lowered: bytes) -> None:
-        pairs = self._pairs.decode(lowered, self._samples)
-        if pairs is None:
-            self._complain("weights", name, "entries that do not decode")
-            return
-        view = self._views[self._places[name]]
-        before = view[pairs[0]]
-        if _fall(view, self._consumed, self._units.sample, *pairs):
-            return
-        view[pairs[0]] = before  # something is wrong: once more, slowly, to say what
-        for sample, left in zip(pairs[0].tolist(), pairs[1].tolist(), strict=True):
-            if left >= view[sample]:
-                self._complain(
-                    "weights", name, f"sample {sample} from {view[sample]} to {left} units"
-                )
-            view[sample] = left
-            if left < self._units.sample - self._consumed[sample]:
-                self._complain("credit", name, f"its view of sample {sample} is below the truth")
+        if outputs.weights:
+            self._check_published(act.name, outputs.weights)
+        self._check_goal(act.name, outputs.goal, outputs.spent)
+        if self._scenario.register_width and act.name not in self._missed:
+            self._check_register(act, outputs)
 
     def _check_published(self, name: ParticipantId, weights: bytes) -> None:
-        if not weights:
-            return
-        subscriber, view = self._subscribers[name], self._views[self._places[name]]
+        subscriber, views = self._subscribers[name], self._state.views
         if not subscriber.take(weights):
             self._complain("weights", name, "publishes a vector that cannot be rebuilt")
-        elif subscriber.weights is None or not np.array_equal(subscriber.weights, view):
+        elif subscriber.weights is None or not _equals(
+            subscriber.weights, views, self._places[name]
+        ):
             self._complain("weights", name, "publishes a vector that is not its own")
 
     def _check_goal(
-        self, name: ParticipantId, goal: tuple[float, float] | None, spent: dict[int, int]
+        self, name: ParticipantId, goal: tuple[float, float] | None, spent: bytes
     ) -> None:
         """The weight at the time of choosing: what is left now, and what it has shipped since."""
         scenario = self._scenario
@@ -229,11 +618,23 @@ class Checker:
             return
         if self._samples_by_place is None:
             self._samples_by_place = self._index_samples()
-        samples = self._samples_by_place.get(goal)
-        if samples is None:
+        samples = self._samples_by_place.get(goal, [])
+        place, units = self._places[name], self._state.views.item
+        for sample in samples:
+            if units(place, sample) > 0:
+                return
+        if not samples:
             self._complain("goal", name, f"{goal} is no sample")
-        elif not any(self._views[self._places[name], j] + spent.get(j, 0) > 0 for j in samples):
+        elif not self._ships(spent, samples):
             self._complain("goal", name, f"{goal} has no weight left in its view")
+
+    def _ships(self, spent: bytes, samples: list[int]) -> bool:
+        """Whether something of what was spent went to any of these samples."""
+        pairs = self._pairs.decode(spent, self._samples)
+        return pairs is not None and any(
+            sample in samples and units > 0
+            for sample, units in zip(pairs[0].tolist(), pairs[1].tolist(), strict=True)
+        )
 
     _samples_by_place: dict[tuple[float, float], list[int]] | None = None
 
@@ -244,59 +645,13 @@ class Checker:
             places.setdefault((x, y), []).append(j)
         return places
 
-    def _check_energy(self, name: ParticipantId, spent: bytes, energy_spent: int) -> dict[int, int]:
-        """Check what a step shipped; it comes back as units by sample."""
-        pairs = self._pairs.decode(spent, self._samples)
-        if pairs is None:
-            self._complain("energy", name, "spending that does not decode")
-            return {}
-        shipped = dict(zip(pairs[0].tolist(), pairs[1].tolist(), strict=True))
-        if pairs[0].size:
-            self._points[name] += 1
-            units = int(pairs[1].sum())
-            if units > self._units.point:
-                self._complain("energy", name, f"{units} units in one point")
-            np.add.at(self._consumed, pairs[0], pairs[1])
-            if self._scenario.merge == "ledger":
-                self._own_spent[name] += map(
-                    list, zip(pairs[0].tolist(), pairs[1].tolist(), strict=True)
-                )
-        if self._points[name] > self._scenario.steps_per_robot:
-            self._complain("energy", name, f"{self._points[name]} points shipped")
-        if energy_spent < self._points[name] and name != SUPERVISOR:
-            self._complain("energy", name, f"counts {energy_spent} of {self._points[name]} points")
-        return shipped
-
-    def _check_ledger(self, name: ParticipantId, envelope: Envelope) -> None:
-        """Own entries that a participant sends are the ones it consumed, one for one."""
-        if self._scenario.merge != "ledger":
-            return
-        try:
-            news = decode_news(envelope.body)
-        except RefusedError as error:
-            self._complain("ledger", name, f"sends what nobody can read: {error}")
-            return
-        have, logs = read_have(news.have, len(self._places)), read_logs(news.logs)
-        if have is None or logs is None:
-            self._complain("ledger", name, "sends what nobody can read")
-            return
-        self._have[name] = have
-        own = logs[logs[:, 0] == self._places[name]]
-        if own.size:
-            start = int(own[0, 1])
-            consumed = self._own_spent[name][start : start + own.shape[0]]
-            if own[:, 2:].tolist() != consumed:
-                self._complain("ledger", name, f"its log from {start} on is not what it consumed")
-
-    def _check_register(self, act: Act, outputs: Outputs, *, chose: bool) -> None:
+    def _check_register(self, act: Act, outputs: Outputs) -> None:
         """It chooses where it was observed last, or where it went itself if that word is late."""
         name, place, width = act.name, self._places[act.name], self._scenario.register_width
-        if not width or name in self._missed:
-            return
         timely = act.observation.step == outputs.step - 1
-        pose = act.observation.pose if timely else self._said[name]
+        pose = act.observation.pose if timely else self._said.get(name, act.observation.pose)
         self._said[name] = outputs.pose
-        if chose:
+        if outputs.spent:
             modes = self._scenario.planner.modes
             self._registers[place] += visit_at(pose.x_m, pose.y_m, self._rectangle, modes)
         for envelope in outputs.outbox:
@@ -305,59 +660,55 @@ class Checker:
             except RefusedError:
                 content = b"\x80"
             sent = read_register(content, len(self._places), width, place)
+            points = int(self._state.book[place, _POINTS])
             if sent is None:
                 self._complain("register", name, "sends what nobody can read")
             elif sent[0] and not np.array_equal(sent[1], self._registers[place]):
                 self._complain("register", name, "its sums are not those over its places")
-            elif sent[0] and sent[0] != self._points[name]:
-                self._complain("register", name, f"writes {sent[0]} of {self._points[name]}")
-
-    def _check_verdict(self, verdict: Verdict) -> None:
-        target = self._sent.get((verdict.source, verdict.sequence))
-        if target is None or verdict.target not in self._places:
-            self._complain(
-                "delivery", verdict.target, f"{verdict.source}#{verdict.sequence} was never sent"
-            )
-            return
-        if target not in (EVERYBODY, verdict.target):
-            self._complain("delivery", verdict.target, "delivered what was for somebody else")
-        if verdict.due_ns == DROPPED:
-            return
-        by_supervisor = SUPERVISOR in (verdict.source, verdict.target)
-        scenario = self._scenario
-        range_m = scenario.supervisor.range_m if by_supervisor else scenario.radio.range_m
-        here, there = self._poses[verdict.source], self._poses[verdict.target]
-        dx, dy = there.x_m - here.x_m, there.y_m - here.y_m
-        if not dx * dx + dy * dy <= range_m * range_m:
-            self._complain(
-                "range",
-                verdict.target,
-                f"{verdict.source}#{verdict.sequence} over {math.hypot(dx, dy):.6g} m",
-            )
-        key = (verdict.source, verdict.sequence, verdict.target)
-        self._in_flight.setdefault(key, []).append(verdict.due_ns)
+            elif sent[0] and sent[0] != points:
+                self._complain("register", name, f"writes {sent[0]} of {points}")
 
     def _end(self) -> None:
-        if self._scenario.merge == "ledger":
-            for name, have in self._have.items():
-                self._check_view(name, have)
+        if self._law.ledger:
+            for name, place in self._places.items():
+                if self._state.book[place, _TOLD]:
+                    self._check_view(name, self._state.have[place].tolist())
 
     def _check_view(self, name: ParticipantId, have: list[int]) -> None:
+        state = self._state
         spent = np.zeros(self._samples, dtype=np.int64)
         for origin, length in zip(self._places, have, strict=True):
-            log = self._own_spent[origin]
-            if length > len(log):
-                self._complain("ledger", name, f"holds {length} entries of {origin}'s {len(log)}")
+            place = self._places[origin]
+            entries = int(state.book[place, _ENTRIES])
+            if length > entries:
+                self._complain("ledger", name, f"holds {length} entries of {origin}'s {entries}")
                 return
-            entries = np.array(log[:length], dtype=np.int64).reshape(-1, 2)
-            np.add.at(spent, entries[:, 0], entries[:, 1])
+            log = state.logs[place, :length]
+            np.add.at(spent, log[:, 0], log[:, 1])
         wrong = np.flatnonzero(
-            self._views[self._places[name]] != np.maximum(self._units.sample - spent, 0)
+            state.views[self._places[name]] != np.maximum(self._units.sample - spent, 0)
         )
         if wrong.size:
             self._complain(
                 "ledger", name, f"its view of sample {wrong[0]} is not what its logs leave"
             )
+
+
+def _concerned(batch: Batch, fault: int, row: int, item: int) -> tuple[str, str]:
+    """Whom a fault is about; and which envelope, or what the codec says of it."""
+    if fault in _OF_VERDICTS:
+        verdict = batch.verdicts[row]
+        return verdict.target, f"{verdict.source}#{verdict.sequence}"
+    act = batch.acts[row]
+    if fault == _UNHEARD:
+        source, sequence = act.heard[item]
+        return act.name, f"{source}#{sequence}"
+    if fault == _UNREADABLE and act.outputs is not None:
+        try:
+            decode_news(act.outputs.outbox[item].body)
+        except RefusedError as error:
+            return act.name, f": {error}"
+    return act.name, ""
 
 
 def check(records: Iterable[Record]) -> Checker:

@@ -35,8 +35,7 @@ class Digest:
 
     def add(self, payload: bytes) -> None:
         """Add one encoded record."""
-        self._hash.update(len(payload).to_bytes(8, "little"))
-        self._hash.update(payload)
+        self._hash.update(len(payload).to_bytes(8, "little") + payload)
         self.records += 1
 
     @property
@@ -86,13 +85,14 @@ class Journal:
         except OSError as error:
             self._give_up(error)
 
-    def take(self, record: Record) -> None:
-        """Write one record."""
-        payload = encode_record(record)
+    def take(self, record: Record, payload: bytes = b"") -> None:
+        """Write one record. payload: the record encoded, if somebody has done so already."""
+        payload = payload or encode_record(record)
         self.digest.add(payload)
-        if isinstance(record, Batch | Ending):
+        if isinstance(record, (Batch, Ending)):
             self._time_ns = record.now_ns
-        self._write(RECORD_TOPIC, payload)
+        if self._file is not None:
+            self._write(RECORD_TOPIC, payload)
 
     def take_row(self, row: Row) -> None:
         """Write one row of metrics, for viewers; it is not part of the digest."""

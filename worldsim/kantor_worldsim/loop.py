@@ -2,6 +2,8 @@
 
 import heapq
 from collections.abc import Callable, Mapping
+from itertools import groupby
+from operator import itemgetter
 
 from kantor_protocol.clock import Clock, clocks
 from kantor_protocol.machine import Exchange, Inputs, Outputs, ParticipantId, StateMachine
@@ -61,22 +63,18 @@ def simulate(stage: Stage, exchange: Exchange, seed: int, stopped: Callable[[], 
         batch = agenda.batch(stage.channel.lookahead_ns)
         inputs = {name: stage.inputs(name, due_ns) for due_ns, name in batch}
         outputs = exchange(inputs)
-        for moment_ns in sorted({due_ns for due_ns, _ in batch}):
+        for moment_ns, due in groupby(batch, key=itemgetter(0)):
             if _reason(stage, moment_ns, stopped):  # what was looked ahead to does not happen
                 break
-            steps = [
-                Step(name, inputs[name], outputs.get(name))
-                for due_ns, name in batch
-                if due_ns == moment_ns
-            ]
+            steps = [Step(name, inputs[name], outputs.get(name)) for _, name in due]
             stage.settle(moment_ns, steps)
     stage.end(reason)
     return reason
 
 
 def _reason(stage: Stage, next_ns: int, stopped: Callable[[], bool]) -> str | None:
-    if stage.over:
-        return stage.over
-    if next_ns > stage.scenario.limit_ns:
+    if over := stage.over:
+        return over
+    if next_ns > stage.limit_ns:
         return "limit"
     return "interrupted" if stopped() else None

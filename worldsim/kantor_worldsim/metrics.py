@@ -28,19 +28,24 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
-from kantor_protocol.kernels import kernel
+from kantor_protocol.kernels import kernel, sum_kernel
 from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
-from kantor_protocol.packing import Pairs
+from kantor_protocol.machine import ParticipantId, State
 from kantor_protocol.walk import Walk
 from kantor_worldsim import exact
-from kantor_worldsim.bounds import Auction
+from kantor_worldsim import reading as of
+from kantor_worldsim.bounds import Auction, measure
 from kantor_worldsim.channel import DROPPED, links
-from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
+from kantor_worldsim.reading import Reader
+from kantor_worldsim.records import Batch, Ending, Opening, Record
 
 _PAIRS_PER_ROW = 200_000
 """Robot-sample distances that one row of metrics may cost when the period is chosen by size."""
+
+_BLOCK = 1024
+"""Samples that a row of metrics takes at a time."""
 
 
 class Row(NamedTuple):
@@ -137,37 +142,200 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
 
 
+# Slots of Tally.counts and Tally.shipped.
+_VIOLATIONS, _STEPS, _BYTES_WEIGHTS, _BYTES_TOTAL, _ENERGY, _UNITS = 0, 1, 2, 3, 4, 5
+_DELIVERIES, _DROPS, _FIRST_CONTACT, _LEAST = 6, 7, 8, 9
+_EVER, _NOW = 0, 1
+_NEVER = -1
+
+
+class Tally(NamedTuple):
+    """What is counted batch by batch. n participants, of them m robots; N samples."""
+
+    counts: npt.NDArray[np.int64]
+    """(10,): violations, robot-steps, bytes on weights keys and in all, points and units shipped,
+    deliveries, drops, step of the first contact or _NEVER, units in `least`."""
+    shipped: npt.NDArray[np.float64]
+    """(2,) mass times metres: since the start, in this tick."""
+    standing: npt.NDArray[np.int64]
+    """(n, 3): refused messages; whether it rests; step in which it saw no weight left, or _NEVER."""
+    shipped_by: npt.NDArray[np.float64]
+    """(m,) since the start."""
+    xy_m: npt.NDArray[np.float64]
+    """(m, 2) where robots are, world frame."""
+    views: npt.NDArray[np.int64]
+    """(n, N) the weight vector of each, in units."""
+    least: npt.NDArray[np.int64]
+    """(N,) the least of all views."""
+    true_left: npt.NDArray[np.int64]
+    """(N,) first weight minus everybody's spending; negative where a sample was filled twice."""
+
+
 @kernel
-def _pending(xy_m: np.ndarray, x: float, y: float, units: np.ndarray) -> float:
+def _lower(tally: Tally, place: int, sample: int, left: int) -> None:
+    """Put an entry into a view. A record that is not sound may let it rise."""
+    before, least = tally.views[place, sample], tally.least[sample]
+    tally.views[place, sample] = left
+    lower = min(left, least)
+    if left > before == least:
+        lower = left
+        for other in range(tally.views.shape[0]):
+            lower = min(lower, tally.views[other, sample])
+    tally.least[sample] = lower
+    tally.counts[_LEAST] += lower - least
+
+
+@kernel
+def _ship(
+    tally: Tally, samples_m: np.ndarray, place: int, sample: int, units: int, whole: int
+) -> None:
+    dx = samples_m[sample, 0] - tally.xy_m[place, 0]
+    dy = samples_m[sample, 1] - tally.xy_m[place, 1]
+    cost = units * math.hypot(dx, dy) / whole
+    tally.shipped[_EVER] += cost
+    tally.shipped[_NOW] += cost
+    tally.shipped_by[place] += cost
+    tally.counts[_UNITS] += units
+    tally.true_left[sample] -= units
+
+
+@kernel
+def _follow(
+    _payload: bytes,
+    sizes: np.ndarray,
+    acts: np.ndarray,
+    poses_m: np.ndarray,
+    _heard: np.ndarray,
+    _sent: np.ndarray,
+    verdicts: np.ndarray,
+    pairs: np.ndarray,
+    counts: np.ndarray,
+    shipped: np.ndarray,
+    standing: np.ndarray,
+    shipped_by: np.ndarray,
+    xy_m: np.ndarray,
+    views: np.ndarray,
+    least: np.ndarray,
+    true_left: np.ndarray,
+    samples_m: np.ndarray,
+    whole: int,
+) -> int:
+    """Count one batch, see Reading and Tally; how many targets were found in it.
+
+    samples_m: (N, 2) as they are now.
+    """
+    tally = Tally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left)
+    finds = 0
+    for row in range(sizes[of.VERDICTS]):
+        counts[_DROPS if verdicts[row, of.DUE_NS] == DROPPED else _DELIVERIES] += 1
+    for row in range(sizes[of.ACTS]):
+        act = acts[row]
+        place = act[of.PLACE]
+        if place < 0 or not act[of.PRESENT]:
+            continue
+        counts[_VIOLATIONS] += act[of.VIOLATIONS]
+        standing[place, 0] = act[of.REFUSED]
+        for i in range(act[of.LOWERED], act[of.LOWERED] + max(0, act[of.LOWERED_COUNT])):
+            _lower(tally, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS])
+        if place >= xy_m.shape[0]:  # the supervisor
+            continue
+        xy_m[place, 0], xy_m[place, 1] = poses_m[row, 0], poses_m[row, 1]
+        counts[_STEPS] += 1
+        counts[_BYTES_WEIGHTS] += act[of.WEIGHTS_BYTES]
+        counts[_BYTES_TOTAL] += act[of.WEIGHTS_BYTES] + act[of.BODY_BYTES]
+        finds += act[of.FINDS]
+        if act[of.HEARD_COUNT] > 0 and counts[_FIRST_CONTACT] == _NEVER:
+            counts[_FIRST_CONTACT] = act[of.STEP]
+        if act[of.STATE] != State.EXPLORING.value:
+            standing[place, 1] = 1
+        if act[of.STATE] == State.FINISHED.value and standing[place, 2] == _NEVER:
+            standing[place, 2] = act[of.STEP]
+        if act[of.SPENT_COUNT] > 0 and not act[of.VOID]:
+            counts[_ENERGY] += 1
+            for i in range(act[of.SPENT], act[of.SPENT] + act[of.SPENT_COUNT]):
+                _ship(tally, samples_m, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS], whole)
+    return finds
+
+
+@sum_kernel
+def _weighed(units: np.ndarray, way_m: np.ndarray) -> float:
     total = 0.0
     for j in range(units.shape[0]):
-        if units[j] > 0:
-            dx = xy_m[j, 0] - x
-            dy = xy_m[j, 1] - y
-            total += units[j] * math.sqrt(dx * dx + dy * dy)
+        total += units[j] * way_m[j]
     return total
 
 
 @kernel
-def _least(views: np.ndarray, out: np.ndarray) -> None:
-    for j in range(out.shape[0]):
-        least = views[0, j]
-        for k in range(1, views.shape[0]):
-            least = min(least, views[k, j])
-        out[j] = least
+def _sum_up(
+    shipped_by: np.ndarray,
+    xy_m: np.ndarray,
+    views: np.ndarray,
+    least: np.ndarray,
+    true_left: np.ndarray,
+    samples_m: np.ndarray,
+    whole: int,
+    range_m: float,
+    centralized: bool,
+    ledger: bool,
+    near: np.ndarray,
+    way_m: np.ndarray,
+    true_rest: np.ndarray,
+    paper: np.ndarray,
+    local: np.ndarray,
+) -> int:
+    """The pending terms, mass times the distance to a robot, over all samples; the true rest in units.
+
+    For each robot in paper: by the common weights or its own view; in local: eq. 12, what the robots in
+    its range have shipped and their terms by its own view. near: (m, m) room for who is in whose range.
+    way_m, true_rest: room for one block of samples, which stays in the cache while all robots and views
+    meet in it.
+    """
+    robots = xy_m.shape[0]
+    rest = 0
+    paper[:] = 0.0
+    local[:] = 0.0
+    for k in range(robots):
+        for i in range(robots):
+            apart_m = math.hypot(xy_m[i, 0] - xy_m[k, 0], xy_m[i, 1] - xy_m[k, 1])
+            near[i, k] = i == k or apart_m <= range_m
+            if near[i, k]:
+                local[k] += shipped_by[i]
+    for first in range(0, samples_m.shape[0], way_m.shape[0]):
+        last = min(first + way_m.shape[0], samples_m.shape[0])
+        for j in range(first, last):
+            true_rest[j - first] = max(true_left[j], 0)
+            rest += true_rest[j - first]
+        for i in range(robots):
+            way = way_m[: last - first]
+            measure(samples_m[first:last], xy_m[i, 0], xy_m[i, 1], way)
+            if centralized:
+                common = true_rest[: last - first] if ledger else least[first:last]
+                paper[i] += _weighed(common, way) / whole
+                continue
+            own = _weighed(views[i, first:last], way) / whole
+            paper[i] += own
+            for k in range(robots):
+                if k == i:
+                    local[k] += own
+                elif near[i, k]:
+                    local[k] += _weighed(views[k, first:last], way) / whole
+    return rest
 
 
 class Metrics:
     """Follows the records of one run."""
 
-    def __init__(self, exact_every: int | None = None) -> None:
-        """exact_every: periods from one exact distance to the next; 0: at the end only; None: never."""
+    def __init__(self, exact_every: int | None = None, reader: Reader | None = None) -> None:
+        """exact_every: periods from one exact distance to the next; 0: at the end only; None: never.
+
+        reader: the one that another referee of the same run reads by.
+        """
         self.rows: list[Row] = []
-        self._exact_every = exact_every
         self.finds: list[tuple[float, ParticipantId, int, float, float]] = []
         """(time, robot, target, x, y), world frame."""
+        self._exact_every = exact_every
+        self._reader = reader or Reader()
         self._opening: Opening | None = None
-        self._pairs = Pairs()
 
     def take(self, record: Record) -> None:
         """Follow one record."""
@@ -180,6 +348,7 @@ class Metrics:
             self._row(last=True)
 
     def _open(self, opening: Opening) -> None:
+        self._reader.read(opening)
         scenario, site = opening.scenario, opening.site
         self._opening, self._scenario, self._units = opening, scenario, opening.units
         self._period_ns = scenario.period_ns
@@ -190,29 +359,40 @@ class Metrics:
             opening.seed,
             Purpose.SAMPLE_WALK,
         )
-        self._names = scenario.roster
-        self._places = {name: i for i, name in enumerate(self._names)}
-        samples, robots = site.samples_m.shape[0], scenario.robots.count
+        names, samples, robots = scenario.roster, site.samples_m.shape[0], scenario.robots.count
         self._targets = site.targets_m.shape[0]
-        self._views = np.full((len(self._names), samples), self._units.sample, dtype=np.int64)
-        self._true_left = np.full(samples, self._units.sample, dtype=np.int64)
-        self._common = np.zeros(samples, dtype=np.int64)
-        self._xy_m = site.starts_m.copy()
+        self._tally = Tally(
+            counts=np.zeros(10, dtype=np.int64),
+            shipped=np.zeros(2),
+            standing=np.zeros((len(names), 3), dtype=np.int64),
+            shipped_by=np.zeros(robots),
+            xy_m=site.starts_m.copy(),
+            views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
+            least=np.full(samples, self._units.sample, dtype=np.int64),
+            true_left=np.full(samples, self._units.sample, dtype=np.int64),
+        )
+        self._tally.counts[_FIRST_CONTACT] = _NEVER
+        self._tally.counts[_LEAST] = self._units.whole
+        self._tally.standing[:, 2] = _NEVER
+        self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
+        self._terms = np.zeros((2, robots))
+        self._to_sum_up = (
+            *self._tally[3:],
+            self._walk.xy_m,
+            self._units.whole,
+            scenario.radio.range_m,
+            scenario.centralized,
+            scenario.merge == "ledger",
+            np.zeros((robots, robots), dtype=np.bool_),
+            np.zeros(_BLOCK),
+            np.zeros(_BLOCK, dtype=np.int64),
+            *self._terms,
+        )
         size = samples * robots // _PAIRS_PER_ROW
         self._every = scenario.metrics.every or max(1, size)
         self._auction = Auction(robots, samples, self._every)
-        self._shipped = 0.0
-        self._shipped_by = [0.0] * robots
-        self._shipped_now = 0.0
         self._points: list[tuple[float, float, int]] = []
-        self._spent_units = 0
-        self._energy_spent = 0
-        self._deliveries = self._drops = self._out_of_range = self._violations = self._absences = 0
-        self._bytes_weights = self._bytes_total = self._steps = 0
-        self._refused: dict[ParticipantId, int] = {}
-        self._finished: dict[ParticipantId, int] = {}
-        self._resting: set[ParticipantId] = set()
-        self._first_contact: int | None = None
+        self._out_of_range = self._absences = 0
         self._ending = Ending(0, "cut")
         self._tick = 0
         for name, found in opening.first_look.items():
@@ -224,97 +404,62 @@ class Metrics:
         if tick != self._tick:
             if self._tick and self._tick % self._every == 0:
                 self._row()
-            self._tick, self._shipped_now = tick, 0.0
+            self._tick, self._tally.shipped[_NOW] = tick, 0.0
         self._walk.advance(batch.now_ns)
         self._out_of_range += batch.out_of_range
         self._absences += len(batch.absent)
-        for verdict in batch.verdicts:
-            if verdict.due_ns == DROPPED:
-                self._drops += 1
-            else:
-                self._deliveries += 1
-        for act in batch.acts:
-            self._follow_act(act)
-
-    def _follow_act(self, act: Act) -> None:
-        outputs, ruling, place = act.outputs, act.ruling, self._places[act.name]
-        if outputs is None or ruling is None:
-            return
-        self._violations += len(ruling.violations)
-        self._refused[act.name] = outputs.refused
-        lowered = self._pairs.decode(outputs.lowered, self._views.shape[1])
-        if lowered is not None:
-            self._views[place, lowered[0]] = lowered[1]
-        if act.name == SUPERVISOR:
-            return
-        self._xy_m[place] = ruling.pose.x_m, ruling.pose.y_m
-        self._steps += 1
-        self._bytes_weights += len(outputs.weights)
-        self._bytes_total += len(outputs.weights) + sum(len(e.body) for e in outputs.outbox)
-        if act.heard and self._first_contact is None:
-            self._first_contact = outputs.step
-        if outputs.state is not State.EXPLORING:
-            self._resting.add(act.name)
-        if outputs.state is State.FINISHED:
-            self._finished.setdefault(act.name, outputs.step)
-        time_s = act.now_ns * 1e-9
-        self.finds += [(time_s, act.name, target, x, y) for target, x, y in ruling.found]
-        if outputs.spent and not {"step", "energy", "units"} & set(ruling.violations):
-            self._ship(place, outputs.spent)
-
-    def _ship(self, place: int, spent: bytes) -> None:
-        pairs = self._pairs.decode(spent, self._views.shape[1])
-        if pairs is None:
-            return
-        self._energy_spent += 1
-        x, y = self._xy_m[place].tolist()
+        reading = self._reader.read(batch)
+        if _follow(*reading, *self._arguments):
+            self._note_finds(batch)
         if self._exact_every is not None:
-            self._points.append((x, y, int(pairs[1].sum())))
-        for sample, units in zip(pairs[0].tolist(), pairs[1].tolist(), strict=True):
-            way_m = math.hypot(self._walk.xy_m[sample, 0] - x, self._walk.xy_m[sample, 1] - y)
-            cost = units * way_m / self._units.whole
-            self._shipped += cost
-            self._shipped_now += cost
-            self._shipped_by[place] += cost
-            self._spent_units += units
-            self._true_left[sample] -= units
+            self._note_points(of.Reading(*reading))
 
-    def _mass_left(self) -> int:
-        """Units left in the common view: everybody's minimum, or with a ledger the truth."""
-        if self._scenario.merge == "ledger":
-            np.maximum(self._true_left, 0, out=self._common)
-        else:
-            _least(self._views, self._common)
-        return int(self._common.sum())
+    def _note_finds(self, batch: Batch) -> None:
+        for act in batch.acts:
+            if act.ruling is not None and act.outputs is not None:
+                time_s = act.now_ns * 1e-9
+                self.finds += [
+                    (time_s, act.name, target, x, y) for target, x, y in act.ruling.found
+                ]
+
+    def _note_points(self, reading: of.Reading) -> None:
+        """Where a point was shipped, and how many units."""
+        for row in range(reading.sizes[of.ACTS]):
+            act = reading.acts[row]
+            if act[of.PLACE] >= 0 and act[of.SPENT_COUNT] > 0 and not act[of.VOID]:
+                shipped = reading.pairs[act[of.SPENT] : act[of.SPENT] + act[of.SPENT_COUNT]]
+                x, y = reading.poses_m[row].tolist()
+                self._points.append((x, y, int(shipped[:, of.UNITS].sum())))
 
     def _row(self, *, last: bool = False) -> None:
-        left = self._mass_left()
-        whole, robots = self._units.whole, len(self._xy_m)
-        places = [(i, *self._xy_m[i].tolist()) for i in range(robots)]
-        xy_m = self._walk.xy_m
-        pending = 0.0
-        for i, x, y in places:
-            units = self._common if self._scenario.centralized else self._views[i]
-            pending += _pending(xy_m, x, y, units) / whole
+        tally, scenario, whole = self._tally, self._scenario, self._units.whole
+        counts = tally.counts.tolist()
+        true_rest = _sum_up(*self._to_sum_up)
+        # The common view: everybody's minimum, or with a ledger the truth.
+        left = true_rest if scenario.merge == "ledger" else counts[_LEAST]
+        paper, local = self._terms.tolist()
+        pending = sum(paper)
+        shipped, shipped_now = tally.shipped.tolist()
         tight = None
-        standing = self._scenario.samples.diffusion_m == 0.0
-        if standing and int(np.maximum(self._true_left, 0).sum()) == whole - self._spent_units:
-            tight = self._shipped + self._auction.cost(xy_m, self._xy_m, self._true_left) / whole
-        local = [] if self._scenario.centralized else self._local_bounds()
+        if scenario.samples.diffusion_m == 0.0 and true_rest == whole - counts[_UNITS]:
+            rest = self._auction.cost(self._walk.xy_m, tally.xy_m, tally.true_left)
+            tight = shipped + rest / whole
+        if scenario.centralized:
+            local = []
         self.rows.append(
             Row(
                 tick=self._tick,
                 time_s=self._tick * self._period_ns * 1e-9,
-                energy_spent=self._energy_spent,
+                energy_spent=counts[_ENERGY],
                 detected=len(self.finds),
-                w_ub_paper=self._shipped + pending,
+                w_ub_paper=shipped + pending,
                 w_ub_tight=tight,
-                w_ub_instant=self._shipped_now + pending,
+                w_ub_instant=shipped_now + pending,
                 mass_left=left / whole,
-                mass_double_counted=(self._spent_units - (whole - left)) / whole,
-                links=links(self._xy_m, self._scenario.radio.range_m),
-                deliveries=self._deliveries,
-                drops=self._drops,
+                mass_double_counted=(counts[_UNITS] - (whole - left)) / whole,
+                links=links(tally.xy_m, scenario.radio.range_m),
+                deliveries=counts[_DELIVERIES],
+                drops=counts[_DROPS],
                 w_ub_local_min=min(local, default=None),
                 w_ub_local_max=max(local, default=None),
                 w1_exact=self._exact() if self._exact_due(last=last) else None,
@@ -328,29 +473,16 @@ class Metrics:
 
     def _exact(self) -> float:
         """W_1 between the samples and the robots' ensemble; see the module."""
-        robots = self._xy_m.shape[0]
+        robots_m, samples_m = self._tally.xy_m, self._walk.xy_m
+        robots = robots_m.shape[0]
         shipped = np.array(self._points, dtype=np.float64).reshape(-1, 3)
-        left = float(np.maximum(self._true_left, 0).sum())
-        samples_m = self._walk.xy_m
+        left = float(np.maximum(self._tally.true_left, 0).sum())
         return exact.w1(
-            np.concatenate((shipped[:, :2], self._xy_m)),
+            np.concatenate((shipped[:, :2], robots_m)),
             np.concatenate((shipped[:, 2], np.full(robots, left / robots))),
             samples_m,
             np.ones(samples_m.shape[0]),
         )
-
-    def _local_bounds(self) -> list[float]:
-        """Eq. 12 for every robot."""
-        range_m, xy_m = self._scenario.radio.range_m, self._xy_m
-        bounds = []
-        for k in range(len(xy_m)):
-            team = np.flatnonzero(np.hypot(*(xy_m - xy_m[k]).T) <= range_m).tolist()
-            pending = sum(
-                _pending(self._walk.xy_m, *xy_m[q].tolist(), self._views[k]) for q in team
-            )
-            shipped = sum(self._shipped_by[q] for q in team)
-            bounds.append(shipped + pending / self._units.whole)
-        return bounds
 
     def glance(self) -> Glance:
         """How the run stands, by the last row."""
@@ -362,13 +494,13 @@ class Metrics:
         rate = (last.deliveries - before.deliveries) / elapsed_s if elapsed_s > 0.0 else 0.0
         return Glance(
             now_ns=round(last.time_s * 1e9),
-            energy_spent=self._energy_spent,
+            energy_spent=int(self._tally.counts[_ENERGY]),
             detected=len(self.finds),
             targets=self._targets,
             w_ub=last.w_ub_paper,
             links=last.links,
             messages_per_s=rate,
-            robots_done=len(self._resting),
+            robots_done=int(self._tally.standing[:, 1].sum()),
             mass_left=last.mass_left,
         )
 
@@ -384,9 +516,9 @@ class Metrics:
     ) -> Result:
         """The summary; call it after the last record. complaints: the checker's."""
         scenario, last = self._scenario, self.rows[-1]
-        robots = scenario.robots.count
-        finished = max(self._finished.values()) if len(self._finished) == robots else None
-        steps = max(1, self._steps)
+        counts, robots = self._tally.counts.tolist(), scenario.robots.count
+        finished = self._tally.standing[:robots, 2].tolist()
+        steps = max(1, counts[_STEPS])
         assert self._opening is not None
         return Result(
             scenario=scenario.name,
@@ -398,29 +530,29 @@ class Metrics:
             claims=scenario.claiming,
             robots=robots,
             ticks=self._tick,
-            finished_tick=finished,
-            first_contact_tick=self._first_contact,
+            finished_tick=None if _NEVER in finished else max(finished),
+            first_contact_tick=None if counts[_FIRST_CONTACT] == _NEVER else counts[_FIRST_CONTACT],
             detected=len(self.finds),
             targets=self._targets,
             detection_rate=len(self.finds) / self._targets if self._targets else None,
             w_ub_start=self.rows[0].w_ub_paper,
             w_ub=Bounds(last.w_ub_paper, last.w_ub_tight, last.w_ub_instant),
             w1_exact=last.w1_exact,
-            energy_spent=self._energy_spent,
+            energy_spent=counts[_ENERGY],
             energy_total=scenario.steps_per_robot * robots,
             mass_left=last.mass_left,
             mass_double_counted=last.mass_double_counted,
             bytes_per_robot_tick=BytesPerRobotTick(
-                self._bytes_weights / steps, self._bytes_total / steps
+                counts[_BYTES_WEIGHTS] / steps, counts[_BYTES_TOTAL] / steps
             ),
-            deliveries=self._deliveries,
-            drops=self._drops,
+            deliveries=counts[_DELIVERIES],
+            drops=counts[_DROPS],
             out_of_range_refused=self._out_of_range,
-            messages_refused=sum(self._refused.values()) + refused_at_door,
+            messages_refused=int(self._tally.standing[:, 0].sum()) + refused_at_door,
             absences=self._absences,
             ended=self._ending.reason,
             record=record,
-            violations=self._violations + len(complaints),
+            violations=counts[_VIOLATIONS] + len(complaints),
             complaints=complaints[:10],
             digest=digest,
             wall_s=wall_s,

@@ -17,6 +17,7 @@ from kantor_protocol.scenario import Scenario, to_toml
 from kantor_worldsim.checkers import Checker
 from kantor_worldsim.journal import Journal, file_digest
 from kantor_worldsim.metrics import Metrics, Result, Row
+from kantor_worldsim.reading import Reader
 from kantor_worldsim.records import Record
 
 JOURNAL = "run.mcap"
@@ -53,8 +54,9 @@ class Recording:
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         """folder: an existing folder for the run's files; None keeps nothing. exact_every: see Metrics."""
-        self.metrics = Metrics(exact_every)
-        self.checker = Checker()
+        self._reader = Reader()
+        self.metrics = Metrics(exact_every, self._reader)
+        self.checker = Checker(self._reader)
         self.refused_at_door = 0
         """Messages to world-sim that it could not take in; whoever runs the bus counts them."""
         self._scenario = scenario
@@ -74,9 +76,13 @@ class Recording:
 
     def take(self, record: Record) -> None:
         """Follow one record."""
-        self.journal.take(record)
+        self.journal.take(record, self._reader.read(record)[0])
         self.metrics.take(record)
         self.checker.take(record)
+        if len(self.metrics.rows) > self._rows:
+            self._write_rows()
+
+    def _write_rows(self) -> None:
         for row in self.metrics.rows[self._rows :]:
             self.journal.take_row(row)
             self.checker.take_row(row)

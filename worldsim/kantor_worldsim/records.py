@@ -44,7 +44,7 @@ class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
         return Units.of(self.scenario.energy.points, self.samples_m.shape[0])
 
 
-class Act(msgspec.Struct, frozen=True, array_like=True):
+class Act(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One participant's step: what it was given, what it did, what the world made of it."""
 
     name: ParticipantId

@@ -33,7 +33,9 @@ class Stage:
     ) -> None:
         self.scenario = scenario
         self.now_ns = 0
+        self.limit_ns = scenario.limit_ns
         self.channel = Channel(scenario, seed)
+        self._robots = frozenset(scenario.robot_ids)
         self._world = World(scenario, seed, site)
         self._listeners = tuple(listeners)
         self._resting: set[ParticipantId] = set()
@@ -58,8 +60,10 @@ class Stage:
 
         `done`: every robot rests, or has left while others rest. `deserted`: nobody is left.
         """
-        robots = set(self.scenario.robot_ids)
-        if not robots <= self._resting | self.gone:
+        robots = self._robots
+        if len(self._resting) + len(self.gone) < len(robots) or not robots <= (
+            self._resting | self.gone
+        ):
             return None
         return "done" if robots - self.gone or robots <= self._resting else "deserted"
 
@@ -71,24 +75,25 @@ class Stage:
         self.now_ns = max(self.now_ns, now_ns)
         sound = [(name, inputs, self._sound(name, outputs)) for name, inputs, outputs in steps]
         sent = [Sent(now_ns, e) for _, _, outputs in sound if outputs for e in outputs.outbox]
-        verdicts, out_of_range = self.channel.transmit(sent)
-        acts = tuple(self._act(name, inputs, outputs) for name, inputs, outputs in sound)
-        absent = tuple(act.name for act in acts if act.outputs is None)
-        self._tell(Batch(now_ns, acts, tuple(verdicts), out_of_range, absent))
-        return tuple(verdicts)
+        ruled, out_of_range = self.channel.transmit(sent)
+        verdicts = tuple(ruled)
+        acts = tuple([self._act(name, inputs, outputs) for name, inputs, outputs in sound])
+        absent = tuple([act.name for act in acts if act.outputs is None])
+        self._tell(Batch(now_ns, acts, verdicts, out_of_range, absent))
+        return verdicts
 
     def end(self, reason: str) -> None:
         """Close the record."""
         self._tell(Ending(self.now_ns, reason))
 
     def _act(self, name: ParticipantId, inputs: Inputs, outputs: Outputs | None) -> Act:
-        heard = tuple((envelope.source, envelope.sequence) for envelope in inputs.inbox)
+        heard = tuple([(envelope.source, envelope.sequence) for envelope in inputs.inbox])
         if outputs is None:
             return Act(name, inputs.now_ns, inputs.observation, heard, None, None)
         ruling = self._world.accept(name, inputs.now_ns, outputs)
         self.channel.place(name, ruling.pose)
         self._acted.add(name)
-        if outputs.state is not State.EXPLORING and name in self.scenario.robot_ids:
+        if outputs.state is not State.EXPLORING and name in self._robots:
             self._resting.add(name)
         return Act(name, inputs.now_ns, inputs.observation, heard, outputs, ruling)
 
@@ -100,8 +105,9 @@ class Stage:
             check_outputs(outputs)
         except RefusedError:
             return None
-        if any(envelope.source != name for envelope in outputs.outbox):
-            return None
+        for envelope in outputs.outbox:
+            if envelope.source != name:
+                return None
         return outputs
 
     def _tell(self, record: Record) -> None:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import SUPERVISOR, Observation, Outputs, ParticipantId, Pose
-from kantor_protocol.packing import Pairs
+from kantor_protocol.packing import sum_pairs
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units
@@ -41,7 +41,7 @@ class Site(NamedTuple):
         )
 
 
-class Ruling(msgspec.Struct, frozen=True, array_like=True):
+class Ruling(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What the world made of a participant's step."""
 
     pose: Pose
@@ -80,7 +80,6 @@ class World:
         self._speed_m_s = scenario.vehicle.speed_m_s
         self._range_m = scenario.sensor.range_m
         self._room = np.zeros(site.targets_m.shape[0], dtype=np.int64)
-        self._pairs = Pairs()
         self._bodies = {
             name: _Body(Pose(float(x), float(y)))
             for name, (x, y) in zip(scenario.robot_ids, site.starts_m, strict=True)
@@ -124,8 +123,7 @@ class World:
         return True
 
     def _spend(self, body: _Body, spent: bytes) -> list[str]:
-        pairs = self._pairs.decode(spent, self._samples)
-        if pairs is None or not 0 < sum(pairs[1].tolist()) <= self._units.point:
+        if not 0 < sum_pairs(spent, self._samples) <= self._units.point:
             return ["units"]
         if body.energy_spent >= self._budget:
             return ["energy"]
