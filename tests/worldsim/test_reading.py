@@ -141,6 +141,20 @@ def test_odd_values_are_read_too(played: Play) -> None:
     assert tabled(Reading(*reader.read(ODD))) == plain(ODD, ROSTER, 60)
 
 
+def test_tables_grow_with_what_comes(played: Play) -> None:
+    """More pairs, verdicts and deliveries in one batch than there was room for."""
+    many = tuple(Verdict("r1", sequence, "r2", sequence) for sequence in range(5000))
+    entries = Pairs().encode(np.arange(60).repeat(100), np.arange(6000), 6000)
+    outputs = Outputs(1, Pose(0.0, 0.0), lowered=entries)
+    look = Observation(0, Pose(0.0, 0.0))
+    act = Act("r1", 1, look, tuple(("r2", i) for i in range(3000)), outputs, Ruling(look.pose))
+    batch = Batch(1, (act,), many, 0)
+    reader = Reader()
+    reader.read(played()[0])
+
+    assert tabled(Reading(*reader.read(batch))) == plain(batch, ROSTER, 60)
+
+
 def test_record_is_read_once_for_all(played: Play) -> None:
     """Referees that share a reader share its work."""
     records = played()

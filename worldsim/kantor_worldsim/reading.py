@@ -248,6 +248,8 @@ def _read_pairs(tables: Tables, at: int, bound: int) -> tuple[int, int]:
         sample += step
         if at < 0 or at > end or sample < 0 or sample >= bound:
             return NOT_DECODED, end
+        if row >= tables.pairs.shape[0]:
+            return NOT_DECODED, _MALFORMED
         tables.pairs[row, SAMPLE], tables.pairs[row, UNITS] = sample, units
         row += 1
     count = row - tables.sizes[PAIRS]
@@ -346,9 +348,9 @@ def _read_batch(
     supervisor: int,
     samples: int,
 ) -> int:
-    """Fill the tables; the position at the end of the batch, or a negative number if it is none.
+    """Fill the tables; the position after the verdicts.
 
-    Every table has a row for each two bytes of the payload, which is more than it can take.
+    Negative if this is no batch, or if a table has too few rows for it.
     """
     tables = Tables(
         payload,
@@ -436,7 +438,7 @@ class Reader:
         self._reading: tuple[Any, ...] = ()
         self._bounds = (0, STRANGER, 0)
         """Robots, place of the supervisor, samples."""
-        self._make_room(1 << 12)
+        self._make_room(1 << 10)
 
     def read(self, record: Record) -> tuple[Any, ...]:
         """The record's bytes and, of a batch, its tables: a Reading as arguments of a kernel.
@@ -447,10 +449,9 @@ class Reader:
             return self._reading
         payload = encode_record(record)
         if isinstance(record, Batch):
-            if len(payload) > self._bytes:
-                self._make_room(2 * len(payload))
-            at = _read_batch(payload, *self._tables, self._pose_bits, *self._bounds)
-            assert at > 0, "what msgspec has encoded can be read"
+            while _read_batch(payload, *self._tables, self._pose_bits, *self._bounds) < 0:
+                assert self._rows <= len(payload), "what msgspec has encoded can be read"
+                self._make_room(2 * self._rows)
         elif isinstance(record, Opening):
             scenario = record.scenario
             supervisor = scenario.robots.count if scenario.centralized else STRANGER
@@ -459,10 +460,9 @@ class Reader:
         self._record = record
         return self._reading
 
-    def _make_room(self, size: int) -> None:
-        """Tables for payloads of so many bytes: no row of any table takes less than two."""
-        self._bytes = size
-        rows = size // 2 + 1
+    def _make_room(self, rows: int) -> None:
+        """Tables of so many rows each; none needs more than its payload has bytes."""
+        self._rows = rows
         poses_m = np.zeros((rows, 2))
         self._pose_bits = poses_m.view(np.int64)
         self._tables = (
