@@ -117,8 +117,8 @@ def test_an_interval_is_students() -> None:
 
 
 def test_measures_read_the_rows(row: Row) -> None:
-    """The fall in one tick near the contact; the bound over the exact distance at its worst."""
-    bounds = {9: 100.0, 10: 100.0, 11: 70.0, 12: 69.0, 40: 1.0}
+    """The fall until both have heard; the bound over the exact distance at its worst."""
+    bounds = {9: 100.0, 10: 90.0, 11: 70.0, 12: 69.0, 40: 1.0}
     rows = [row._replace(tick=tick, w_ub_instant=bound) for tick, bound in bounds.items()]
     exact = [row._replace(w_ub_tight=tight, w1_exact=1.0) for tight in (1.5, 2.5, None, 2.0)]
     result = FakeResult(first_contact_tick=10)

@@ -6,7 +6,6 @@ robots one after another within a tick, a step of 10 m, three samples in a plan.
 
 import math
 from collections.abc import Callable
-from itertools import pairwise
 from typing import NamedTuple
 
 from matplotlib.figure import Figure as Picture
@@ -87,12 +86,15 @@ def first_contact(flight: Flight) -> float:
 
 
 def drop_at_contact(flight: Flight) -> float:
-    """Largest fall of the bound's current part in one tick at the first contact, per cent."""
+    """Fall of the bound's current part from before the first contact until both have heard, per cent.
+
+    The paper merges both vectors in one tick; here each robot's message takes its own step.
+    """
     contact = first_contact(flight)
-    if math.isinf(contact):
+    by_tick = {row.tick: row.w_ub_instant for row in flight.rows}
+    if contact - 1 not in by_tick or contact + 1 not in by_tick:
         return 0.0
-    near = [row.w_ub_instant for row in flight.rows if -1 <= row.tick - contact <= 3]
-    return max(100.0 * (1.0 - after / before) for before, after in pairwise(near))
+    return 100.0 * (1.0 - by_tick[int(contact) + 1] / by_tick[int(contact) - 1])
 
 
 def loosest(flight: Flight) -> float:
