@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from kantor_fleet.counting import RunsView
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.pools import local
@@ -17,7 +18,6 @@ from kantor_fleet.preload import warm_up
 from kantor_fleet.reproduce.claims import MISS, UNMATCHED, Verdict
 from kantor_fleet.reproduce.flights import Flight, Flights, Setting, fly
 from kantor_fleet.reproduce.kabir_lee import FIGURES, Figure
-from kantor_fleet.sweep.view import SweepView
 from kantor_worldsim.exact import available
 
 _EXACT_RUNS = 3
@@ -96,7 +96,7 @@ def _fly_all(orders: dict[Setting, int], jobs: int, interrupts: Interrupts) -> F
         for seed in range(count)
     }
     flights: dict[Setting, list[Flight]] = {s: [Flight()] * count for s, count in orders.items()}
-    with SweepView(len(cases)) as view, closing(local(cases, jobs, fly)) as pool:
+    with RunsView(len(cases)) as view, closing(local(cases, jobs, fly)) as pool:
         for done in pool:
             if interrupts():
                 break

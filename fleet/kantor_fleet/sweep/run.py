@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 import msgspec
 from rich.console import Console
 
+from kantor_fleet.counting import RunsView
 from kantor_fleet.exits import Exit
 from kantor_fleet.experiment import Case
 from kantor_fleet.interrupts import Interrupts
@@ -21,7 +22,6 @@ from kantor_fleet.sweep import summary, table
 from kantor_fleet.sweep.journal import Journal
 from kantor_fleet.sweep.plan import Key, Plan, SweepError
 from kantor_fleet.sweep.table import Run
-from kantor_fleet.sweep.view import SweepView
 from kantor_protocol.scenario import to_tree
 
 RUNS = "runs.jsonl"
@@ -90,7 +90,7 @@ def _run(
     """Run cases into the journal; why that was cut short, if it was."""
     if not left:
         return None
-    with SweepView(len(left)) as view, closing(start(left)) as pool:
+    with RunsView(len(left)) as view, closing(start(left)) as pool:
         view.note("starting workers (the first time, kernels are compiled: about half a minute)")
         try:
             for done in pool:

@@ -1,4 +1,4 @@
-"""How a sweep goes, on standard output: a bar in a terminal, plain lines anywhere else."""
+"""How many runs are done, on standard output: a bar in a terminal, plain lines anywhere else."""
 
 import math
 import sys
@@ -24,7 +24,7 @@ _LINE_S = 5.0
 _AN_HOUR_S = 3600.0
 
 
-class SweepView:
+class RunsView:
     """Counts runs, tells of those that fail, and guesses when the last one will be done."""
 
     def __init__(self, runs: int, monotonic: Callable[[], float] = time.monotonic) -> None:
