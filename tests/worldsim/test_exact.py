@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from itertools import product
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import wasserstein_distance
 
+from kantor_protocol.scenario import PlannerName
 from kantor_worldsim.checkers import Checker
 from kantor_worldsim.exact import w1
 from kantor_worldsim.metrics import Metrics, Row
@@ -65,13 +67,21 @@ def judged(records: tuple[Record, ...], every: int) -> tuple[list[Row], Checker]
     return metrics.rows, checker
 
 
+@pytest.mark.parametrize("planner", get_args(PlannerName))
 @pytest.mark.parametrize("merge", MERGES)
 @pytest.mark.parametrize(("order", "coordination"), [*product(ORDERS, COORDINATIONS)])
-def test_no_bound_lies_below_it(played: Play, merge: str, order: str, coordination: str) -> None:
+def test_no_bound_lies_below_it(
+    played: Play, planner: str, merge: str, order: str, coordination: str
+) -> None:
     """Theorems 1-3, wherever they claim to hold: no sample filled twice, samples stand."""
     claimed = 0
     for seed in range(6):
-        overrides = (f"clock.order={order}", f"coordination={coordination}", "metrics.every=1")
+        overrides = (
+            f"planner={planner}",
+            f"clock.order={order}",
+            f"coordination={coordination}",
+            "metrics.every=1",
+        )
         rows, checker = judged(played(*MERGES[merge], *overrides, seed=seed), every=5)
         claimed += sum(row.w1_exact is not None and row.w_ub_tight is not None for row in rows)
 
