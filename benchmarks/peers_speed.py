@@ -4,7 +4,7 @@ They do less in a step, so this is a scale and no race: ir-sim moves bodies (dif
 no radio); coverage-control senses an importance field and computes Voronoi coverage, decentralized, in
 C++. kantor plans, merges, passes every message through the codec, and records with every referee on.
 
-    pip install ir-sim==2.12.0 coverage-control==1.3.1
+    pip install --group peers
 """
 
 import importlib.machinery
@@ -54,7 +54,9 @@ def measure(*, quick: bool) -> Table:
         "peers: robot-steps per CPU second of other simulators",
         ("simulator", "a step is", "robots", "robot-steps/s"),
         rows,
-        ("kantor's are in the section fleet, column recorded",),
+        (
+            "kantor's are in the section fleet, column recorded; `pip install --group peers` installs these",
+        ),
     )
 
 

@@ -1,5 +1,6 @@
 """`kantor run`, `scenarios` and `verify` as a user runs them."""
 
+import csv
 import json
 import shutil
 import signal
@@ -57,6 +58,28 @@ def test_a_mission_that_is_not_met_exits_with_one(kantor: "Kantor") -> None:
 
     assert finished.code == 1
     assert result_of(kantor.runs()[0])["ended"] == "limit"
+
+
+@pytest.mark.parametrize("exchange", ["in-process", "lockstep"])
+def test_an_exact_distance_comes_when_asked_for_and_changes_nothing(
+    kantor: "Kantor", exchange: str
+) -> None:
+    """In its column at the ticks that were named and at the end; the digest is that without it."""
+    small = ("--exchange", exchange, "--set", "energy.points=200", "--set", "samples.count=100")
+    without, asked = (
+        kantor("run", "paper-centralized", *flags, *small)
+        for flags in ((), ("--exact-every", "15"))
+    )
+
+    assert (without.code, asked.code) == (0, 0), asked.err
+    before, after = (result_of(folder) for folder in kantor.runs())
+    assert before["digest"] == after["digest"]
+    assert before["w1_exact"] is None
+    with (kantor.runs()[1] / "metrics.csv").open(encoding="utf-8", newline="") as file:
+        exact = {int(row["tick"]): row["w1_exact"] for row in csv.DictReader(file)}
+    assert {tick for tick, value in exact.items() if value} == {0, 15, 30, 40}
+    assert float(exact[40]) == after["w1_exact"]
+    assert f"exact {after['w1_exact']:.4g}" in asked.out
 
 
 def test_the_scenario_in_the_folder_runs_again_to_the_same_digest(kantor: "Kantor") -> None:
