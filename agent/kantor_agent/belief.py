@@ -54,7 +54,6 @@ def ship(
 def _ship_packed(
     xy_m: np.ndarray,
     order: np.ndarray,
-    slot: np.ndarray,
     cell: np.ndarray,
     first: np.ndarray,
     alive: np.ndarray,
@@ -83,7 +82,7 @@ def _ship_packed(
     """`ship` for calls from Python: bytes of packed pairs in `out`, or -1 if the log has no room."""
     if length[me] + sample.shape[0] > logs.shape[1]:
         return -1
-    grid = Grid(xy_m, order, slot, cell, first, alive, frame, levels)
+    grid = Grid(xy_m, order, cell, first, alive, frame, levels)
     store = Store(
         weights,
         logs,
@@ -106,7 +105,6 @@ def _ship_packed(
 def _drop_empty(
     xy_m: np.ndarray,
     order: np.ndarray,
-    slot: np.ndarray,
     cell: np.ndarray,
     first: np.ndarray,
     alive: np.ndarray,
@@ -115,10 +113,11 @@ def _drop_empty(
     weights: np.ndarray,
     lowered: np.ndarray,
     counters: np.ndarray,
-) -> None:
+) -> int:
     """Take the samples that this step has emptied out of the grid."""
-    grid = Grid(xy_m, order, slot, cell, first, alive, frame, levels)
-    remove_empty(grid, weights, lowered[: counters[LOWERED]])
+    grid = Grid(xy_m, order, cell, first, alive, frame, levels)
+    read: int = remove_empty(grid, weights, lowered[: counters[LOWERED]])
+    return read
 
 
 class Belief:
