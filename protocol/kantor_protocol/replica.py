@@ -224,10 +224,16 @@ def _is_vector(store: Store, manner: Manner, have: bytes) -> bool:
 
 @kernel
 def _apply_have(store: Store, manner: Manner, have: bytes, source: int) -> None:
+    known = store.known[source]
+    slots = store.length.shape[0] * (2 if manner.claims else 1)
+    if len(have) == slots:  # a byte for each: the processor takes many at once
+        for slot in range(slots):
+            known[slot] = max(known[slot], np.int32(have[slot]))
+        return
     at = 0
-    for slot in range(store.length.shape[0] * (2 if manner.claims else 1)):
+    for slot in range(slots):
         held, at = take_uint(have, at)
-        store.known[source, slot] = max(store.known[source, slot], min(held, KNOWN_MAX))
+        known[slot] = max(known[slot], min(held, KNOWN_MAX))
 
 
 @kernel

@@ -36,7 +36,7 @@ class Units(msgspec.Struct, frozen=True):
         return cls(whole=whole, sample=whole // samples, point=whole // points)
 
 
-class WeightsMessage(msgspec.Struct, frozen=True, array_like=True, tag=20):
+class WeightsMessage(msgspec.Struct, frozen=True, array_like=True, tag=20, gc=False):
     """On `<id>/weights`: a whole vector, or the entries that fell since the message before."""
 
     version: int
