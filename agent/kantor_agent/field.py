@@ -98,19 +98,19 @@ def build(grid: Grid, weights: np.ndarray) -> None:
 @kernel
 def remove(grid: Grid, j: int) -> None:
     """Take a sample out of the search. A sample that is out already stays out."""
+    leaf = grid.levels - 1
     c = grid.cell[j]
     start = grid.first[c]
-    end = start + grid.alive[_level_start(grid.levels - 1) + c]
+    end = start + grid.alive[_level_start(leaf) + c]
     slot = start
     while slot < end and grid.order[slot] != j:
         slot += 1
     if slot == end:
         return
     grid.order[slot], grid.order[end - 1] = grid.order[end - 1], j
-    side = 1 << (grid.levels - 1)
-    row, column = c // side, c % side
-    for level in range(grid.levels - 1, -1, -1):
-        grid.alive[_level_start(level) + row * (1 << level) + column] -= 1
+    row, column = c >> leaf, c & ((1 << leaf) - 1)
+    for level in range(leaf, -1, -1):
+        grid.alive[_level_start(level) + (row << level) + column] -= 1
         row >>= 1
         column >>= 1
 
