@@ -124,7 +124,7 @@ class Pairs:
         self._value = np.zeros(capacity, dtype=np.int64)
 
     def encode(
-        self, index: npt.NDArray[np.int64], value: npt.NDArray[np.int64], count: int
+        self, index: npt.NDArray[np.signedinteger], value: npt.NDArray[np.signedinteger], count: int
     ) -> bytes:
         """The first `count` pairs as bytes."""
         if not count:
