@@ -54,16 +54,13 @@ def ship(
 def _ship_packed(
     xy_m: np.ndarray,
     order: np.ndarray,
-    slot: np.ndarray,
     cell: np.ndarray,
     first: np.ndarray,
     alive: np.ndarray,
     frame: np.ndarray,
     levels: int,
     weights: np.ndarray,
-    spent: np.ndarray,
-    log_index: np.ndarray,
-    log_value: np.ndarray,
+    logs: np.ndarray,
     length: np.ndarray,
     known: np.ndarray,
     sending: np.ndarray,
@@ -83,14 +80,12 @@ def _ship_packed(
     y: float,
 ) -> int:
     """`ship` for calls from Python: bytes of packed pairs in `out`, or -1 if the log has no room."""
-    if length[me] + sample.shape[0] > log_index.shape[1]:
+    if length[me] + sample.shape[0] > logs.shape[1]:
         return -1
-    grid = Grid(xy_m, order, slot, cell, first, alive, frame, levels)
+    grid = Grid(xy_m, order, cell, first, alive, frame, levels)
     store = Store(
         weights,
-        spent,
-        log_index,
-        log_value,
+        logs,
         length,
         known,
         sending,
@@ -100,7 +95,7 @@ def _ship_packed(
         counters,
     )
     # Of the manner, spending reads only whose log it is and what an entry means.
-    manner = Manner(me, ledger != 0, False, False, False, 0, 0, 0)
+    manner = Manner(me, ledger != 0, False, False, False, 0, 0)
     count = ship(grid, store, manner, x, y, point, _Room(best, near, sample, units))
     used: int = pack_pairs(sample, units, count, out)
     return used
@@ -110,7 +105,6 @@ def _ship_packed(
 def _drop_empty(
     xy_m: np.ndarray,
     order: np.ndarray,
-    slot: np.ndarray,
     cell: np.ndarray,
     first: np.ndarray,
     alive: np.ndarray,
@@ -119,10 +113,11 @@ def _drop_empty(
     weights: np.ndarray,
     lowered: np.ndarray,
     counters: np.ndarray,
-) -> None:
+) -> int:
     """Take the samples that this step has emptied out of the grid."""
-    grid = Grid(xy_m, order, slot, cell, first, alive, frame, levels)
-    remove_empty(grid, weights, lowered[: counters[LOWERED]])
+    grid = Grid(xy_m, order, cell, first, alive, frame, levels)
+    read: int = remove_empty(grid, weights, lowered[: counters[LOWERED]])
+    return read
 
 
 class Belief:

@@ -34,8 +34,6 @@ class Grid(NamedTuple):
     """(N, 2) world frame."""
     order: npt.NDArray[np.int32]
     """(N,) samples by cell, those with weight first."""
-    slot: npt.NDArray[np.int32]
-    """(N,) where each sample is in `order`."""
     cell: npt.NDArray[np.int32]
     """(N,) the cell of each sample."""
     first: npt.NDArray[np.int32]
@@ -78,8 +76,7 @@ def build(grid: Grid, weights: np.ndarray) -> None:
         for j in range(grid.xy_m.shape[0]):
             if (weights[j] > 0) == with_weight:
                 c = grid.cell[j]
-                grid.slot[j] = grid.first[c] + grid.alive[leaves + c]
-                grid.order[grid.slot[j]] = j
+                grid.order[grid.first[c] + grid.alive[leaves + c]] = j
                 grid.alive[leaves + c] += 1
     for j in range(grid.xy_m.shape[0]):
         if weights[j] <= 0:
@@ -101,28 +98,45 @@ def build(grid: Grid, weights: np.ndarray) -> None:
 @kernel
 def remove(grid: Grid, j: int) -> None:
     """Take a sample out of the search. A sample that is out already stays out."""
+    leaf = grid.levels - 1
     c = grid.cell[j]
-    leaf = _level_start(grid.levels - 1) + c
-    last = grid.first[c] + grid.alive[leaf] - 1
-    if grid.slot[j] > last:
+    start = grid.first[c]
+    end = start + grid.alive[_level_start(leaf) + c]
+    slot = start
+    while slot < end and grid.order[slot] != j:
+        slot += 1
+    if slot == end:
         return
-    other = grid.order[last]
-    grid.order[grid.slot[j]], grid.order[last] = other, j
-    grid.slot[other], grid.slot[j] = grid.slot[j], last
-    side = 1 << (grid.levels - 1)
-    row, column = c // side, c % side
-    for level in range(grid.levels - 1, -1, -1):
-        grid.alive[_level_start(level) + row * (1 << level) + column] -= 1
+    grid.order[slot], grid.order[end - 1] = grid.order[end - 1], j
+    row, column = c >> leaf, c & ((1 << leaf) - 1)
+    for level in range(leaf, -1, -1):
+        grid.alive[_level_start(level) + (row << level) + column] -= 1
         row >>= 1
         column >>= 1
 
 
 @kernel
-def remove_empty(grid: Grid, weights: np.ndarray, lowered: np.ndarray) -> None:
-    """Take those of the lowered samples out that have no weight left."""
+def _reach_for(grid: Grid, samples: np.ndarray) -> int:
+    """Read what `remove` reads of each: memory answers many at once when none waits for another.
+
+    Returns a sum that means nothing, but for which the compiler must read.
+    """
+    leaves = _level_start(grid.levels - 1)
+    read = 0
+    for i in range(samples.shape[0]):
+        c = grid.cell[samples[i]]
+        read += grid.order[grid.first[c]] + grid.alive[leaves + c]
+    return read
+
+
+@kernel
+def remove_empty(grid: Grid, weights: np.ndarray, lowered: np.ndarray) -> int:
+    """Take those of the lowered samples out that have no weight left; see `_reach_for`."""
+    read: int = _reach_for(grid, lowered)
     for i in range(lowered.shape[0]):
         if weights[lowered[i]] <= 0:
             remove(grid, lowered[i])
+    return read
 
 
 @kernel
@@ -263,7 +277,6 @@ def grid_over(xy_m: npt.NDArray[np.float64], weights: npt.NDArray[np.int64]) -> 
     grid = Grid(
         xy_m=xy_m,
         order=np.zeros(count, dtype=np.int32),
-        slot=np.zeros(count, dtype=np.int32),
         cell=np.zeros(count, dtype=np.int32),
         first=np.zeros(side * side + 1, dtype=np.int32),
         alive=np.zeros((4**levels - 1) // 3, dtype=np.int32),

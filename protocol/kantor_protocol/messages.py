@@ -58,7 +58,7 @@ class Array(msgspec.Struct, frozen=True, array_like=True):
             raise RefusedError(f"array {self.dtype}{self.shape}: {error}") from None
 
 
-class News(_Message, frozen=True, array_like=True, tag=1):
+class News(_Message, frozen=True, array_like=True, tag=1, gc=False):
     """Radio, participant to participant: the sender's registers and the log suffixes others lack."""
 
     step: int

@@ -58,6 +58,15 @@ def take_int(buffer: bytes | np.ndarray, at: int) -> tuple[int, int]:
 
 
 @kernel
+def skip_numbers(buffer: bytes | np.ndarray, at: int, count: int) -> int:
+    """The position behind `count` numbers that are known to be well-formed, or the end."""
+    while count > 0 and at < len(buffer):
+        count -= buffer[at] < 128
+        at += 1
+    return at
+
+
+@kernel
 def pack_pairs(index: np.ndarray, value: np.ndarray, count: int, out: np.ndarray) -> int:
     """Write `count` pairs (index as difference to the one before, value >= 0); the bytes used."""
     at = 0
@@ -115,7 +124,7 @@ class Pairs:
         self._value = np.zeros(capacity, dtype=np.int64)
 
     def encode(
-        self, index: npt.NDArray[np.int64], value: npt.NDArray[np.int64], count: int
+        self, index: npt.NDArray[np.signedinteger], value: npt.NDArray[np.signedinteger], count: int
     ) -> bytes:
         """The first `count` pairs as bytes."""
         if not count:

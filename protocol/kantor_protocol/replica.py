@@ -33,7 +33,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.kernels import kernel
-from kantor_protocol.packing import Pairs, put_int, put_uint, take_int, take_uint
+from kantor_protocol.packing import Pairs, put_int, put_uint, skip_numbers, take_int, take_uint
 from kantor_protocol.registers import Registers
 from kantor_protocol.weights import Units, Weights
 
@@ -53,6 +53,8 @@ _REPEATED = 32
 """So many unacknowledged entries are repeated with every message, so that one loss costs nothing."""
 LENGTH_MAX = 1 << 40
 """No log is longer; it keeps sums of positions within 64 bits."""
+KNOWN_MAX = (1 << 31) - 2
+"""More is not remembered of what another holds: it fits into 32 bits, and nothing gets so long."""
 
 # Rows of Store.claims.
 _SAMPLE, _SINCE, _STAMP, _HEARD = 0, 1, 2, 3
@@ -61,25 +63,26 @@ LOWERED, _STEP, _HOLDING = 0, 1, 2
 
 
 class Store(NamedTuple):
-    """All that a participant holds, for the kernels. n origins, N samples."""
+    """All that a participant holds, for the kernels. n origins, N samples.
 
-    weights: npt.NDArray[np.int64]
+    A crowd does not fit into a cache: what is touched here and there is kept small, and side by side.
+    """
+
+    weights: npt.NDArray[np.int32]
     """(N,) units left in this participant's view; never rises."""
-    spent: npt.NDArray[np.int64]
-    """(N,) ledger: units spent by all origins, as far as held. min: (0,)."""
-    log_index: npt.NDArray[np.int32]
-    """ledger: (n, capacity). min: (1, capacity), the own log only."""
-    log_value: npt.NDArray[np.int32]
+    logs: npt.NDArray[np.int32]
+    """(n, capacity, 2) entries: sample, value. min: (1, capacity, 2), the own log only."""
     length: npt.NDArray[np.int64]
     """(n,) entries held of each log; min: of the others, how much has been merged."""
-    known: npt.NDArray[np.int64]
-    """(n, 2n) what each participant is known to hold: log lengths, then claim stamps."""
+    known: npt.NDArray[np.int32]
+    """(n, 2n) what each participant is known to hold: log lengths, then claim stamps; it says no
+    more than KNOWN_MAX of any."""
     sending: npt.NDArray[np.int64]
     """(3 + patience, n): entries sent; step of the last repetition; step last heard; then a ring of
     the lengths at the last `patience` steps."""
     claims: npt.NDArray[np.int64]
     """(4, n): sample or NOBODY; since_ns; stamp; own step at which the stamp was heard."""
-    lowered: npt.NDArray[np.int64]
+    lowered: npt.NDArray[np.int32]
     """(N,) indices of the weights that fell since the last `take_lowered`, each once."""
     mark: npt.NDArray[np.int32]
     """(N,) the step at which an index was put into `lowered`."""
@@ -99,7 +102,6 @@ class Manner(NamedTuple):
     """It sends all that it knows while it hears nobody."""
     patience: int
     """Own steps within which an acknowledgement is due."""
-    sample_units: int
     value_max: int
     """The largest value of a log entry."""
 
@@ -116,8 +118,8 @@ def _lower(store: Store, index: int, value: int) -> None:
 
 @kernel
 def _append(store: Store, row: int, origin: int, index: int, value: int) -> None:
-    store.log_index[row, store.length[origin]] = index
-    store.log_value[row, store.length[origin]] = value
+    store.logs[row, store.length[origin], 0] = index
+    store.logs[row, store.length[origin], 1] = value
     store.length[origin] += 1
 
 
@@ -126,7 +128,6 @@ def spend(store: Store, manner: Manner, index: int, units: int) -> None:
     """Ship `units` to a sample and log it. The log must have room for one more entry."""
     _lower(store, index, store.weights[index] - units)
     if manner.ledger:
-        store.spent[index] += units
         _append(store, manner.me, manner.me, index, units)
     else:
         _append(store, 0, manner.me, index, store.weights[index])
@@ -135,18 +136,16 @@ def spend(store: Store, manner: Manner, index: int, units: int) -> None:
 @kernel
 def _merge_entry(store: Store, manner: Manner, origin: int, index: int, value: int) -> None:
     if manner.ledger:
-        store.spent[index] += value
         _append(store, origin, origin, index, value)
-        left = max(0, manner.sample_units - store.spent[index])
-        if left < store.weights[index]:
-            _lower(store, index, left)
+        if min(value, store.weights[index]) > 0:
+            _lower(store, index, max(0, store.weights[index] - value))
     elif value < store.weights[index]:
         _lower(store, index, value)
         _append(store, 0, manner.me, index, value)
 
 
 @kernel
-def _walk_logs(store: Store, manner: Manner, logs: bytes, source: int, apply: bool) -> int:
+def _walk_suffixes(store: Store, manner: Manner, suffixes: bytes, source: int, apply: bool) -> int:
     """Read all suffixes; apply what is new, or only check.
 
     Returns how many entries some log may then hold, or a negative number when malformed.
@@ -155,12 +154,12 @@ def _walk_logs(store: Store, manner: Manner, logs: bytes, source: int, apply: bo
     at = 0
     entries = 0
     longest = 0
-    while at < len(logs):
-        origin, at = take_uint(logs, at)
-        start, at = take_uint(logs, at)
-        span, at = take_uint(logs, at)
-        count, at = take_uint(logs, at)
-        if at < 0 or origin >= store.length.shape[0] or count > span or count > len(logs):
+    while at < len(suffixes):
+        origin, at = take_uint(suffixes, at)
+        start, at = take_uint(suffixes, at)
+        span, at = take_uint(suffixes, at)
+        count, at = take_uint(suffixes, at)
+        if at < 0 or origin >= store.length.shape[0] or count > span or count > len(suffixes):
             return -1
         if start > LENGTH_MAX or span > LENGTH_MAX:
             return -1
@@ -172,17 +171,20 @@ def _walk_logs(store: Store, manner: Manner, logs: bytes, source: int, apply: bo
             longest = store.length[manner.me] + entries
         elif start <= held + entries:  # it may follow on another suffix in this message
             longest = max(longest, start + span)
-        fresh = apply and origin != manner.me and (not ledger or start <= held)
+        fresh = origin != manner.me and (not ledger or start <= held < start + count)
+        if apply and not fresh:
+            at = skip_numbers(suffixes, at, 2 * count)
+            continue
         index = 0
         for i in range(count):
-            step, at = take_int(logs, at)
-            value, at = take_uint(logs, at)
+            step, at = take_int(suffixes, at)
+            value, at = take_uint(suffixes, at)
             index += step
             if at < 0 or index < 0 or index >= store.weights.shape[0] or value > manner.value_max:
                 return -1
-            if fresh and (not ledger or start + i >= held):
+            if apply and (not ledger or start + i >= held):
                 _merge_entry(store, manner, origin, index, value)
-        if fresh and not ledger and start <= held:
+        if apply and not ledger and start <= held:
             store.length[origin] = max(held, start + span)
     return longest
 
@@ -222,25 +224,27 @@ def _is_vector(store: Store, manner: Manner, have: bytes) -> bool:
 
 @kernel
 def _apply_have(store: Store, manner: Manner, have: bytes, source: int) -> None:
+    known = store.known[source]
+    slots = store.length.shape[0] * (2 if manner.claims else 1)
+    if len(have) == slots:  # a byte for each: the processor takes many at once
+        for slot in range(slots):
+            known[slot] = max(known[slot], np.int32(have[slot]))
+        return
     at = 0
-    for slot in range(store.length.shape[0] * (2 if manner.claims else 1)):
+    for slot in range(slots):
         held, at = take_uint(have, at)
-        store.known[source, slot] = max(store.known[source, slot], held)
+        known[slot] = max(known[slot], min(held, KNOWN_MAX))
 
 
 @kernel
 def _manner(law: np.ndarray) -> Manner:
-    return Manner(
-        law[0], law[1] != 0, law[2] != 0, law[3] != 0, law[4] != 0, law[5], law[6], law[7]
-    )
+    return Manner(law[0], law[1] != 0, law[2] != 0, law[3] != 0, law[4] != 0, law[5], law[6])
 
 
 @kernel
 def _learn(
     weights: np.ndarray,
-    spent: np.ndarray,
-    log_index: np.ndarray,
-    log_value: np.ndarray,
+    logs: np.ndarray,
     length: np.ndarray,
     known: np.ndarray,
     sending: np.ndarray,
@@ -250,7 +254,7 @@ def _learn(
     counters: np.ndarray,
     law: np.ndarray,
     have: bytes,
-    logs: bytes,
+    suffixes: bytes,
     registers: bytes,
     source: int,
 ) -> int:
@@ -261,9 +265,7 @@ def _learn(
     """
     store = Store(
         weights,
-        spent,
-        log_index,
-        log_value,
+        logs,
         length,
         known,
         sending,
@@ -273,17 +275,17 @@ def _learn(
         counters,
     )
     manner = _manner(law)
-    longest = _walk_logs(store, manner, logs, source, False)
+    longest = _walk_suffixes(store, manner, suffixes, source, False)
     if (
         longest < 0
         or not _is_vector(store, manner, have)
         or _walk_claims(store, manner, registers, False) < 0
     ):
         return _MALFORMED
-    if longest > log_index.shape[1]:
+    if longest > logs.shape[1]:
         return longest
     _apply_have(store, manner, have, source)
-    _walk_logs(store, manner, logs, source, True)
+    _walk_suffixes(store, manner, suffixes, source, True)
     if manner.claims:
         _walk_claims(store, manner, registers, True)
     store.sending[2, source] = store.counters[_STEP]
@@ -291,41 +293,36 @@ def _learn(
 
 
 @kernel
-def _find_neighbours(store: Store, manner: Manner, target: int, out: np.ndarray) -> int:
-    """Whoever was heard lately, or the target alone if it was; their number."""
-    count = 0
-    for other in range(store.length.shape[0]):
-        if other == manner.me or (target >= 0 and other != target):
-            continue
-        heard = store.sending[2, other]
-        if heard >= 0 and heard + manner.patience + _FRESH_STEPS >= store.counters[_STEP]:
-            out[count] = other
-            count += 1
-    return count
+def _find_least(store: Store, manner: Manner, target: int, least: np.ndarray) -> None:
+    """The least that any neighbour, or the target alone, is known to hold in each slot of `known`.
 
-
-@kernel
-def _neighbours_lack(store: Store, neighbours: np.ndarray, origin: int, slot: int) -> int:
-    """The least that any of them is known to hold in a slot of `known`; -1 if there is none.
-
-    The origin of the slot itself does not count: it holds its own state.
+    Whoever was heard lately is a neighbour. The origin of a slot does not count there: it holds its
+    own state. NOBODY where nobody else counts.
     """
-    least = -1
-    for other in neighbours:
-        if other != origin:
-            held = store.known[other, slot]
-            least = held if least < 0 else min(least, held)
-    return least
+    origins = store.length.shape[0]
+    least[:] = KNOWN_MAX + 1
+    for other in range(origins):
+        heard = store.sending[2, other]
+        lately = heard >= 0 and heard + manner.patience + _FRESH_STEPS >= store.counters[_STEP]
+        if lately and other != manner.me and target in (NOBODY, other):
+            log, claim = least[other], least[origins + other]
+            for slot in range(least.shape[0]):  # row by row: so the processor takes many at once
+                least[slot] = min(least[slot], store.known[other, slot])
+            least[other], least[origins + other] = log, claim
+    for slot in range(least.shape[0]):
+        least[slot] = NOBODY if least[slot] > KNOWN_MAX else least[slot]
 
 
 @kernel
 def _start_of_suffix(
-    store: Store, manner: Manner, target: int, neighbours: np.ndarray, origin: int, aged: int
+    store: Store, manner: Manner, target: int, least: int, origin: int, aged: int
 ) -> int:
-    """First entry to send of an origin's log; its length when nothing is to be sent."""
+    """First entry to send of an origin's log; its length when nothing is to be sent.
+
+    least: how much of it all neighbours hold.
+    """
     me, relay, patience = manner.me, manner.relay, manner.patience
     length = store.length[origin]
-    least = _neighbours_lack(store, neighbours, origin, origin)
     if least < 0 and target < 0 and manner.beacon:
         return 0
     if least < 0:
@@ -346,12 +343,12 @@ def _put_suffix(
     store: Store, out: np.ndarray, at: int, origin: int, ledger: bool, start: int, room: int
 ) -> tuple[int, int]:
     """Write one suffix: (position after it, entries written)."""
-    row = origin if ledger else 0
+    log = store.logs[origin if ledger else 0]
     count = 0
     end = start
     while end < store.length[origin] and count < room:
         # In a log of minima only the newest entry of a sample matters: the one the vector holds.
-        if ledger or store.log_value[row, end] == store.weights[store.log_index[row, end]]:
+        if ledger or log[end, 1] == store.weights[log[end, 0]]:
             count += 1
         end += 1
     at = put_uint(out, at, origin)
@@ -360,8 +357,7 @@ def _put_suffix(
     at = put_uint(out, at, count)
     before = 0
     for entry in range(start, end):
-        index = int(store.log_index[row, entry])
-        value = int(store.log_value[row, entry])
+        index, value = int(log[entry, 0]), int(log[entry, 1])
         if ledger or value == store.weights[index]:
             at = put_int(out, at, index - before)
             at = put_uint(out, at, value)
@@ -371,9 +367,7 @@ def _put_suffix(
 
 
 @kernel
-def _put_claims(
-    store: Store, manner: Manner, out: np.ndarray, at: int, neighbours: np.ndarray
-) -> int:
+def _put_claims(store: Store, manner: Manner, out: np.ndarray, at: int, least: np.ndarray) -> int:
     me, relay = manner.me, manner.relay
     origins = store.length.shape[0]
     step = store.counters[_STEP]
@@ -384,9 +378,9 @@ def _put_claims(
         ):
             continue
         if origin != me:
-            least = _neighbours_lack(store, neighbours, origin, origins + origin)
+            held = least[origins + origin]
             slack = 0 if relay else _CLAIM_RENEWAL_STEPS
-            if least < 0 or least + slack >= stamp:
+            if held < 0 or held + slack >= stamp:
                 continue
         at = put_uint(out, at, origin)
         at = put_uint(out, at, stamp)
@@ -398,9 +392,7 @@ def _put_claims(
 @kernel
 def _compose(
     weights: np.ndarray,
-    spent: np.ndarray,
-    log_index: np.ndarray,
-    log_value: np.ndarray,
+    logs: np.ndarray,
     length: np.ndarray,
     known: np.ndarray,
     sending: np.ndarray,
@@ -410,18 +402,16 @@ def _compose(
     counters: np.ndarray,
     law: np.ndarray,
     out: np.ndarray,
-    room: np.ndarray,
+    least: np.ndarray,
     target: int,
 ) -> tuple[int, int, int]:
     """Write have, logs and claims one after the other; the position at the end of each.
 
-    room: (n,) for the neighbours.
+    least: (2n,) room, see `_find_least`.
     """
     store = Store(
         weights,
-        spent,
-        log_index,
-        log_value,
+        logs,
         length,
         known,
         sending,
@@ -432,7 +422,7 @@ def _compose(
     )
     manner = _manner(law)
     me, ledger = manner.me, manner.ledger
-    neighbours = room[: _find_neighbours(store, manner, target, room)]
+    _find_least(store, manner, target, least)
     origins = store.length.shape[0]
     at = 0
     for origin in range(origins):
@@ -447,7 +437,7 @@ def _compose(
         origin = (me + turn) % origins
         if ledger or origin == me:
             aged = store.sending[slot, origin]
-            start = _start_of_suffix(store, manner, target, neighbours, origin, aged)
+            start = _start_of_suffix(store, manner, target, least[origin], origin, aged)
             if start < store.length[origin] and entries_left > 0:
                 at, written = _put_suffix(store, out, at, origin, ledger, start, entries_left)
                 entries_left -= written
@@ -455,7 +445,7 @@ def _compose(
         store.sending[slot, origin] = store.length[origin]
     end_of_logs = at
     if manner.claims:
-        at = _put_claims(store, manner, out, at, neighbours)
+        at = _put_claims(store, manner, out, at, least)
     return end_of_have, end_of_logs, at
 
 
@@ -498,9 +488,10 @@ def _pack_lowered(
     at = 0
     before = 0
     for i in range(count):
-        at = put_int(out, at, lowered[i] - before)
-        at = put_uint(out, at, weights[lowered[i]])
-        before = lowered[i]
+        index = int(lowered[i])
+        at = put_int(out, at, index - before)
+        at = put_uint(out, at, int(weights[index]))
+        before = index
     return at
 
 
@@ -543,20 +534,17 @@ class Replica:
             relay=relay,
             beacon=beacon,
             patience=max(1, patience_steps),
-            sample_units=units.sample,
             value_max=units.point if ledger else units.sample,
         )
         rows = origins if ledger else 1
         self.store = Store(
-            weights=np.full(samples, units.sample, dtype=np.int64),
-            spent=np.zeros(samples if ledger else 0, dtype=np.int64),
-            log_index=np.zeros((rows, 256), dtype=np.int32),
-            log_value=np.zeros((rows, 256), dtype=np.int32),
+            weights=np.full(samples, units.sample, dtype=np.int32),
+            logs=np.zeros((rows, 256, 2), dtype=np.int32),
             length=np.zeros(origins, dtype=np.int64),
-            known=np.zeros((origins, 2 * origins), dtype=np.int64),
+            known=np.zeros((origins, 2 * origins), dtype=np.int32),
             sending=np.zeros((3 + self.manner.patience, origins), dtype=np.int64),
             claims=np.zeros((4, origins), dtype=np.int64),
-            lowered=np.zeros(samples, dtype=np.int64),
+            lowered=np.zeros(samples, dtype=np.int32),
             mark=np.zeros(samples, dtype=np.int32),
             counters=np.array([0, 1, samples], dtype=np.int64),
         )
@@ -564,7 +552,7 @@ class Replica:
         self.store.claims[_SAMPLE] = NOBODY
         self._out = np.zeros(20 * _ENTRIES_MAX + 120 * origins + 64, dtype=np.uint8)
         self._taken = np.zeros(origins, dtype=np.int64)
-        self._room = np.zeros(origins, dtype=np.int64)
+        self._least = np.zeros(2 * origins, dtype=np.int32)
         self._law = np.array(self.manner, dtype=np.int64)
         self._fields = (*self.store, self._law)
 
@@ -581,8 +569,7 @@ class Replica:
     def entries(self, origin: int) -> list[tuple[int, int]]:
         """The held log of an origin, as (sample, value); with min only the own log is held."""
         row, length = (origin if self.manner.ledger else 0), int(self.store.length[origin])
-        index, value = self.store.log_index[row, :length], self.store.log_value[row, :length]
-        return list(zip(index.tolist(), value.tolist(), strict=True))
+        return [(index, value) for index, value in self.store.logs[row, :length].tolist()]
 
     def learn(
         self, source: int, have: bytes, logs: bytes, claims: bytes, registers: bytes = b""
@@ -605,15 +592,14 @@ class Replica:
 
     def _lengthen(self, needed: int) -> None:
         """Make room for this many entries in every log."""
-        rows, capacity = self.store.log_index.shape
+        rows, capacity, _ = self.store.logs.shape
         if needed <= capacity:
             return
         while capacity < needed:
             capacity *= 2
-        grown = [np.zeros((rows, capacity), dtype=np.int32) for _ in range(2)]
-        for new, old in zip(grown, (self.store.log_index, self.store.log_value), strict=True):
-            new[:, : old.shape[1]] = old
-        self.store = self.store._replace(log_index=grown[0], log_value=grown[1])
+        logs = np.zeros((rows, capacity, 2), dtype=np.int32)
+        logs[:, : self.store.logs.shape[1]] = self.store.logs
+        self.store = self.store._replace(logs=logs)
         self._fields = (*self.store, self._law)
 
     def claim(self, sample: int, now_ns: int) -> None:
@@ -629,11 +615,11 @@ class Replica:
 
     def compose(self, target: int = NOBODY) -> tuple[bytes, bytes, bytes]:
         """(have, logs, claims) for one message to everybody, or to one participant."""
-        end_of_have, end_of_logs, end = _compose(*self._fields, self._out, self._room, target)
+        end_of_have, end_of_logs, end = _compose(*self._fields, self._out, self._least, target)
         told = self._out[:end].tobytes()
         return told[:end_of_have], told[end_of_have:end_of_logs], told[end_of_logs:]
 
-    def lowered(self) -> npt.NDArray[np.int64]:
+    def lowered(self) -> npt.NDArray[np.int32]:
         """Samples whose weight fell in this step, each once; a view valid until `end_step`."""
         return self.store.lowered[: self.store.counters.item(LOWERED)]
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from kantor_protocol.kernels import kernel
 from kantor_protocol.packing import Pairs
 
-Weights = npt.NDArray[np.int64]
+Weights = npt.NDArray[np.signedinteger]
 
 _SIZES = (np.dtype("<u1"), np.dtype("<u2"), np.dtype("<u4"))
 
@@ -36,7 +36,7 @@ class Units(msgspec.Struct, frozen=True):
         return cls(whole=whole, sample=whole // samples, point=whole // points)
 
 
-class WeightsMessage(msgspec.Struct, frozen=True, array_like=True, tag=20):
+class WeightsMessage(msgspec.Struct, frozen=True, array_like=True, tag=20, gc=False):
     """On `<id>/weights`: a whole vector, or the entries that fell since the message before."""
 
     version: int
@@ -78,12 +78,12 @@ class WeightsPublisher:
         self._keyframe_every = keyframe_every
         self._steps = 0
         self._sequence = 0
-        self._changed = np.zeros(weights.shape[0], dtype=np.int64)
+        self._changed = np.zeros(weights.shape[0], dtype=np.int32)
         self._count = 0
-        self._noted_in = np.zeros(weights.shape[0], dtype=np.int64)
+        self._noted_in = np.zeros(weights.shape[0], dtype=np.int32)
         self._pairs = Pairs()
 
-    def step(self, lowered: npt.NDArray[np.int64], *, last: bool) -> bytes:
+    def step(self, lowered: npt.NDArray[np.int32], *, last: bool) -> bytes:
         """Note the indices that fell; the encoded message when one is due, else nothing.
 
         last: nothing will fall any more, so a message is due now.

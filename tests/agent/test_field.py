@@ -70,9 +70,8 @@ def check_pyramid(grid: Grid, alive: set[int]) -> None:
     assert int(grid.alive[0]) == len(alive)
     assert set().union(*(living for living, _ in cells)) == alive
     assert sorted(grid.order.tolist()) == list(range(grid.xy_m.shape[0]))
-    assert [int(grid.order[slot]) for slot in grid.slot] == list(range(grid.xy_m.shape[0]))
     assert [j in cells[int(grid.cell[j])][1] for j in range(grid.xy_m.shape[0])] == [True] * len(
-        grid.slot
+        grid.cell
     )
 
 

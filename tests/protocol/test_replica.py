@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.replica import NOBODY, Replica, spend
+from kantor_protocol.replica import KNOWN_MAX, NOBODY, Replica, spend
 from kantor_protocol.weights import Units
 from strategies import examples
 
@@ -267,7 +267,30 @@ def test_overspent_sample_stops_at_zero() -> None:
     a, b = team([[(3, 3)], [(3, 3)]], ledger=True)
 
     assert vector(join(a, b)) == [4, 4, 4, 0, 4, 4]
-    assert int(a.store.spent[3]) == 6
+
+
+@MODES
+def test_largest_units_are_exact(*, ledger: bool) -> None:
+    """The most points that a scenario may have: no weight overflows."""
+    units = Units.of(1_999_999_999, N)
+    writer, held = (replica(me, 2, ledger=ledger, units=units) for me in range(2))
+    value = units.point if ledger else units.sample - 1
+    entries = [(0, value), (0, value)]
+
+    assert vector(writer) == [units.sample] * N
+    assert held.learn(0, have(2), suffix(0, 0, entries), b"")
+    assert vector(held)[0] == units.sample - (2 * units.point if ledger else 1)
+
+
+def test_acknowledgement_beyond_any_log_is_taken_for_all_of_it() -> None:
+    """Whoever says that it holds more than can be gets nothing, and harms nobody."""
+    held = replica(0, 2, ledger=True)
+    buy(held, [(3, 1)])
+    boast = b"".join(leb128(number) for number in (1 << 62, 1 << 31, (1 << 31) - 1, 0))
+
+    assert held.learn(1, boast, b"", b"")
+    assert held.store.known[1].tolist() == [KNOWN_MAX, KNOWN_MAX, KNOWN_MAX, 0]
+    assert held.compose()[1] == b""
 
 
 # Suffixes.
@@ -714,7 +737,7 @@ def test_compact_words_are_what_the_protocol_says(*, ledger: bool) -> None:
 @examples(40)
 @given(bought=TEAM_PURCHASES)
 def test_held_spending_is_the_sum_of_the_logs(bought: tuple[Purchases, ...]) -> None:
-    """ledger: `spent` and `weights` are what the held entries add up to, to the unit."""
+    """ledger: `weights` are what the held entries add up to, to the unit."""
     a, b, c = team(bought, ledger=True)
     join(a, b, c)
     total = np.zeros(N, dtype=np.int64)
@@ -722,5 +745,4 @@ def test_held_spending_is_the_sum_of_the_logs(bought: tuple[Purchases, ...]) -> 
         for sample, units in a.entries(origin):
             total[sample] += units
 
-    assert a.store.spent.tolist() == total.tolist()
     assert vector(a) == np.maximum(0, UNITS.sample - total).tolist()

@@ -8,7 +8,7 @@ from kantor_agent.belief import Belief
 from kantor_protocol.machine import Pose
 
 
-class Goal(msgspec.Struct, frozen=True):
+class Goal(msgspec.Struct, frozen=True, gc=False):
     """Where to head, in the world frame."""
 
     x_m: float

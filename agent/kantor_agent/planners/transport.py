@@ -78,7 +78,6 @@ def choose_sample(
 def _choose(
     xy_m: np.ndarray,
     order: np.ndarray,
-    slot: np.ndarray,
     cell: np.ndarray,
     first: np.ndarray,
     alive: np.ndarray,
@@ -100,7 +99,7 @@ def _choose(
 
     held: room for the samples that others hold. me: NOBODY in a mission without claims.
     """
-    grid = Grid(xy_m, order, slot, cell, first, alive, frame, levels)
+    grid = Grid(xy_m, order, cell, first, alive, frame, levels)
     skip = held[: taken(claims, counters, me, held) if me != NOBODY else 0]
     sample = choose_sample(grid, weights, x, y, skip, best, near, cost_to_go)
     if sample == NOBODY and skip.shape[0] > 0:
