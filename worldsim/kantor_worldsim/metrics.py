@@ -36,7 +36,7 @@ from kantor_protocol.machine import ParticipantId, State
 from kantor_protocol.walk import Walk
 from kantor_worldsim import exact
 from kantor_worldsim import reading as of
-from kantor_worldsim.bounds import Auction, measure
+from kantor_worldsim.bounds import Auction, gather, measure
 from kantor_worldsim.channel import DROPPED, links
 from kantor_worldsim.reading import Reader
 from kantor_worldsim.records import Batch, Ending, Opening, Record
@@ -260,9 +260,47 @@ def _follow(
 @sum_kernel
 def _weighed(units: np.ndarray, way_m: np.ndarray) -> float:
     total = 0.0
-    for j in range(units.shape[0]):
+    for j in range(way_m.shape[0]):
         total += units[j] * way_m[j]
     return total
+
+
+@kernel
+def _sum_common(
+    xy_m: np.ndarray, xyu: np.ndarray, way_m: np.ndarray, whole: int, paper: np.ndarray
+) -> None:
+    """Every robot ships the same weights: add a block of them."""
+    for i in range(xy_m.shape[0]):
+        measure(xyu[0], xyu[1], xy_m[i], way_m)
+        paper[i] += _weighed(xyu[2], way_m) / whole
+
+
+@kernel
+def _sum_views(
+    xy_m: np.ndarray,
+    samples_m: np.ndarray,
+    views: np.ndarray,
+    first: int,
+    near: np.ndarray,
+    xyu: np.ndarray,
+    way_m: np.ndarray,
+    whole: int,
+    paper: np.ndarray,
+    local: np.ndarray,
+) -> None:
+    """Every robot ships by its own view: add the block that begins at `first`."""
+    last = first + way_m.shape[0]
+    for j in range(way_m.shape[0]):
+        xyu[0, j], xyu[1, j] = samples_m[first + j, 0], samples_m[first + j, 1]
+    for i in range(xy_m.shape[0]):
+        measure(xyu[0], xyu[1], xy_m[i], way_m)
+        own = _weighed(views[i, first:last], way_m) / whole
+        paper[i] += own
+        for k in range(xy_m.shape[0]):
+            if k == i:
+                local[k] += own
+            elif near[i, k]:
+                local[k] += _weighed(views[k, first:last], way_m) / whole
 
 
 @kernel
@@ -278,8 +316,8 @@ def _sum_up(
     centralized: bool,
     ledger: bool,
     near: np.ndarray,
+    xyu: np.ndarray,
     way_m: np.ndarray,
-    true_rest: np.ndarray,
     paper: np.ndarray,
     local: np.ndarray,
 ) -> int:
@@ -287,11 +325,13 @@ def _sum_up(
 
     For each robot in paper: by the common weights or its own view; in local: eq. 12, what the robots in
     its range have shipped and their terms by its own view. near: (m, m) room for who is in whose range.
-    way_m, true_rest: room for one block of samples, which stays in the cache while all robots and views
-    meet in it.
+    xyu (3, B), way_m (B,): room for one block of samples, which stays in the cache while all robots and
+    views meet in it.
     """
     robots = xy_m.shape[0]
     rest = 0
+    for j in range(true_left.shape[0]):
+        rest += max(true_left[j], 0)
     paper[:] = 0.0
     local[:] = 0.0
     for k in range(robots):
@@ -300,25 +340,16 @@ def _sum_up(
             near[i, k] = i == k or apart_m <= range_m
             if near[i, k]:
                 local[k] += shipped_by[i]
-    for first in range(0, samples_m.shape[0], way_m.shape[0]):
-        last = min(first + way_m.shape[0], samples_m.shape[0])
-        for j in range(first, last):
-            true_rest[j - first] = max(true_left[j], 0)
-            rest += true_rest[j - first]
-        for i in range(robots):
-            way = way_m[: last - first]
-            measure(samples_m[first:last], xy_m[i, 0], xy_m[i, 1], way)
-            if centralized:
-                common = true_rest[: last - first] if ledger else least[first:last]
-                paper[i] += _weighed(common, way) / whole
-                continue
-            own = _weighed(views[i, first:last], way) / whole
-            paper[i] += own
-            for k in range(robots):
-                if k == i:
-                    local[k] += own
-                elif near[i, k]:
-                    local[k] += _weighed(views[k, first:last], way) / whole
+    first = 0
+    while first < samples_m.shape[0]:
+        if centralized:
+            common = true_left if ledger else least
+            count, first = gather(samples_m, common, first, xyu)
+            _sum_common(xy_m, xyu, way_m[:count], whole, paper)
+        else:
+            way = way_m[: min(way_m.shape[0], samples_m.shape[0] - first)]
+            _sum_views(xy_m, samples_m, views, first, near, xyu, way, whole, paper, local)
+            first += way.shape[0]
     return rest
 
 
@@ -384,8 +415,8 @@ class Metrics:
             scenario.centralized,
             scenario.merge == "ledger",
             np.zeros((robots, robots), dtype=np.bool_),
+            np.zeros((3, _BLOCK)),
             np.zeros(_BLOCK),
-            np.zeros(_BLOCK, dtype=np.int64),
             *self._terms,
         )
         size = samples * robots // _PAIRS_PER_ROW
