@@ -459,7 +459,7 @@ class Metrics:
             act = reading.acts[row]
             if act[of.PLACE] >= 0 and act[of.SPENT_COUNT] > 0 and not act[of.VOID]:
                 shipped = reading.pairs[act[of.SPENT] : act[of.SPENT] + act[of.SPENT_COUNT]]
-                x, y = reading.poses_m[row].tolist()
+                x, y = reading.poses_m[row, :2].tolist()
                 self._points.append((x, y, int(shipped[:, of.UNITS].sum())))
 
     def _row(self, *, last: bool = False) -> None:
