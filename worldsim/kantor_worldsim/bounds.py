@@ -138,6 +138,12 @@ class Auction:
         self._rounds = min(_ROUNDS_FIRST, affordable)
         self._rounds_later = min(every, _ROUNDS_FIRST, affordable)
 
+    @property
+    def ways(self) -> npt.NDArray[np.float64]:
+        """(n,) units times metres to ship all that was left at the last plan by each robot alone."""
+        ways: npt.NDArray[np.float64] = self._ways.sum(axis=1)
+        return ways
+
     def cost(
         self,
         xy_m: npt.NDArray[np.float64],

@@ -36,7 +36,7 @@ from kantor_protocol.machine import ParticipantId, State
 from kantor_protocol.walk import Walk
 from kantor_worldsim import exact
 from kantor_worldsim import reading as of
-from kantor_worldsim.bounds import Auction, gather, measure
+from kantor_worldsim.bounds import Auction, measure
 from kantor_worldsim.channel import DROPPED, links
 from kantor_worldsim.reading import Reader
 from kantor_worldsim.records import Batch, Ending, Opening, Record
@@ -266,10 +266,29 @@ def _weighed(units: np.ndarray, way_m: np.ndarray) -> float:
 
 
 @kernel
+def _rest(true_left: np.ndarray) -> int:
+    """Units that are truly left."""
+    rest = 0
+    for j in range(true_left.shape[0]):
+        rest += max(true_left[j], 0)
+    return rest
+
+
+@kernel
 def _sum_common(
-    xy_m: np.ndarray, xyu: np.ndarray, way_m: np.ndarray, whole: int, paper: np.ndarray
+    xy_m: np.ndarray,
+    samples_m: np.ndarray,
+    common: np.ndarray,
+    first: int,
+    xyu: np.ndarray,
+    way_m: np.ndarray,
+    whole: int,
+    paper: np.ndarray,
 ) -> None:
-    """Every robot ships the same weights: add a block of them."""
+    """Every robot ships the same weights: add the block that begins at `first`."""
+    for j in range(way_m.shape[0]):
+        xyu[0, j], xyu[1, j] = samples_m[first + j, 0], samples_m[first + j, 1]
+        xyu[2, j] = max(common[first + j], 0)
     for i in range(xy_m.shape[0]):
         measure(xyu[0], xyu[1], xy_m[i], way_m)
         paper[i] += _weighed(xyu[2], way_m) / whole
@@ -320,8 +339,8 @@ def _sum_up(
     way_m: np.ndarray,
     paper: np.ndarray,
     local: np.ndarray,
-) -> int:
-    """The pending terms, mass times the distance to a robot, over all samples; the true rest in units.
+) -> None:
+    """The pending terms, mass times the distance to a robot, over all samples.
 
     For each robot in paper: by the common weights or its own view; in local: eq. 12, what the robots in
     its range have shipped and their terms by its own view. near: (m, m) room for who is in whose range.
@@ -329,9 +348,6 @@ def _sum_up(
     views meet in it.
     """
     robots = xy_m.shape[0]
-    rest = 0
-    for j in range(true_left.shape[0]):
-        rest += max(true_left[j], 0)
     paper[:] = 0.0
     local[:] = 0.0
     for k in range(robots):
@@ -342,15 +358,13 @@ def _sum_up(
                 local[k] += shipped_by[i]
     first = 0
     while first < samples_m.shape[0]:
+        way = way_m[: min(way_m.shape[0], samples_m.shape[0] - first)]
         if centralized:
             common = true_left if ledger else least
-            count, first = gather(samples_m, common, first, xyu)
-            _sum_common(xy_m, xyu, way_m[:count], whole, paper)
+            _sum_common(xy_m, samples_m, common, first, xyu, way, whole, paper)
         else:
-            way = way_m[: min(way_m.shape[0], samples_m.shape[0] - first)]
             _sum_views(xy_m, samples_m, views, first, near, xyu, way, whole, paper, local)
-            first += way.shape[0]
-    return rest
+        first += way.shape[0]
 
 
 class Metrics:
@@ -465,18 +479,21 @@ class Metrics:
     def _row(self, *, last: bool = False) -> None:
         tally, scenario, whole = self._tally, self._scenario, self._units.whole
         counts = tally.counts.tolist()
-        true_rest = _sum_up(*self._to_sum_up)
+        true_rest = _rest(tally.true_left)
         # The common view: everybody's minimum, or with a ledger the truth.
         left = true_rest if scenario.merge == "ledger" else counts[_LEAST]
-        paper, local = self._terms.tolist()
-        pending = sum(paper)
         shipped, shipped_now = tally.shipped.tolist()
         tight = None
         if scenario.samples.diffusion_m == 0.0 and true_rest == whole - counts[_UNITS]:
             rest = self._auction.cost(self._walk.xy_m, tally.xy_m, tally.true_left)
             tight = shipped + rest / whole
-        if scenario.centralized:
-            local = []
+        local: list[float] = []
+        if tight is not None and scenario.centralized and scenario.merge == "ledger":
+            pending = sum((self._auction.ways / whole).tolist())  # one pass for both
+        else:
+            _sum_up(*self._to_sum_up)
+            pending = sum(self._terms[0].tolist())
+            local = [] if scenario.centralized else self._terms[1].tolist()
         self.rows.append(
             Row(
                 tick=self._tick,
