@@ -1,5 +1,6 @@
 """The referees: silent on a good record, and each rule noticed when it alone is broken."""
 
+import zlib
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise, product
 from typing import Any
@@ -374,6 +375,47 @@ def _published_vector_is_not_the_robots(records: Records) -> list[Record]:
 def _published_vector_cannot_be_rebuilt(records: Records) -> list[Record]:
     act = acts(records, "r1")[10]
     return put_act(records, act, outputs(weights=act.outputs.weights[:-1]))
+
+
+def republished(records: Records, which: int, **values: Any) -> list[Record]:
+    """Something else in place of what the first robot published in one of its steps."""
+    act = acts(records, "r1")[which]
+    message = msgspec.msgpack.decode(act.outputs.weights, type=WeightsMessage)
+    assert (message.base == 0) == (which == 0)
+    told = msgspec.structs.replace(message, **values)
+    return put_act(records, act, outputs(weights=msgspec.msgpack.encode(told)))
+
+
+@breaks("weights", run=MERGES["min"])
+def _keyframe_is_not_the_robots(records: Records) -> list[Record]:
+    return republished(
+        records, 0, content=zlib.compress(bytes(opening(records).samples_m.shape[0]))
+    )
+
+
+@breaks("weights", run=MERGES["min"])
+def _keyframe_does_not_inflate(records: Records) -> list[Record]:
+    return republished(records, 0, content=b"?")
+
+
+@breaks("weights", run=MERGES["min"])
+def _keyframe_of_another_size(records: Records) -> list[Record]:
+    return republished(records, 0, content=zlib.compress(bytes(3)), size=3)
+
+
+@breaks("weights", run=MERGES["min"])
+def _changes_of_something_else(records: Records) -> list[Record]:
+    return republished(records, 10, base=7)
+
+
+@breaks("weights", run=MERGES["min"])
+def _changes_that_rise(records: Records) -> list[Record]:
+    return republished(records, 10, content=pairs((0, 1_000_000)))
+
+
+@breaks("weights", run=MERGES["min"])
+def _changes_beyond_the_last_sample(records: Records) -> list[Record]:
+    return republished(records, 10, content=pairs((opening(records).samples_m.shape[0], 0)))
 
 
 @breaks("energy")

@@ -54,6 +54,7 @@ def plain(batch: Batch, roster: tuple[str, ...], samples: int) -> list[Any]:
             told += [len(ruling.violations), bool(refused), len(out.weights)]
             told += [sum(len(envelope.body) for envelope in out.outbox)]
             told += [[ruling.pose.x_m, ruling.pose.y_m]]
+            told += [None if out.goal is None else [*out.goal], out.weights]
             told += [pairs(out.spent, samples), pairs(out.lowered, samples)]
             told += [
                 [
@@ -83,7 +84,10 @@ def tabled(reading: Reading) -> list[Any]:
         if act[of.PRESENT]:
             told += [act[of.STEP], act[of.ENERGY], act[of.STATE], act[of.REFUSED], act[of.FINDS]]
             told += [act[of.VIOLATIONS], bool(act[of.VOID]), act[of.WEIGHTS_BYTES]]
-            told += [act[of.BODY_BYTES], reading.poses_m[row].tolist()]
+            *pose_m, goal_x_m, goal_y_m = reading.poses_m[row].tolist()
+            begin, end = act[of.WEIGHTS], act[of.WEIGHTS] + act[of.WEIGHTS_BYTES]
+            told += [act[of.BODY_BYTES], pose_m]
+            told += [[goal_x_m, goal_y_m] if act[of.HEADS] else None, reading.payload[begin:end]]
             told += [rows(reading.pairs, act[of.SPENT], act[of.SPENT_COUNT])]
             told += [rows(reading.pairs, act[of.LOWERED], act[of.LOWERED_COUNT])]
             sent = rows(reading.sent, act[of.SENT], act[of.SENT_COUNT]) or []

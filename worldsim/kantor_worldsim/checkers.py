@@ -18,7 +18,7 @@ from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import Outputs, ParticipantId, Pose
 from kantor_protocol.messages import RefusedError, decode_news
 from kantor_protocol.modes import rectangle_of, visit_at
-from kantor_protocol.packing import Pairs, take_int, take_uint
+from kantor_protocol.packing import take_int, take_uint
 from kantor_protocol.registers import read_register
 from kantor_protocol.replica import LENGTH_MAX
 from kantor_protocol.weights import WeightsSubscriber
@@ -37,6 +37,7 @@ _COMPLAINTS_MAX = 100
 _UNHEARD, _NEVER_SENT, _FOR_ANOTHER, _TOO_FAR = 0, 1, 2, 3
 _STEP, _SPEED, _GARBLED_SPENT, _POINT, _BUDGET, _MISCOUNT = 4, 5, 6, 7, 8, 9
 _GARBLED_LOWERED, _RISE, _BELOW, _UNREADABLE, _LOG = 10, 11, 12, 13, 14
+_STRANGER, _REFUSED, _NOT_REBUILT, _NOT_ITS_OWN, _NO_SAMPLE, _NO_WEIGHT = 15, 16, 17, 18, 19, 20
 _OF_VERDICTS = (_NEVER_SENT, _FOR_ANOTHER, _TOO_FAR)
 _NO_LOGS, _NO_POSTED, _NO_FLIGHTS = -1, -2, -3
 _GROWING = {_NO_LOGS: "logs", _NO_POSTED: "posted", _NO_FLIGHTS: "flights"}
@@ -57,33 +58,35 @@ _WORDS = {
     _BELOW: ("credit", "its view of sample {item} is below the truth"),
     _UNREADABLE: ("ledger", "sends what nobody can read{what}"),
     _LOG: ("ledger", "its log from {a} on is not what it consumed"),
+    _STRANGER: ("order", "not in the roster"),
+    _REFUSED: ("ruling", "the world refused its {what}"),
+    _NOT_REBUILT: ("weights", "publishes a vector that cannot be rebuilt"),
+    _NOT_ITS_OWN: ("weights", "publishes a vector that is not its own"),
+    _NO_SAMPLE: ("goal", "{what} is no sample"),
+    _NO_WEIGHT: ("goal", "{what} has no weight left in its view"),
 }
 """Rule and text of each fault."""
 
 # Columns of State.book.
-_STEPS, _ABSENCES, _MOVED_NS, _POINTS, _ENTRIES, _POSTED, _FLYING, _TOLD, _COMING = (
-    0,
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-    7,
-    8,
-)
+_STEPS, _ABSENCES, _MOVED_NS, _POINTS, _ENTRIES, _POSTED, _FLYING, _TOLD = 0, 1, 2, 3, 4, 5, 6, 7
+_SEQUENCE, _DIFFERING, _COMING, _KEYFRAME = 8, 9, 10, 13
+_BOOK_COLUMNS = 14
 
 
 class State(NamedTuple):
     """What the kernels keep of the run so far. n participants, N samples."""
 
     book: npt.NDArray[np.int64]
-    """(n, 11): last step, absences since, time of the last move, points shipped; rows used of its
-    logs, posted and flights; whether it has sent a version vector; rows that this batch brings."""
+    """(n, 14): last step, absences since, time of the last move, points shipped; rows used of its
+    logs, posted and flights; whether it has sent a version vector; sequence of what it published last,
+    entries in which that differs from its view; rows that this batch brings to logs, posted and
+    flights; 1 + the act with which it publishes a keyframe in this batch."""
     poses_m: npt.NDArray[np.float64]
     """(n, 2) world frame."""
     views: npt.NDArray[np.int64]
     """(n, N) the weight vector of each, in units."""
+    published: npt.NDArray[np.int64]
+    """(n, N) the same, rebuilt from what each has published."""
     consumed: npt.NDArray[np.int64]
     """(N,) units shipped by all."""
     logs: npt.NDArray[np.int64]
@@ -99,7 +102,11 @@ class State(NamedTuple):
     lengths_m: npt.NDArray[np.float64]
     """(rows, 2): lengths of the fault."""
     found: npt.NDArray[np.int64]
-    """(1,) how many faults this batch has."""
+    """(2,) how many faults and how many keyframes this batch has."""
+    samples_m: npt.NDArray[np.float64]
+    """(N, 2) at the start."""
+    by_x: npt.NDArray[np.int64]
+    """(N,) samples in the order of their x."""
 
 
 class Law(NamedTuple):
@@ -114,6 +121,8 @@ class Law(NamedTuple):
     speed_m_s: float
     range_m: float
     supervisor_range_m: float
+    transport: bool
+    """Every goal is a sample that has weight."""
 
 
 @kernel
@@ -279,7 +288,7 @@ def _check_energy(state: State, law: Law, reading: Reading, row: int) -> None:
 @kernel
 def _check_weights(state: State, law: Law, reading: Reading, row: int) -> None:
     act = reading.acts[row]
-    view = state.views[act[of.PLACE]]
+    book, view = state.book[act[of.PLACE]], state.views[act[of.PLACE]]
     if act[of.LOWERED_COUNT] == of.NOT_DECODED:
         _note(state, _GARBLED_LOWERED, row, 0, 0, 0, 0.0, 0.0)
     for i in range(act[of.LOWERED], act[of.LOWERED] + max(0, act[of.LOWERED_COUNT])):
@@ -288,7 +297,78 @@ def _check_weights(state: State, law: Law, reading: Reading, row: int) -> None:
             _note(state, _RISE, row, sample, view[sample], left, 0.0, 0.0)
         if left < law.sample_units - state.consumed[sample]:
             _note(state, _BELOW, row, sample, 0, 0, 0.0, 0.0)
+        published = state.published[act[of.PLACE], sample]
+        book[_DIFFERING] += (published != left) - (published != view[sample])
         view[sample] = left
+
+
+@kernel
+def _check_published(state: State, reading: Reading, row: int) -> None:
+    """What has changed since the message before; a keyframe is left to `Checker`, to inflate it."""
+    act = reading.acts[row]
+    payload, at = reading.payload, act[of.WEIGHTS]
+    book, view = state.book[act[of.PLACE]], state.views[act[of.PLACE]]
+    published = state.published[act[of.PLACE]]
+    sequence, base, size, at, end = of.parts_of_weights(payload, at, at + act[of.WEIGHTS_BYTES])
+    if end >= 0 and base == 0:
+        book[_SEQUENCE], book[_KEYFRAME] = sequence, row + 1
+        state.found[1] += 1
+        return
+    sound = end >= 0 and base == book[_SEQUENCE] and size == view.shape[0]
+    sample = 0
+    while sound and at < end:
+        step, at = take_int(payload, at)
+        units, at = take_uint(payload, at)
+        sample += step
+        if not (0 <= at <= end and 0 <= sample < size) or units > published[sample]:
+            sound = False
+            break
+        left = view[sample]
+        book[_DIFFERING] += (units != left) - (published[sample] != left)
+        published[sample] = units
+    if end >= 0:
+        book[_SEQUENCE] = sequence if sound else 0
+    if not sound:
+        _note(state, _NOT_REBUILT, row, 0, 0, 0, 0.0, 0.0)
+    elif book[_DIFFERING]:
+        _note(state, _NOT_ITS_OWN, row, 0, 0, 0, 0.0, 0.0)
+
+
+@kernel
+def _check_goal(state: State, reading: Reading, row: int) -> None:
+    """The weight at the time of choosing: what is left now, or what it has shipped since."""
+    samples_m, by_x = state.samples_m, state.by_x
+    x_m, y_m = reading.poses_m[row, 2], reading.poses_m[row, 3]
+    low, high = 0, by_x.shape[0]
+    while low < high:
+        middle = (low + high) // 2
+        if samples_m[by_x[middle], 0] < x_m:
+            low = middle + 1
+        else:
+            high = middle
+    known = False
+    while low < by_x.shape[0] and samples_m[by_x[low], 0] == x_m:
+        sample = by_x[low]
+        if samples_m[sample, 1] == y_m:
+            known = True
+            if state.views[reading.acts[row, of.PLACE], sample] > 0:
+                return
+        low += 1
+    if not known:
+        _note(state, _NO_SAMPLE, row, 0, 0, 0, 0.0, 0.0)
+    elif not _ships_to(state, reading, row, x_m, y_m):
+        _note(state, _NO_WEIGHT, row, 0, 0, 0, 0.0, 0.0)
+
+
+@kernel
+def _ships_to(state: State, reading: Reading, row: int, x_m: float, y_m: float) -> bool:
+    """Whether something of what was spent went to this place."""
+    act = reading.acts[row]
+    for i in range(act[of.SPENT], act[of.SPENT] + max(0, act[of.SPENT_COUNT])):
+        place_m = state.samples_m[reading.pairs[i, of.SAMPLE]]
+        if place_m[0] == x_m and place_m[1] == y_m and reading.pairs[i, of.UNITS] > 0:
+            return True
+    return False
 
 
 @kernel
@@ -365,6 +445,7 @@ def _check(
     book: np.ndarray,
     poses_m: np.ndarray,
     views: np.ndarray,
+    published: np.ndarray,
     consumed: np.ndarray,
     logs: np.ndarray,
     posted: np.ndarray,
@@ -373,6 +454,8 @@ def _check(
     faults: np.ndarray,
     lengths_m: np.ndarray,
     found: np.ndarray,
+    samples_m: np.ndarray,
+    by_x: np.ndarray,
     sample_units: int,
     point_units: int,
     budget: int,
@@ -381,14 +464,19 @@ def _check(
     speed_m_s: float,
     range_m: float,
     supervisor_range_m: float,
+    transport: bool,
     now_ns: int,
 ) -> int:
-    """Follow one batch; how many faults it has, or which array has no room, and nothing has changed."""
+    """Follow one batch; how many faults and keyframes it has.
+
+    Negative if an array has no room, and nothing has changed.
+    """
     reading = Reading(payload, sizes, acts, ruled_m, heard, sent, verdicts, pairs)
     state = State(
         book,
         poses_m,
         views,
+        published,
         consumed,
         logs,
         posted,
@@ -397,6 +485,8 @@ def _check(
         faults,
         lengths_m,
         found,
+        samples_m,
+        by_x,
     )
     law = Law(
         sample_units,
@@ -407,11 +497,12 @@ def _check(
         speed_m_s,
         range_m,
         supervisor_range_m,
+        transport,
     )
     lacking = _lacking(state, reading)
     if lacking < 0:
         return lacking
-    found[0] = 0
+    found[:] = 0
     for row in range(sizes[of.ACTS]):
         if acts[row, of.PLACE] >= 0:
             _check_inbox(state, reading, row, now_ns)
@@ -421,6 +512,7 @@ def _check(
     for row in range(sizes[of.ACTS]):
         who = acts[row, of.PLACE]
         if who < 0:
+            _note(state, _STRANGER, row, 0, 0, 0, 0.0, 0.0)
             continue
         if not acts[row, of.PRESENT]:
             book[who, _ABSENCES] += 1
@@ -431,18 +523,13 @@ def _check(
         _check_weights(state, law, reading, row)
         for item in range(acts[row, of.SENT_COUNT] if ledger else 0):
             _check_ledger(state, reading, row, item)
-    return found[0]
-
-
-@kernel
-def _equals(weights: np.ndarray, views: np.ndarray, who: int) -> bool:
-    """Whether a published vector is the view of a participant, entry for entry."""
-    if weights.shape[0] != views.shape[1]:
-        return False
-    differing = 0
-    for j in range(weights.shape[0]):
-        differing += weights[j] != views[who, j]
-    return differing == 0
+        for item in range(acts[row, of.VIOLATIONS]):
+            _note(state, _REFUSED, row, item, 0, 0, 0.0, 0.0)
+        if acts[row, of.WEIGHTS_BYTES]:
+            _check_published(state, reading, row)
+        if transport and acts[row, of.HEADS]:
+            _check_goal(state, reading, row)
+    return found[0] + found[1]
 
 
 class Checker:
@@ -476,7 +563,6 @@ class Checker:
         self._opening: Opening | None = None
         self._ended = False
         self._now_ns = 0
-        self._pairs = Pairs()
 
     def take(self, record: Record) -> None:
         """Check one record."""
@@ -517,8 +603,7 @@ class Checker:
         self._samples = site.samples_m.shape[0]
         names = scenario.roster
         self._places = {name: i for i, name in enumerate(names)}
-        self._subscribers = {name: WeightsSubscriber() for name in names}
-        self._samples_by_place = None
+        self._subscriber = WeightsSubscriber()
         self._law = Law(
             sample_units=self._units.sample,
             point_units=self._units.point,
@@ -528,14 +613,16 @@ class Checker:
             speed_m_s=scenario.vehicle.speed_m_s,
             range_m=scenario.radio.range_m,
             supervisor_range_m=scenario.supervisor.range_m,
+            transport=scenario.planner.name == "transport" and scenario.samples.diffusion_m == 0.0,
         )
         poses_m = np.zeros((len(names), 2))
         poses_m[-1] = scenario.supervisor_m
         poses_m[: scenario.robots.count] = site.starts_m
         self._state = State(
-            book=np.zeros((len(names), 11), dtype=np.int64),
+            book=np.zeros((len(names), _BOOK_COLUMNS), dtype=np.int64),
             poses_m=poses_m,
             views=np.full((len(names), self._samples), self._units.sample, dtype=np.int64),
+            published=np.zeros((len(names), self._samples), dtype=np.int64),
             consumed=np.zeros(self._samples, dtype=np.int64),
             logs=np.zeros((len(names), 256, 2), dtype=np.int64),
             posted=np.zeros((len(names), 256, 2), dtype=np.int64),
@@ -543,7 +630,9 @@ class Checker:
             have=np.zeros((len(names), len(names)), dtype=np.int64),
             faults=np.zeros((_COMPLAINTS_MAX, 5), dtype=np.int64),
             lengths_m=np.zeros((_COMPLAINTS_MAX, 2)),
-            found=np.zeros(1, dtype=np.int64),
+            found=np.zeros(2, dtype=np.int64),
+            samples_m=site.samples_m.copy(),
+            by_x=np.argsort(site.samples_m[:, 0]),
         )
         self._arguments = (*self._state, *self._law)
         self._registers = np.zeros((len(names), scenario.register_width), dtype=np.int64)
@@ -556,19 +645,15 @@ class Checker:
             self._complain("order", "record", f"time runs back to {batch.now_ns * 1e-9:.3f} s")
         self._now_ns = batch.now_ns
         reading = self._reader.read(batch)
-        faults = _check(*reading, *self._arguments, batch.now_ns)
-        while faults < 0:
-            self._lengthen(_GROWING[faults])
-            faults = _check(*reading, *self._arguments, batch.now_ns)
-        if faults:
-            self._put_into_words(batch, faults)
-        for act in batch.acts:
-            if act.name not in self._places:
-                self._complain("order", act.name, "not in the roster")
-            elif act.outputs is not None and act.ruling is not None:
-                self._check_act(act)
-            else:
-                self._missed.add(act.name)
+        noted = _check(*reading, *self._arguments, batch.now_ns)
+        while noted < 0:
+            self._lengthen(_GROWING[noted])
+            noted = _check(*reading, *self._arguments, batch.now_ns)
+        if noted:
+            self._put_into_words(batch, int(self._state.found[0]))
+            self._check_keyframes(batch)
+        if self._scenario.register_width:
+            self._check_registers(batch)
 
     def _lengthen(self, name: str) -> None:
         """Double one of the arrays that grow with the run."""
@@ -586,64 +671,28 @@ class Checker:
             self._complain(rule, who, text.format(what=what, item=item, a=a, b=b, x=x, y=y))
         self.count += faults - noted
 
-    def _check_act(self, act: Act) -> None:
-        """The rules that need more than numbers."""
-        outputs, ruling = act.outputs, act.ruling
-        assert outputs is not None
-        assert ruling is not None
-        for violation in ruling.violations:
-            self._complain("ruling", act.name, f"the world refused its {violation}")
-        if outputs.weights:
-            self._check_published(act.name, outputs.weights)
-        self._check_goal(act.name, outputs.goal, outputs.spent)
-        if self._scenario.register_width and act.name not in self._missed:
-            self._check_register(act, outputs)
+    def _check_keyframes(self, batch: Batch) -> None:
+        book, subscriber = self._state.book, self._subscriber
+        for place in np.flatnonzero(book[:, _KEYFRAME]).tolist():
+            act = batch.acts[book[place, _KEYFRAME] - 1]
+            assert act.outputs is not None
+            rebuilt = subscriber.take(act.outputs.weights)
+            weights, view = subscriber.weights, self._state.views[place]
+            if not rebuilt or weights is None or weights.shape != view.shape:
+                book[place, _SEQUENCE] = 0
+                self._complain("weights", act.name, _WORDS[_NOT_REBUILT][1])
+                continue
+            self._state.published[place] = weights
+            book[place, _DIFFERING] = np.count_nonzero(weights != view)
+            if book[place, _DIFFERING]:
+                self._complain("weights", act.name, _WORDS[_NOT_ITS_OWN][1])
 
-    def _check_published(self, name: ParticipantId, weights: bytes) -> None:
-        subscriber, views = self._subscribers[name], self._state.views
-        if not subscriber.take(weights):
-            self._complain("weights", name, "publishes a vector that cannot be rebuilt")
-        elif subscriber.weights is None or not _equals(
-            subscriber.weights, views, self._places[name]
-        ):
-            self._complain("weights", name, "publishes a vector that is not its own")
-
-    def _check_goal(
-        self, name: ParticipantId, goal: tuple[float, float] | None, spent: bytes
-    ) -> None:
-        """The weight at the time of choosing: what is left now, and what it has shipped since."""
-        scenario = self._scenario
-        standing = scenario.samples.diffusion_m == 0.0
-        if goal is None or not standing or scenario.planner.name != "transport":
-            return
-        if self._samples_by_place is None:
-            self._samples_by_place = self._index_samples()
-        samples = self._samples_by_place.get(goal, [])
-        place, units = self._places[name], self._state.views.item
-        for sample in samples:
-            if units(place, sample) > 0:
-                return
-        if not samples:
-            self._complain("goal", name, f"{goal} is no sample")
-        elif not self._ships(spent, samples):
-            self._complain("goal", name, f"{goal} has no weight left in its view")
-
-    def _ships(self, spent: bytes, samples: list[int]) -> bool:
-        """Whether something of what was spent went to any of these samples."""
-        pairs = self._pairs.decode(spent, self._samples)
-        return pairs is not None and any(
-            sample in samples and units > 0
-            for sample, units in zip(pairs[0].tolist(), pairs[1].tolist(), strict=True)
-        )
-
-    _samples_by_place: dict[tuple[float, float], list[int]] | None = None
-
-    def _index_samples(self) -> dict[tuple[float, float], list[int]]:
-        assert self._opening is not None
-        places: dict[tuple[float, float], list[int]] = {}
-        for j, (x, y) in enumerate(self._opening.site.samples_m.tolist()):
-            places.setdefault((x, y), []).append(j)
-        return places
+    def _check_registers(self, batch: Batch) -> None:
+        for act in batch.acts:
+            if act.outputs is None or act.ruling is None:
+                self._missed.add(act.name)
+            elif act.name in self._places and act.name not in self._missed:
+                self._check_register(act, act.outputs)
 
     def _check_register(self, act: Act, outputs: Outputs) -> None:
         """It chooses where it was observed last, or where it went itself if that word is late."""
@@ -703,6 +752,10 @@ def _concerned(batch: Batch, fault: int, row: int, item: int) -> tuple[str, str]
     if fault == _UNHEARD:
         source, sequence = act.heard[item]
         return act.name, f"{source}#{sequence}"
+    if fault == _REFUSED and act.ruling is not None:
+        return act.name, act.ruling.violations[item]
+    if fault in (_NO_SAMPLE, _NO_WEIGHT) and act.outputs is not None:
+        return act.name, str(act.outputs.goal)
     if fault == _UNREADABLE and act.outputs is not None:
         try:
             decode_news(act.outputs.outbox[item].body)

@@ -5,10 +5,15 @@ from collections.abc import Callable, Mapping
 from itertools import groupby
 from operator import itemgetter
 
+import msgspec
+
 from kantor_protocol.clock import Clock, clocks
 from kantor_protocol.machine import Exchange, Inputs, Outputs, ParticipantId, StateMachine
-from kantor_protocol.messages import decode_inputs, decode_outputs, encode
+from kantor_protocol.messages import decode_inputs, encode
 from kantor_worldsim.stage import Stage, Step
+
+_decode_outputs = msgspec.msgpack.Decoder(Outputs).decode
+"""The stage checks their numbers."""
 
 
 def in_process(machines: Mapping[ParticipantId, StateMachine]) -> Exchange:
@@ -16,7 +21,7 @@ def in_process(machines: Mapping[ParticipantId, StateMachine]) -> Exchange:
 
     def exchange(inputs: Mapping[ParticipantId, Inputs]) -> Mapping[ParticipantId, Outputs]:
         return {
-            name: decode_outputs(encode(machines[name].step(decode_inputs(encode(given)))))
+            name: _decode_outputs(encode(machines[name].step(decode_inputs(encode(given)))))
             for name, given in inputs.items()
         }
 
@@ -41,18 +46,16 @@ class Agenda:
 
         The batch ends before a participant's second step, so that time never runs back.
         """
-        until_ns = self._due[0][0] + lookahead_ns
+        due = self._due
+        first_ns = due[0][0]
+        until_ns = first_ns + lookahead_ns
         batch: list[tuple[int, ParticipantId]] = []
-        again = []
-        while self._due and (
-            self._due[0][0] < until_ns or not batch or self._due[0][0] == batch[0][0]
-        ):
-            due_ns, order, step, name = heapq.heappop(self._due)
+        while due[0][0] < until_ns or due[0][0] == first_ns:
+            due_ns, order, step, name = due[0]
+            next_ns = self._clocks[name].due_ns(step + 1)
+            heapq.heapreplace(due, (next_ns, order, step + 1, name))
+            until_ns = min(until_ns, next_ns)
             batch.append((due_ns, name))
-            again.append((self._clocks[name].due_ns(step + 1), order, step + 1, name))
-            until_ns = min(until_ns, again[-1][0])
-        for item in again:
-            heapq.heappush(self._due, item)
         return batch
 
 

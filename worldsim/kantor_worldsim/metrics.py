@@ -260,9 +260,66 @@ def _follow(
 @sum_kernel
 def _weighed(units: np.ndarray, way_m: np.ndarray) -> float:
     total = 0.0
-    for j in range(units.shape[0]):
+    for j in range(way_m.shape[0]):
         total += units[j] * way_m[j]
     return total
+
+
+@kernel
+def _rest(true_left: np.ndarray) -> int:
+    """Units that are truly left."""
+    rest = 0
+    for j in range(true_left.shape[0]):
+        rest += max(true_left[j], 0)
+    return rest
+
+
+@kernel
+def _sum_common(
+    xy_m: np.ndarray,
+    samples_m: np.ndarray,
+    common: np.ndarray,
+    first: int,
+    xyu: np.ndarray,
+    way_m: np.ndarray,
+    whole: int,
+    paper: np.ndarray,
+) -> None:
+    """Every robot ships the same weights: add the block that begins at `first`."""
+    for j in range(way_m.shape[0]):
+        xyu[0, j], xyu[1, j] = samples_m[first + j, 0], samples_m[first + j, 1]
+        xyu[2, j] = max(common[first + j], 0)
+    for i in range(xy_m.shape[0]):
+        measure(xyu[0], xyu[1], xy_m[i], way_m)
+        paper[i] += _weighed(xyu[2], way_m) / whole
+
+
+@kernel
+def _sum_views(
+    xy_m: np.ndarray,
+    samples_m: np.ndarray,
+    views: np.ndarray,
+    first: int,
+    near: np.ndarray,
+    xyu: np.ndarray,
+    way_m: np.ndarray,
+    whole: int,
+    paper: np.ndarray,
+    local: np.ndarray,
+) -> None:
+    """Every robot ships by its own view: add the block that begins at `first`."""
+    last = first + way_m.shape[0]
+    for j in range(way_m.shape[0]):
+        xyu[0, j], xyu[1, j] = samples_m[first + j, 0], samples_m[first + j, 1]
+    for i in range(xy_m.shape[0]):
+        measure(xyu[0], xyu[1], xy_m[i], way_m)
+        own = _weighed(views[i, first:last], way_m) / whole
+        paper[i] += own
+        for k in range(xy_m.shape[0]):
+            if k == i:
+                local[k] += own
+            elif near[i, k]:
+                local[k] += _weighed(views[k, first:last], way_m) / whole
 
 
 @kernel
@@ -278,20 +335,19 @@ def _sum_up(
     centralized: bool,
     ledger: bool,
     near: np.ndarray,
+    xyu: np.ndarray,
     way_m: np.ndarray,
-    true_rest: np.ndarray,
     paper: np.ndarray,
     local: np.ndarray,
-) -> int:
-    """The pending terms, mass times the distance to a robot, over all samples; the true rest in units.
+) -> None:
+    """The pending terms, mass times the distance to a robot, over all samples.
 
     For each robot in paper: by the common weights or its own view; in local: eq. 12, what the robots in
     its range have shipped and their terms by its own view. near: (m, m) room for who is in whose range.
-    way_m, true_rest: room for one block of samples, which stays in the cache while all robots and views
-    meet in it.
+    xyu (3, B), way_m (B,): room for one block of samples, which stays in the cache while all robots and
+    views meet in it.
     """
     robots = xy_m.shape[0]
-    rest = 0
     paper[:] = 0.0
     local[:] = 0.0
     for k in range(robots):
@@ -300,26 +356,15 @@ def _sum_up(
             near[i, k] = i == k or apart_m <= range_m
             if near[i, k]:
                 local[k] += shipped_by[i]
-    for first in range(0, samples_m.shape[0], way_m.shape[0]):
-        last = min(first + way_m.shape[0], samples_m.shape[0])
-        for j in range(first, last):
-            true_rest[j - first] = max(true_left[j], 0)
-            rest += true_rest[j - first]
-        for i in range(robots):
-            way = way_m[: last - first]
-            measure(samples_m[first:last], xy_m[i, 0], xy_m[i, 1], way)
-            if centralized:
-                common = true_rest[: last - first] if ledger else least[first:last]
-                paper[i] += _weighed(common, way) / whole
-                continue
-            own = _weighed(views[i, first:last], way) / whole
-            paper[i] += own
-            for k in range(robots):
-                if k == i:
-                    local[k] += own
-                elif near[i, k]:
-                    local[k] += _weighed(views[k, first:last], way) / whole
-    return rest
+    first = 0
+    while first < samples_m.shape[0]:
+        way = way_m[: min(way_m.shape[0], samples_m.shape[0] - first)]
+        if centralized:
+            common = true_left if ledger else least
+            _sum_common(xy_m, samples_m, common, first, xyu, way, whole, paper)
+        else:
+            _sum_views(xy_m, samples_m, views, first, near, xyu, way, whole, paper, local)
+        first += way.shape[0]
 
 
 class Metrics:
@@ -384,8 +429,8 @@ class Metrics:
             scenario.centralized,
             scenario.merge == "ledger",
             np.zeros((robots, robots), dtype=np.bool_),
+            np.zeros((3, _BLOCK)),
             np.zeros(_BLOCK),
-            np.zeros(_BLOCK, dtype=np.int64),
             *self._terms,
         )
         size = samples * robots // _PAIRS_PER_ROW
@@ -428,24 +473,27 @@ class Metrics:
             act = reading.acts[row]
             if act[of.PLACE] >= 0 and act[of.SPENT_COUNT] > 0 and not act[of.VOID]:
                 shipped = reading.pairs[act[of.SPENT] : act[of.SPENT] + act[of.SPENT_COUNT]]
-                x, y = reading.poses_m[row].tolist()
+                x, y = reading.poses_m[row, :2].tolist()
                 self._points.append((x, y, int(shipped[:, of.UNITS].sum())))
 
     def _row(self, *, last: bool = False) -> None:
         tally, scenario, whole = self._tally, self._scenario, self._units.whole
         counts = tally.counts.tolist()
-        true_rest = _sum_up(*self._to_sum_up)
+        true_rest = _rest(tally.true_left)
         # The common view: everybody's minimum, or with a ledger the truth.
         left = true_rest if scenario.merge == "ledger" else counts[_LEAST]
-        paper, local = self._terms.tolist()
-        pending = sum(paper)
         shipped, shipped_now = tally.shipped.tolist()
         tight = None
         if scenario.samples.diffusion_m == 0.0 and true_rest == whole - counts[_UNITS]:
             rest = self._auction.cost(self._walk.xy_m, tally.xy_m, tally.true_left)
             tight = shipped + rest / whole
-        if scenario.centralized:
-            local = []
+        local: list[float] = []
+        if tight is not None and scenario.centralized and scenario.merge == "ledger":
+            pending = sum((self._auction.ways / whole).tolist())  # one pass for both
+        else:
+            _sum_up(*self._to_sum_up)
+            pending = sum(self._terms[0].tolist())
+            local = [] if scenario.centralized else self._terms[1].tolist()
         self.rows.append(
             Row(
                 tick=self._tick,

@@ -16,6 +16,7 @@ from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import SUPERVISOR
 from kantor_protocol.messages import BODY_BYTES_MAX, VERSION, News
 from kantor_protocol.packing import take_int, take_uint
+from kantor_protocol.weights import WeightsMessage
 from kantor_worldsim.records import Batch, Opening, Record, encode_record
 
 NOT_DECODED = -1
@@ -30,9 +31,11 @@ PLACE, NOW_NS, PRESENT, STEP, ENERGY, STATE, REFUSED = 0, 1, 2, 3, 4, 5, 6
 FINDS, VIOLATIONS, VOID, WEIGHTS_BYTES, BODY_BYTES = 7, 8, 9, 10, 11
 HEARD, HEARD_COUNT, SENT, SENT_COUNT = 12, 13, 14, 15
 SPENT, SPENT_COUNT, LOWERED, LOWERED_COUNT = 16, 17, 18, 19
-_ACT_COLUMNS = 20
+HEADS, WEIGHTS = 20, 21
+_ACT_COLUMNS = 22
 """PRESENT: it has outputs and a ruling; all columns from STEP on hold only then, but for HEARD.
-VOID: the world refused the step, its energy or its units, so that nothing was shipped."""
+VOID: the world refused the step, its energy or its units, so that nothing was shipped. HEADS: it has a
+goal. WEIGHTS: where what it publishes begins in the payload."""
 
 # Columns of Reading.heard, Reading.sent and Reading.verdicts.
 SOURCE, SEQUENCE, TARGET, DUE_NS = 0, 1, 2, 3
@@ -53,9 +56,9 @@ class Reading(NamedTuple):
     sizes: npt.NDArray[np.int64]
     """(5,): how many rows of each table count."""
     acts: npt.NDArray[np.int64]
-    """(rows, 20)"""
+    """(rows, 22)"""
     poses_m: npt.NDArray[np.float64]
-    """(rows, 2): x and y of each ruling, world frame."""
+    """(rows, 4): x and y of each ruling and of each goal, world frame."""
     heard: npt.NDArray[np.int64]
     """(rows, 2): source, sequence."""
     sent: npt.NDArray[np.int64]
@@ -199,6 +202,7 @@ def _read_metres(tables: Tables, row: int, axis: int, at: int) -> int:
 
 
 _NEWS_TAG = News.__struct_config__.tag
+_WEIGHTS_TAG = WeightsMessage.__struct_config__.tag
 _SUPERVISOR_TEXT = np.frombuffer(SUPERVISOR.encode(), dtype=np.uint8)
 _REFUSALS = tuple(np.frombuffer(text, dtype=np.uint8) for text in (b"step", b"energy", b"units"))
 
@@ -289,20 +293,33 @@ def _read_outbox(tables: Tables, act: np.ndarray, at: int) -> int:
 
 
 @kernel
-def _read_outputs(tables: Tables, act: np.ndarray, at: int, samples: int) -> int:
+def _read_goal(tables: Tables, act: np.ndarray, row: int, at: int) -> int:
+    kind, numbers, after = head_of(tables.payload, at)
+    act[HEADS] = kind == ARRAY
+    if kind != ARRAY:
+        return after
+    if numbers != 2:
+        return _MALFORMED
+    at = _read_metres(tables, row, 2, after)
+    return _read_metres(tables, row, 3, at)
+
+
+@kernel
+def _read_outputs(tables: Tables, act: np.ndarray, row: int, at: int, samples: int) -> int:
     kind, fields, at = head_of(tables.payload, at)
     act[PRESENT] = kind == ARRAY
     act[SENT_COUNT] = 0
     if kind != ARRAY:
         return at
     act[STEP], at = _number(tables.payload, at)
-    at = skip(tables.payload, at, 2)  # pose, goal
+    at = skip(tables.payload, at, 1)  # pose
+    at = _read_goal(tables, act, row, at)
     act[SPENT] = tables.sizes[PAIRS]
     act[SPENT_COUNT], at = _read_pairs(tables, at, samples)
     act[LOWERED] = tables.sizes[PAIRS]
     act[LOWERED_COUNT], at = _read_pairs(tables, at, samples)
-    _, act[WEIGHTS_BYTES], at = head_of(tables.payload, at)
-    at = _read_outbox(tables, act, at + act[WEIGHTS_BYTES])
+    _, act[WEIGHTS_BYTES], act[WEIGHTS] = head_of(tables.payload, at)
+    at = _read_outbox(tables, act, act[WEIGHTS] + act[WEIGHTS_BYTES])
     act[ENERGY], at = _number(tables.payload, at)
     act[STATE], at = _number(tables.payload, at)
     act[REFUSED], at = _number(tables.payload, at)
@@ -376,7 +393,7 @@ def _read_batch(
         act[NOW_NS], at = _number(payload, at)
         at = skip(payload, at, 1)  # observation
         at = _read_heard(tables, act, at)
-        at = _read_outputs(tables, act, at, samples)
+        at = _read_outputs(tables, act, i, at, samples)
         at = _read_ruling(tables, act, i, at)
         at = skip(payload, at, fields - 6)
         if at < 0:
@@ -430,6 +447,25 @@ def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int
     return have, have_end, logs, logs_end
 
 
+@kernel
+def parts_of_weights(payload: bytes, at: int, end: int) -> tuple[int, int, int, int, int]:
+    """Sequence, base, size of the WeightsMessage in payload[at:end]; where its content begins and ends.
+
+    The last is negative for what `WeightsSubscriber` would not decode.
+    """
+    fields, at = _array(payload, at, _ANY)
+    tag, at = _number(payload, at)
+    version, at = _number(payload, at)
+    sequence, at = _number(payload, at)
+    base, at = _number(payload, at)
+    size, at = _number(payload, at)
+    kind, length, at = head_of(payload, at)
+    sound = fields >= 6 and tag == _WEIGHTS_TAG and version == VERSION and kind == BYTES
+    if not sound or at < 0 or skip(payload, at + length, fields - 6) != end:
+        return 0, 0, 0, 0, _MALFORMED
+    return sequence, base, size, at, at + length
+
+
 class Reader:
     """Reads the records of a run in order. Several referees may share one; each record is read once."""
 
@@ -463,7 +499,7 @@ class Reader:
     def _make_room(self, rows: int) -> None:
         """Tables of so many rows each; none needs more than its payload has bytes."""
         self._rows = rows
-        poses_m = np.zeros((rows, 2))
+        poses_m = np.zeros((rows, 4))
         self._pose_bits = poses_m.view(np.int64)
         self._tables = (
             np.zeros(5, dtype=np.int64),
