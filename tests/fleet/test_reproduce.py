@@ -14,6 +14,7 @@ from kantor_fleet.reproduce.claims import (
     UNMATCHED,
     Ahead,
     Median,
+    Range,
     Ratio,
     Share,
     Spread,
@@ -101,6 +102,14 @@ def test_a_ratio_is_told_and_not_judged() -> None:
 
     assert (line.verdict, line.why) == (UNMATCHED, "it depends")
     assert "0.50 times" in line.ours
+
+
+def test_a_range_goes_from_the_lowest_to_the_highest() -> None:
+    claim = Range("it", (HERE, THERE), "", 5.0, number, " %")
+
+    far = claim.judge("fig0", {HERE: flights(70), THERE: flights(75)})
+    assert (far.verdict, far.ours) == (OK, "70.0 to 75.0 % over 2 starts")
+    assert claim.judge("fig0", {HERE: flights(70), THERE: flights(74.9)}).verdict == MISS
 
 
 def test_a_share_counts_runs() -> None:

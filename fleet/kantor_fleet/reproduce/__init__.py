@@ -20,8 +20,6 @@ from kantor_fleet.reproduce.flights import Flight, Flights, Setting, fly
 from kantor_fleet.reproduce.kabir_lee import FIGURES, Figure
 from kantor_worldsim.exact import available
 
-_EXACT_RUNS = 3
-"""An exact distance takes seconds; these runs have eleven each."""
 _WIDTH = 160
 """Columns of what is printed into a file or a pipe."""
 
@@ -74,7 +72,7 @@ def _affordable(figure: Figure, runs: int | None) -> Figure:
 def _settings(figure: Figure) -> dict[Setting, int]:
     """What a figure needs flown, how often."""
     return {
-        setting: min(figure.runs, _EXACT_RUNS) if setting.exact else figure.runs
+        setting: min(figure.runs, setting.most)
         for claim in figure.claims
         for setting in claim.settings
     }

@@ -143,6 +143,27 @@ class Ahead(NamedTuple):
         return Verdict(figure, self.text, self.published, self.reading, ours, OK if met else MISS)
 
 
+class Range(NamedTuple):
+    """One run of each of several settings that hardly differ: how far apart the outcomes lie."""
+
+    text: str
+    settings: tuple[Setting, ...]
+    published: str
+    least: float
+    """How far apart, at least."""
+    measure: Measure
+    unit: str
+
+    def judge(self, figure: str, flights: Flights) -> Verdict:
+        """From the lowest to the highest."""
+        values = [self.measure(flights[setting][0]) for setting in self.settings]
+        low, high = min(values), max(values)
+        ours = f"{low:.1f} to {high:.1f}{self.unit} over {len(values)} starts"
+        reading = f"≥ {self.least:g} points apart"
+        verdict = OK if high - low >= self.least else MISS
+        return Verdict(figure, self.text, self.published, reading, ours, verdict)
+
+
 class Ratio(NamedTuple):
     """The ratio of two settings' medians, told and not judged: it depends on the implementation."""
 

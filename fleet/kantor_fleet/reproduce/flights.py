@@ -26,6 +26,8 @@ class Setting(NamedTuple):
     scenario: str
     overrides: tuple[str, ...] = ()
     exact: bool = False
+    most: int = 1_000_000
+    """Runs that are enough, however many a figure wants."""
 
     @property
     def text(self) -> str:
