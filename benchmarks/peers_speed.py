@@ -41,7 +41,7 @@ def measure(*, quick: bool) -> Table:
     """Medians over processes of their own."""
     budget_s, repeats = (1.0, 1) if quick else (4.0, 3)
     rows = []
-    for name, (package, does) in PEERS.items():
+    for name, (package, does, _) in PEERS.items():
         for robots in ROBOTS:
             try:
                 told = f"{package} {version(package)}"
@@ -98,8 +98,8 @@ def coverage_control(robots: int) -> Callable[[], None]:
 
 
 PEERS = {
-    "ir_sim": ("ir-sim", "motion of a body"),
-    "coverage_control": ("coverage-control", "sensing and Voronoi coverage, C++"),
+    "ir_sim": ("ir-sim", "motion of a body", ir_sim),
+    "coverage_control": ("coverage-control", "sensing and Voronoi coverage, C++", coverage_control),
 }
 
 
@@ -125,9 +125,6 @@ def _steps_per_s(step: Callable[[], None], robots: int, budget_s: float) -> floa
 
 
 if __name__ == "__main__":
-    chosen: dict[str, Callable[[int], Callable[[], None]]] = {
-        "ir_sim": ir_sim,
-        "coverage_control": coverage_control,
-    }
     _, peer, count, budget = sys.argv
-    print(_steps_per_s(chosen[peer](int(count)), int(count), float(budget)))
+    *_, stepper = PEERS[peer]
+    print(_steps_per_s(stepper(int(count)), int(count), float(budget)))

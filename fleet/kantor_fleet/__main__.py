@@ -233,16 +233,15 @@ def reproduce(
         jobs: Processes; by default one for each core.
         out: Where the figures go.
     """
-    from kantor_fleet.pools import cores  # noqa: PLC0415
+    from kantor_fleet.pools import pool  # noqa: PLC0415
     from kantor_fleet.reproduce import reproduce as reproduce_figures  # noqa: PLC0415
+    from kantor_fleet.reproduce.flights import fly  # noqa: PLC0415
     from kantor_fleet.reproduce.kabir_lee import FIGURES  # noqa: PLC0415
 
     if runs is not None and runs < 2:
         fail(Exit.USAGE, f"--runs {runs}: give at least 2, an interval needs them")
-    if jobs is not None and jobs < 1:
-        fail(Exit.USAGE, f"--jobs {jobs}: give at least 1")
     names = tuple(FIGURES) if figure == "all" else (figure,)
-    return reproduce_figures(names, runs, jobs or cores(), out)
+    return reproduce_figures(names, runs, pool(jobs, work=fly), out)
 
 
 def tap(

@@ -22,6 +22,13 @@ from kantor_fleet.progress import printable
 _LINE_S = 5.0
 """Real time from one plain line to the next."""
 _AN_HOUR_S = 3600.0
+_WIDTH = 160
+"""Columns of a table that is printed into a file or a pipe."""
+
+
+def table_console() -> Console:
+    """Where tables are printed: as wide as the terminal, if it is one."""
+    return Console(width=None if sys.stdout.isatty() else _WIDTH)
 
 
 class RunsView:

@@ -16,12 +16,10 @@ import kantor_agent
 import kantor_protocol
 import kantor_supervisor
 import kantor_worldsim
-from kantor_fleet.team import team
+from kantor_fleet.team import play
 from kantor_protocol.scenario import Scenario, ScenarioError
-from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.metrics import Result
 from kantor_worldsim.recording import Recording
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 
 _REASON_LETTERS = 300
@@ -84,6 +82,5 @@ def _run(case: Case) -> Result:
     scenario, seed = case.scenario, case.seed
     site = Site.of(scenario, seed)
     recording = Recording(scenario, seed, "in-process", exact_every=0 if case.exact else None)
-    stage = Stage(scenario, seed, site, [recording.take])
-    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    play(scenario, seed, site, [recording.take])
     return recording.finish()

@@ -49,12 +49,14 @@ def cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
-def pool(jobs: int | None = None, address: str | None = None) -> Callable[[Iterable[Case]], Pool]:
+def pool(
+    jobs: int | None = None, address: str | None = None, work: Work = run_case
+) -> Callable[[Iterable[Case]], Pool]:
     """What takes cases, as a user asks for it; ends the command if that cannot be."""
     if jobs is not None and jobs < 1:
         fail(Exit.USAGE, f"--jobs {jobs}: give at least 1")
     if address is None:
-        return partial(local, jobs=jobs or cores())
+        return partial(local, jobs=jobs or cores(), work=work)
     if importlib.util.find_spec("distributed") is None:
         fail(Exit.USAGE, "--cluster: needs Dask; pip install 'kantor[cluster]'")
     if address == SLURM and jobs is None:
@@ -64,7 +66,7 @@ def pool(jobs: int | None = None, address: str | None = None) -> Callable[[Itera
             Exit.USAGE,
             f"--jobs {jobs}: the cluster at {address} has its own workers; drop one of the two",
         )
-    return partial(cluster, address=address, jobs=jobs)
+    return partial(cluster, address=address, jobs=jobs, work=work)
 
 
 def local(cases: Iterable[Case], jobs: int, work: Work = run_case) -> Pool:

@@ -4,11 +4,9 @@ It opens nothing. Zenoh must not be open in a process that forks.
 """
 
 import kantor_worldsim.process  # noqa: F401
-from kantor_fleet.team import team
+from kantor_fleet.team import play
 from kantor_protocol.scenario import parse
-from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.recording import Recording
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 
 _TINY = """
@@ -37,5 +35,4 @@ def warm_up() -> None:
         scenario = parse(_TINY, "warm-up", [*manner, "targets.diffusion_m=1"])
         site = Site.of(scenario, 0)
         recording = Recording(scenario, 0, "in-process")
-        stage = Stage(scenario, 0, site, [recording.take])
-        simulate(stage, in_process(team(scenario, 0, site)), 0, lambda: False)
+        play(scenario, 0, site, [recording.take])

@@ -12,11 +12,10 @@ from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.local import Order, local_fleet, watch_progress
 from kantor_fleet.preload import warm_up
 from kantor_fleet.progress import ProgressView
-from kantor_fleet.team import team
+from kantor_fleet.team import play
 from kantor_protocol.bus import BusError
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.journal import read
-from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.metrics import Result
 from kantor_worldsim.process import progress
 from kantor_worldsim.recording import (
@@ -28,7 +27,6 @@ from kantor_worldsim.recording import (
     folder_for,
 )
 from kantor_worldsim.records import Record
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 
 _GLANCE_S = 0.2
@@ -140,8 +138,7 @@ def _run_in_process(
                 glanced = time.monotonic()
                 view.show(progress(recording.metrics, scenario, "running", ""))
 
-        stage = Stage(scenario, seed, site, [recording.take, glance])
-        reason = simulate(stage, in_process(team(scenario, seed, site)), seed, interrupts)
+        reason = play(scenario, seed, site, [recording.take, glance], stopped=interrupts)
         view.show(progress(recording.metrics, scenario, "over", reason))
     return verdict(recording.finish())
 

@@ -1,9 +1,13 @@
-"""The participants of a scenario as objects, for runs inside one process."""
+"""The participants of a scenario as objects, and a mission of theirs inside one process."""
+
+from collections.abc import Callable, Iterable, Mapping
 
 from kantor_agent.core import Agent
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, StateMachine
 from kantor_protocol.scenario import Scenario
 from kantor_supervisor.core import Supervisor
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.stage import Listener, Stage
 from kantor_worldsim.world import Site
 
 
@@ -18,3 +22,17 @@ def participant(name: ParticipantId, scenario: Scenario, seed: int, site: Site) 
         return Supervisor(name, scenario, site.samples_m.shape[0])
     x_m, y_m = site.starts_m[scenario.robot_ids.index(name)].tolist()
     return Agent(name, scenario, seed, (x_m, y_m), site.samples_m)
+
+
+def play(
+    scenario: Scenario,
+    seed: int,
+    site: Site,
+    listeners: Iterable[Listener],
+    *,
+    machines: Mapping[ParticipantId, StateMachine] | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> str:
+    """A mission in this process; why it ended. machines: the team, unless others take its place."""
+    stage = Stage(scenario, seed, site, listeners)
+    return simulate(stage, in_process(machines or team(scenario, seed, site)), seed, stopped)

@@ -6,16 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from kantor_fleet.exits import Exit, fail
-from kantor_fleet.team import participant, team
+from kantor_fleet.team import participant, play
 from kantor_protocol.machine import StateMachine
 from kantor_protocol.messages import RefusedError
 from kantor_protocol.scenario import ScenarioError
 from kantor_worldsim.checkers import check
 from kantor_worldsim.journal import Digest, file_digest, read
-from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.recording import JOURNAL, MANIFEST
 from kantor_worldsim.records import Batch, Ending, Mailbag, Opening, Record, encode_record
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 
 
@@ -114,13 +112,7 @@ def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict
 
     whole = isinstance(records[-1][1], Ending)
     steps = len(records) - (1 if whole else 0)
-    stage = Stage(scenario, seed, site, [compare])
-    simulate(
-        stage,
-        in_process(team(scenario, seed, site)),
-        seed,
-        lambda: compared >= steps or differing >= 0,
-    )
+    play(scenario, seed, site, [compare], stopped=lambda: compared >= steps or differing >= 0)
     if differing >= 0:
         return False, f"executed again: record {differing} differs"
     if compared < len(records):

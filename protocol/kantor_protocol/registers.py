@@ -33,7 +33,7 @@ _BYTES_MAX = 48 * 1024
 _NUMBER_BYTES, _HEAD_BYTES, _STAMP_BYTES = 8, 12, 6
 _STALE_STEPS = 6
 """How many writes, or steps, behind a neighbour may be before a robot forwards another's register."""
-_FRESH_STEPS = 4
+FRESH_STEPS = 4
 """A participant heard within so many steps beyond `patience` counts as a neighbour."""
 
 
@@ -133,7 +133,7 @@ def _is_due(
     least = -1
     for other in range(stamps.shape[0]):
         wanted = other not in (me, origin) and target in (-1, other)
-        if wanted and heard[other] >= 0 and heard[other] + patience + _FRESH_STEPS >= step:
+        if wanted and heard[other] >= 0 and heard[other] + patience + FRESH_STEPS >= step:
             held = known[other, origin]
             least = held if least < 0 else min(least, held)
     if least < 0:

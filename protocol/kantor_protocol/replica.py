@@ -34,7 +34,7 @@ import numpy.typing as npt
 
 from kantor_protocol.kernels import kernel
 from kantor_protocol.packing import Pairs, put_int, put_uint, skip_numbers, take_int, take_uint
-from kantor_protocol.registers import Registers
+from kantor_protocol.registers import FRESH_STEPS, Registers
 from kantor_protocol.weights import Units, Weights
 
 NOBODY = -1
@@ -46,9 +46,6 @@ _CLAIM_LEASE_STEPS = 12
 """A claim that has not been renewed for so many of the holder's steps is void."""
 _CLAIM_RENEWAL_STEPS = 6
 """How stale a neighbour's knowledge of a foreign claim may be before a robot forwards it."""
-_FRESH_STEPS = 4
-"""A participant heard within so many steps beyond `patience` counts as a neighbour."""
-
 _REPEATED = 32
 """So many unacknowledged entries are repeated with every message, so that one loss costs nothing."""
 LENGTH_MAX = 1 << 40
@@ -303,7 +300,7 @@ def _find_least(store: Store, manner: Manner, target: int, least: np.ndarray) ->
     least[:] = KNOWN_MAX + 1
     for other in range(origins):
         heard = store.sending[2, other]
-        lately = heard >= 0 and heard + manner.patience + _FRESH_STEPS >= store.counters[_STEP]
+        lately = heard >= 0 and heard + manner.patience + FRESH_STEPS >= store.counters[_STEP]
         if lately and other != manner.me and target in (NOBODY, other):
             log, claim = least[other], least[origins + other]
             for slot in range(least.shape[0]):  # row by row: so the processor takes many at once

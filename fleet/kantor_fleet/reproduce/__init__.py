@@ -1,37 +1,37 @@
 """`kantor reproduce`: a paper's figures anew, with a verdict beside each published number."""
 
-import csv
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
-from kantor_fleet.counting import RunsView
+from kantor_fleet.counting import RunsView, table_console
 from kantor_fleet.exits import Exit
+from kantor_fleet.experiment import Case, Outcome
 from kantor_fleet.interrupts import Interrupts
-from kantor_fleet.pools import local
+from kantor_fleet.pools import Pool
 from kantor_fleet.preload import warm_up
 from kantor_fleet.reproduce.claims import MISS, UNMATCHED, Verdict
-from kantor_fleet.reproduce.flights import Flight, Flights, Setting, fly
+from kantor_fleet.reproduce.flights import Flight, Flights, Setting
 from kantor_fleet.reproduce.kabir_lee import FIGURES, Figure
+from kantor_fleet.sweep.table import Row, write_csv
 from kantor_worldsim.exact import available
-
-_WIDTH = 160
-"""Columns of what is printed into a file or a pipe."""
+from kantor_worldsim.metrics import Result
 
 
-def reproduce(names: Sequence[str], runs: int | None, jobs: int, out: Path) -> Exit:
-    """Fly, judge, draw and tell. Raises OSError."""
+def reproduce(
+    names: Sequence[str], runs: int | None, start: Callable[[Iterable[Case]], Pool], out: Path
+) -> Exit:
+    """Fly, judge, draw and tell. start: a pool that flies. Raises OSError."""
     started = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     figures = {name: _affordable(FIGURES[name], runs) for name in names}
     with Interrupts() as interrupts:
         warm_up()
-        flights = _fly_all(_orders(figures.values()), jobs, interrupts)
+        flights = _fly_all(_orders(figures.values()), start, interrupts)
         if interrupts.code is not None:
             print("kantor: interrupted; nothing was written", file=sys.stderr)
             return interrupts.code
@@ -42,7 +42,7 @@ def reproduce(names: Sequence[str], runs: int | None, jobs: int, out: Path) -> E
     verdicts = [
         line for name, figure in figures.items() for line in _conclude(name, figure, flights, out)
     ]
-    _write_verdicts(out / "verdicts.csv", verdicts)
+    write_csv(out / "verdicts.csv", Verdict._fields, [line._asdict() for line in verdicts])
     _print(verdicts)
     print(f"  {out}/  (figures, numbers and verdicts; {time.monotonic() - started:.0f} s)")
     return Exit.NOT_MET if any(verdict.verdict == MISS for verdict in verdicts) else Exit.DONE
@@ -87,28 +87,25 @@ def _orders(figures: Iterable[Figure]) -> dict[Setting, int]:
     return dict(sorted(most.items(), key=lambda item: not item[0].exact))
 
 
-def _fly_all(orders: dict[Setting, int], jobs: int, interrupts: Interrupts) -> Flights:
-    cases = {
-        setting.case(seed): (setting, seed)
-        for setting, count in orders.items()
-        for seed in range(count)
-    }
+def _fly_all(
+    orders: dict[Setting, int], start: Callable[[Iterable[Case]], Pool], interrupts: Interrupts
+) -> Flights:
+    cases = {case: setting for setting, count in orders.items() for case in setting.cases(count)}
     flights: dict[Setting, list[Flight]] = {s: [Flight()] * count for s, count in orders.items()}
-    with RunsView(len(cases)) as view, closing(local(cases, jobs, fly)) as pool:
+    with RunsView(len(cases)) as view, closing(start(cases)) as pool:
         for done in pool:
             if interrupts():
                 break
             if done is not None:
-                setting, seed = cases[done[0]]
-                flights[setting][seed] = _flight(done[1])
-                view.count(done[1].failed)
+                case, outcome = done
+                flights[cases[case]][case.seed] = _flight(outcome)
+                view.count(outcome.failed)
     return flights
 
 
-def _flight(outcome: object) -> Flight:
-    if isinstance(outcome, Flight):
-        return outcome
-    return Flight(failed=getattr(outcome, "failed", None) or "lost")
+def _flight(outcome: Outcome) -> Flight:
+    """What a worker made of a case, or, if it died, why there is nothing."""
+    return outcome if isinstance(outcome, Flight) else Flight(failed=outcome.failed)
 
 
 def _first(flights: Flights, figure: Figure) -> Flights:
@@ -118,40 +115,32 @@ def _first(flights: Flights, figure: Figure) -> Flights:
 
 def _write_runs(path: Path, flights: Flights) -> None:
     """Every run behind a figure."""
-    names = ("setting", "seed", "detected", "targets", "finished_tick", "first_contact_tick")
-    bounds = ("w_ub_start", "w_ub_end", "w_ub_instant_end", "w1_exact")
-    with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow((*names, *bounds))
-        for setting, runs in flights.items():
-            for seed, flight in enumerate(runs):
-                result = flight.result
-                assert result is not None
-                table.writerow(
-                    (
-                        setting.text,
-                        seed,
-                        result.detected,
-                        result.targets,
-                        result.finished_tick,
-                        result.first_contact_tick,
-                        result.w_ub_start,
-                        result.w_ub.paper,
-                        result.w_ub.final_instant,
-                        result.w1_exact,
-                    )
-                )
+    rows = [
+        _row(setting, seed, flight.result)
+        for setting, runs in flights.items()
+        for seed, flight in enumerate(runs)
+        if flight.result is not None
+    ]
+    write_csv(path, list(rows[0]), rows)
 
 
-def _write_verdicts(path: Path, verdicts: Sequence[Verdict]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(Verdict._fields)
-        table.writerows(verdicts)
+def _row(setting: Setting, seed: int, result: Result) -> Row:
+    return {
+        "setting": setting.text,
+        "seed": seed,
+        "detected": result.detected,
+        "targets": result.targets,
+        "finished_tick": result.finished_tick,
+        "first_contact_tick": result.first_contact_tick,
+        "w_ub_start": result.w_ub_start,
+        "w_ub_end": result.w_ub.paper,
+        "w_ub_instant_end": result.w_ub.final_instant,
+        "w1_exact": result.w1_exact,
+    }
 
 
 def _print(verdicts: Sequence[Verdict]) -> None:
-    console = Console(width=None if sys.stdout.isatty() else _WIDTH)
+    console = table_console()
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in ("figure", "claim", "published", "faithful reading", "ours", "verdict"):
         table.add_column(name)

@@ -6,14 +6,12 @@ from typing import NamedTuple
 
 from kantor_fleet.catalog import find
 from kantor_fleet.experiment import Case, Outcome, reason
-from kantor_fleet.team import team
+from kantor_fleet.team import play, team
 from kantor_protocol.machine import SUPERVISOR, Inputs, Outputs, StateMachine
 from kantor_protocol.scenario import Scenario
-from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.metrics import Row
 from kantor_worldsim.recording import Recording
 from kantor_worldsim.records import Record
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 
 EXACT_EVERY = 100
@@ -38,9 +36,10 @@ class Setting(NamedTuple):
         """The scenario itself."""
         return find(self.scenario, self.overrides)
 
-    def case(self, seed: int) -> Case:
-        """One run of it."""
-        return Case(self.find(), seed, self.exact)
+    def cases(self, count: int) -> list[Case]:
+        """Runs of it with the seeds 0, 1, ..."""
+        scenario = self.find()
+        return [Case(scenario, seed, self.exact) for seed in range(count)]
 
 
 class Flight(Outcome, frozen=True, kw_only=True):
@@ -84,8 +83,7 @@ def _fly(case: Case) -> Flight:
     recording = Recording(
         scenario, seed, "in-process", exact_every=EXACT_EVERY if case.exact else None
     )
-    stage = Stage(scenario, seed, site, [recording.take])
-    simulate(stage, in_process(machines), seed, lambda: False)
+    play(scenario, seed, site, [recording.take], machines=machines)
     spent_ns = sum(timed.spent_ns for name, timed in machines.items() if name != SUPERVISOR)
     result = recording.finish()
     return Flight(
@@ -101,6 +99,5 @@ def records_of(setting: Setting, seed: int) -> list[Record]:
     scenario = setting.find()
     site = Site.of(scenario, seed)
     records: list[Record] = []
-    stage = Stage(scenario, seed, site, [records.append])
-    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    play(scenario, seed, site, [records.append])
     return records

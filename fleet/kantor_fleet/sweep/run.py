@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import msgspec
-from rich.console import Console
 
-from kantor_fleet.counting import RunsView
+from kantor_fleet.counting import RunsView, table_console
 from kantor_fleet.exits import Exit
 from kantor_fleet.experiment import Case
 from kantor_fleet.interrupts import Interrupts
@@ -29,9 +28,6 @@ PLAN = "sweep.json"
 TIMINGS = "timings.csv"
 SUMMARY = "summary.csv"
 PLOT = "plot.png"
-
-_WIDTH = 160
-"""Columns of what is printed into a file or a pipe."""
 
 Format = Literal["csv", "parquet"]
 
@@ -120,7 +116,7 @@ def _conclude(order: Order, runs: Sequence[Run]) -> None:
     _write_tables(order, runs, lines)
     main = summary.varying(runs, summary.MAIN) or summary.MAIN
     shown = list(dict.fromkeys([order.plot, *main] if order.plot else main))
-    console = Console(width=None if sys.stdout.isatty() else _WIDTH)
+    console = table_console()
     for measure in shown:
         console.print(summary.table_of(plan, lines, measure), markup=False)
     _complain(runs)
