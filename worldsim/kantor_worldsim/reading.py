@@ -442,6 +442,8 @@ def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int
     claims_kind, size, claims = head_of(payload, logs_end if logs > 0 else logs)
     if claims < 0 or not have_kind == logs_kind == claims_kind == BYTES:
         return refused
+    if fields > 8 and head_of(payload, claims + size)[0] != BYTES:  # the registers
+        return refused
     if skip(payload, claims + size, fields - 8) != end:
         return refused
     return have, have_end, logs, logs_end
