@@ -95,7 +95,7 @@ def _ship_packed(
         counters,
     )
     # Of the manner, spending reads only whose log it is and what an entry means.
-    manner = Manner(me, ledger != 0, False, False, False, 0, 0)
+    manner = Manner(me, ledger != 0, False, False, False, 0, 0, 0)
     count = ship(grid, store, manner, x, y, point, _Room(best, near, sample, units))
     used: int = pack_pairs(sample, units, count, out)
     return used

@@ -26,7 +26,7 @@ class State(enum.IntEnum):
 
     EXPLORING = 0
     FINISHED = 1
-    """No sample has weight left in its own view; it stands and keeps relaying."""
+    """No sample has weight left, or no frontier can be reached, in its own view; it stands and relays."""
     EXHAUSTED = 2
     """Its energy is spent; it stands and keeps relaying."""
 
@@ -60,6 +60,10 @@ class Observation(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """Its true pose after that step."""
     detected: tuple[int, ...] = ()
     """Targets that its sensor found since the last observation."""
+    scan: bytes = b""
+    """What its range finder measured from there, see `scans.py`; empty without a map."""
+    bumped: bool = False
+    """Whether the last step ended at a wall."""
 
 
 class Inputs(msgspec.Struct, frozen=True, array_like=True, gc=False):

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from kantor_protocol.grid import Frame
 from kantor_protocol.machine import Inputs, Outputs, ParticipantId, Pose
 from kantor_protocol.scenario import Scenario
 
@@ -91,6 +92,8 @@ class Mission(_Message, frozen=True, array_like=True, tag=2):
     """(N, 2) float64 at time 0."""
     exchange: str
     """`lockstep` or `wall`."""
+    frame: Frame | None = None
+    """How the cells of the map lie, if there is one; what is in them is for the robots to find out."""
 
 
 class Refusal(_Message, frozen=True, array_like=True, tag=3):
@@ -167,7 +170,9 @@ class Progress(_Message, frozen=True, array_like=True, tag=22):
     robots_done: int
     robots: int
     mass_left: float = 1.0
-    """Share of the mass that the common weights still hold."""
+    """Share of the mass that the common weights still hold; on a map, of the cells not yet seen."""
+    distance_m: float | None = None
+    """On a map: what all robots have driven."""
 
 
 FromParticipant = Report | Ready

@@ -1,8 +1,8 @@
 """Registers: one vector of integers for every participant, held by everybody (design, part 4).
 
-An origin adds to its own register and nobody else writes it. Everywhere else the newest value wins, by
-the origin's stamp, which counts its writes. What a planner wants is the sum over all origins: integers
-make it exact, so that it is the same wherever the same registers are held, whatever came first.
+An origin writes its own register, or adds to it, and nobody else does. Everywhere else the newest value
+wins, by the origin's stamp, which counts its writes. The sum over all origins is kept: integers make it
+exact, so that it is the same wherever the same registers are held, whatever came first.
 
 Talking
 -------
@@ -17,6 +17,8 @@ Talking
 4. Receiving is idempotent. Loss, duplication, delay and reordering cost time, never truth.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -30,7 +32,7 @@ NUMBER_MAX = 1 << 52
 """Sums over a thousand origins stay within 64 bits."""
 _BYTES_MAX = 48 * 1024
 """For one message; with the longest logs and claims a body still fits."""
-_NUMBER_BYTES, _HEAD_BYTES, _STAMP_BYTES = 8, 12, 6
+_NUMBER_BYTES, _HEAD_BYTES, _STAMP_BYTES = 8, 15, 6
 _STALE_STEPS = 6
 """How many writes, or steps, behind a neighbour may be before a robot forwards another's register."""
 FRESH_STEPS = 4
@@ -49,20 +51,23 @@ def add(
 
 
 @kernel
-def _take_head(content: np.ndarray, at: int, origins: int) -> tuple[int, int, int]:
-    """Read what precedes the numbers of a register: (origin, stamp, position), or MALFORMED."""
+def _take_head(
+    content: np.ndarray, at: int, origins: int, width: int
+) -> tuple[int, int, int, int]:
+    """Read what precedes the numbers of a register: (origin, stamp, numbers, position), or MALFORMED."""
     origin, at = take_uint(content, at)
     stamp, at = take_uint(content, at)
-    if at < 0 or origin >= origins or stamp < 1 or stamp > STAMP_MAX:
-        return 0, 0, MALFORMED
-    return origin, stamp, at
+    numbers, at = take_uint(content, at)
+    if at < 0 or origin >= origins or stamp < 1 or stamp > STAMP_MAX or numbers > width:
+        return 0, 0, 0, MALFORMED
+    return origin, stamp, numbers, at
 
 
 @kernel
-def _sound(content: np.ndarray, origins: int, width: int) -> bool:
+def _sound(content: np.ndarray, origins: int, width: int, sums: bool) -> bool:
     """Whether content is stamps and then whole registers.
 
-    The first number of a register bounds the others, as the number of visits bounds every sum over
+    sums: the first number of a register bounds the others, as the number of visits bounds every sum over
     visits of something within [-1, 1].
     """
     at = 0
@@ -71,13 +76,13 @@ def _sound(content: np.ndarray, origins: int, width: int) -> bool:
         if at < 0 or stamp > STAMP_MAX:
             return False
     while at < content.shape[0]:
-        _origin, _stamp, at = _take_head(content, at, origins)
+        _origin, _stamp, numbers, at = _take_head(content, at, origins, width)
         bound = NUMBER_MAX
-        for i in range(width):
+        for i in range(numbers):
             number, at = take_int(content, at)
-            if at < 0 or number > bound or number < (0 if i == 0 else -bound):
+            if at < 0 or number > bound or number < (0 if sums and i == 0 else -bound):
                 return False
-            bound = number if i == 0 else bound
+            bound = number if sums and i == 0 else bound
         if at < 0:
             return False
     return True
@@ -102,10 +107,12 @@ def _learn(
         stamp, at = take_uint(content, at)
         known[source, origin] = max(known[source, origin], stamp)
     while 0 <= at < content.shape[0]:
-        origin, stamp, at = _take_head(content, at, origins)
+        origin, stamp, numbers, at = _take_head(content, at, origins, width)
         news = at >= 0 and origin != me and stamp > stamps[origin]
-        for i in range(width):
-            number, at = take_int(content, at)
+        for i in range(width if at >= 0 else 0):
+            number = 0
+            if i < numbers:
+                number, at = take_int(content, at)
             if news:
                 total[i] += number - values[origin, i]
                 values[origin, i] = number
@@ -171,7 +178,11 @@ def _compose(
         if _is_due(stamps, known, heard, learnt, sent, law, origin, target, step):
             at = put_uint(out, at, origin)
             at = put_uint(out, at, stamps[origin])
-            for i in range(width):
+            numbers = width  # zeros at the end are left out
+            while numbers > 0 and values[origin, numbers - 1] == 0:
+                numbers -= 1
+            at = put_uint(out, at, numbers)
+            for i in range(numbers):
                 at = put_int(out, at, values[origin, i])
             sent[0, origin] = stamps[origin]
             sent[1, origin] = step
@@ -187,11 +198,15 @@ class Registers:
         origins: int,
         width: int,
         *,
+        sums: bool = True,
         relay: bool = False,
         beacon: bool = False,
         patience_steps: int = 2,
     ) -> None:
-        """me: place in the roster of `origins` participants. width: integers in a register, or 0."""
+        """me: place in the roster of `origins` participants. width: integers in a register, or 0.
+
+        sums: registers are sums, the first number of which is the largest in size.
+        """
         self.values = np.zeros((origins, width), dtype=np.int64)
         """(n, width) the newest known of each origin."""
         self.total = np.zeros(width, dtype=np.int64)
@@ -199,6 +214,7 @@ class Registers:
         self.stamps = np.zeros(origins, dtype=np.int64)
         """(n,) writes of each origin that `values` includes."""
         self.me = me
+        self._sums = sums
         self._known = np.zeros((origins, origins), dtype=np.int64)
         self._heard = np.full(origins, -1, dtype=np.int64)
         self._learnt = np.zeros(origins, dtype=np.int64)
@@ -213,10 +229,24 @@ class Registers:
         """Add (width,) integers to the own register; the first sum is the largest in size."""
         add(self.values, self.total, self.stamps, self.me, amounts)
 
+    def write(self, numbers: Sequence[int]) -> None:
+        """Replace the own register; at most `width` integers, the others become 0."""
+        register = self.values[self.me]
+        self.total -= register
+        register[: len(numbers)] = numbers
+        register[len(numbers) :] = 0
+        self.total += register
+        self.stamps[self.me] += 1
+
+    def age_steps(self, origin: int) -> int:
+        """Own steps since the register of an origin was last learnt anew; negative if never."""
+        return self._step - int(self._learnt[origin]) if self.stamps[origin] else -1
+
     def sound(self, content: bytes) -> bool:
         """Whether content is well-formed, whole; without registers none is."""
         origins, width = self.values.shape
-        return width > 0 and bool(_sound(np.frombuffer(content, dtype=np.uint8), origins, width))
+        payload = np.frombuffer(content, dtype=np.uint8)
+        return width > 0 and bool(_sound(payload, origins, width, self._sums))
 
     def learn(self, source: int, content: bytes) -> None:
         """Take in sound content from a participant."""
@@ -258,13 +288,14 @@ class Registers:
 
 @kernel
 def _find(content: np.ndarray, origins: int, wanted: int, register: np.ndarray) -> int:
+    width = register.shape[0]
     at = 0
     for _ in range(origins):
         _stamp, at = take_uint(content, at)
     found = 0
     while 0 <= at < content.shape[0]:
-        origin, stamp, at = _take_head(content, at, origins)
-        for i in range(register.shape[0]):
+        origin, stamp, numbers, at = _take_head(content, at, origins, width)
+        for i in range(numbers):
             number, at = take_int(content, at)
             if at >= 0 and origin == wanted:
                 register[i] = number

@@ -15,7 +15,7 @@ Theory of operation
 6. Receiving is idempotent: a suffix that starts beyond what is held is left (it will come again), what
    is held already is skipped. Loss, duplication, delay and reordering cost time, never truth.
 
-Two meanings of the log, by `merge`:
+Two meanings of the log of a mission that explores a density, by `merge`:
 
 ledger
     An entry is (sample, units spent by the origin). The weight of a sample is its first weight minus
@@ -25,6 +25,9 @@ min
     eq. 8-10). An origin's log holds all that ever fell in its vector, what it learned included, so
     that nothing needs forwarding. Spending of two origins on one sample is counted once: the paper's
     rule, with the paper's weakness.
+
+In a mission with a map there is no weight: an entry is a number alone (`evidence.py` says what it
+means), logs are replicated as with a ledger, and whoever holds them makes of them what it wants.
 """
 
 from typing import NamedTuple
@@ -47,7 +50,8 @@ _CLAIM_LEASE_STEPS = 12
 _CLAIM_RENEWAL_STEPS = 6
 """How stale a neighbour's knowledge of a foreign claim may be before a robot forwards it."""
 _REPEATED = 32
-"""So many unacknowledged entries are repeated with every message, so that one loss costs nothing."""
+"""So many unacknowledged entries are repeated with every message, so that one loss costs nothing.
+Evidence waits for `patience` instead: there are dozens of entries a step, and a late cell does no harm."""
 LENGTH_MAX = 1 << 40
 """No log is longer; it keeps sums of positions within 64 bits."""
 KNOWN_MAX = (1 << 31) - 2
@@ -100,7 +104,9 @@ class Manner(NamedTuple):
     patience: int
     """Own steps within which an acknowledgement is due."""
     value_max: int
-    """The largest value of a log entry."""
+    """The largest value of a log entry; 0: entries have no value and weigh nothing."""
+    bound: int
+    """Every index in a log is below it."""
 
 
 @kernel
@@ -134,7 +140,7 @@ def spend(store: Store, manner: Manner, index: int, units: int) -> None:
 def _merge_entry(store: Store, manner: Manner, origin: int, index: int, value: int) -> None:
     if manner.ledger:
         _append(store, origin, origin, index, value)
-        if min(value, store.weights[index]) > 0:
+        if value > 0 and store.weights[index] > 0:
             _lower(store, index, max(0, store.weights[index] - value))
     elif value < store.weights[index]:
         _lower(store, index, value)
@@ -170,14 +176,16 @@ def _walk_suffixes(store: Store, manner: Manner, suffixes: bytes, source: int, a
             longest = max(longest, start + span)
         fresh = origin != manner.me and (not ledger or start <= held < start + count)
         if apply and not fresh:
-            at = skip_numbers(suffixes, at, 2 * count)
+            at = skip_numbers(suffixes, at, 2 * count if manner.value_max > 0 else count)
             continue
         index = 0
         for i in range(count):
             step, at = take_int(suffixes, at)
-            value, at = take_uint(suffixes, at)
+            value = 0
+            if manner.value_max > 0:
+                value, at = take_uint(suffixes, at)
             index += step
-            if at < 0 or index < 0 or index >= store.weights.shape[0] or value > manner.value_max:
+            if at < 0 or index < 0 or index >= manner.bound or value > manner.value_max:
                 return -1
             if apply and (not ledger or start + i >= held):
                 _merge_entry(store, manner, origin, index, value)
@@ -235,7 +243,9 @@ def _apply_have(store: Store, manner: Manner, have: bytes, source: int) -> None:
 
 @kernel
 def _manner(law: np.ndarray) -> Manner:
-    return Manner(law[0], law[1] != 0, law[2] != 0, law[3] != 0, law[4] != 0, law[5], law[6])
+    return Manner(
+        law[0], law[1] != 0, law[2] != 0, law[3] != 0, law[4] != 0, law[5], law[6], law[7]
+    )
 
 
 @kernel
@@ -325,7 +335,7 @@ def _start_of_suffix(
     if least < 0:
         return store.sending[0, origin] if target >= 0 and origin == me else length
     step = store.counters[_STEP]
-    if (origin == me or relay) and length - least <= _REPEATED:
+    if (origin == me or relay) and length - least <= (_REPEATED if manner.value_max > 0 else 0):
         return least
     if least < aged and step - store.sending[1, origin] >= patience:
         store.sending[1, origin] = step
@@ -337,9 +347,10 @@ def _start_of_suffix(
 
 @kernel
 def _put_suffix(
-    store: Store, out: np.ndarray, at: int, origin: int, ledger: bool, start: int, room: int
+    store: Store, manner: Manner, out: np.ndarray, at: int, origin: int, start: int, room: int
 ) -> tuple[int, int]:
     """Write one suffix: (position after it, entries written)."""
+    ledger, valued = manner.ledger, manner.value_max > 0
     log = store.logs[origin if ledger else 0]
     count = 0
     end = start
@@ -357,7 +368,8 @@ def _put_suffix(
         index, value = int(log[entry, 0]), int(log[entry, 1])
         if ledger or value == store.weights[index]:
             at = put_int(out, at, index - before)
-            at = put_uint(out, at, value)
+            if valued:
+                at = put_uint(out, at, value)
             before = index
     store.sending[0, origin] = max(store.sending[0, origin], end)
     return at, count
@@ -436,7 +448,7 @@ def _compose(
             aged = store.sending[slot, origin]
             start = _start_of_suffix(store, manner, target, least[origin], origin, aged)
             if start < store.length[origin] and entries_left > 0:
-                at, written = _put_suffix(store, out, at, origin, ledger, start, entries_left)
+                at, written = _put_suffix(store, manner, out, at, origin, start, entries_left)
                 entries_left -= written
     for origin in range(origins):
         store.sending[slot, origin] = store.length[origin]
@@ -510,7 +522,7 @@ class Replica:
         me: int,
         origins: int,
         samples: int,
-        units: Units,
+        units: Units | None,
         *,
         ledger: bool,
         claims: bool,
@@ -521,8 +533,11 @@ class Replica:
     ) -> None:
         """me: this participant's place in the roster of `origins` participants. The rest: Manner.
 
-        registers: what the planner shares beside the weights, by default nothing.
+        units: None for logs of bare indices below `samples`, with a ledger. registers: what the planner
+        shares beside the logs, by default nothing.
         """
+        weighed = samples if units else 0
+        units = units or Units(whole=0, sample=0, point=0)
         self.registers = Registers(me, origins, 0) if registers is None else registers
         self.manner = Manner(
             me=me,
@@ -532,18 +547,19 @@ class Replica:
             beacon=beacon,
             patience=max(1, patience_steps),
             value_max=units.point if ledger else units.sample,
+            bound=samples,
         )
         rows = origins if ledger else 1
         self.store = Store(
-            weights=np.full(samples, units.sample, dtype=np.int32),
+            weights=np.full(weighed, units.sample, dtype=np.int32),
             logs=np.zeros((rows, 256, 2), dtype=np.int32),
             length=np.zeros(origins, dtype=np.int64),
             known=np.zeros((origins, 2 * origins), dtype=np.int32),
             sending=np.zeros((3 + self.manner.patience, origins), dtype=np.int64),
             claims=np.zeros((4, origins), dtype=np.int64),
-            lowered=np.zeros(samples, dtype=np.int32),
-            mark=np.zeros(samples, dtype=np.int32),
-            counters=np.array([0, 1, samples], dtype=np.int64),
+            lowered=np.zeros(weighed, dtype=np.int32),
+            mark=np.zeros(weighed, dtype=np.int32),
+            counters=np.array([0, 1, weighed], dtype=np.int64),
         )
         self.store.sending[1:3] = -1 - self.manner.patience
         self.store.claims[_SAMPLE] = NOBODY
@@ -581,6 +597,13 @@ class Replica:
         if outcome == _LEARNT and registers:
             self.registers.learn(source, registers)
         return bool(outcome == _LEARNT)
+
+    def append(self, indices: npt.NDArray[np.int64]) -> None:
+        """Put (k,) bare indices, each below the bound, behind the own log."""
+        self.reserve(indices.shape[0])
+        me, length = self.manner.me, int(self.store.length[self.manner.me])
+        self.store.logs[me, length : length + indices.shape[0], 0] = indices
+        self.store.length[me] += indices.shape[0]
 
     def reserve(self, entries: int) -> None:
         """Make room for this many more entries in every log."""
@@ -636,7 +659,7 @@ class Replica:
 
 
 @kernel
-def _read_logs(logs: np.ndarray, rows: np.ndarray) -> int:
+def _read_logs(logs: np.ndarray, rows: np.ndarray, valued: bool) -> int:
     at = 0
     row = 0
     while at < logs.shape[0]:
@@ -649,7 +672,9 @@ def _read_logs(logs: np.ndarray, rows: np.ndarray) -> int:
             return -1
         for i in range(count):
             step, at = take_int(logs, at)
-            value, at = take_uint(logs, at)
+            value = 0
+            if valued:
+                value, at = take_uint(logs, at)
             if at < 0:
                 return -1
             index += step
@@ -658,13 +683,13 @@ def _read_logs(logs: np.ndarray, rows: np.ndarray) -> int:
     return row
 
 
-def read_logs(logs: bytes) -> npt.NDArray[np.int64] | None:
+def read_logs(logs: bytes, *, valued: bool = True) -> npt.NDArray[np.int64] | None:
     """The entries in a message, as rows (origin, position, sample, value); None if malformed.
 
-    With min, positions count the entries that were sent, which may be fewer than the span.
+    valued: entries have values, see Manner. With min, positions count the entries that were sent, which may be fewer than the span.
     """
-    rows = np.zeros((len(logs) // 2 + 1, 4), dtype=np.int64)
-    count = _read_logs(np.frombuffer(logs, dtype=np.uint8), rows)
+    rows = np.zeros((len(logs) + 1, 4), dtype=np.int64)
+    count = _read_logs(np.frombuffer(logs, dtype=np.uint8), rows, valued)
     return None if count < 0 else rows[:count]
 
 

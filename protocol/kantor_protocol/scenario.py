@@ -10,6 +10,7 @@ import re
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
+from types import UnionType
 from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import msgspec
@@ -23,7 +24,12 @@ Probability = Annotated[float, Meta(ge=0.0, lt=1.0)]
 Seconds = Annotated[float, Meta(ge=0.0, le=1e6)]
 Point = tuple[float, float]
 
-PlannerName = Literal["transport", "spectral"]
+PlannerName = Literal[
+    "transport", "spectral", "frontier", "burgard", "market", "kmeans", "hungarian"
+]
+MAP_PLANNERS = frozenset({"frontier", "burgard", "market", "kmeans", "hungarian"})
+"""Planners that explore an unknown map; the others explore a density."""
+LayoutName = Literal["office", "blank", "unstructured", "cityblock"]
 VehicleName = Literal["first-order", "second-order", "unicycle", "dubins"]
 
 
@@ -39,10 +45,28 @@ class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
 
 class Domain(_Table, frozen=True, kw_only=True):
-    """The rectangle that random starts are drawn from and that plots show. It is no wall."""
+    """The rectangle that random starts are drawn from and that plots show. It is no wall.
+
+    A mission with a map needs none: the map has an extent of its own.
+    """
 
     min_m: Point
     max_m: Point
+
+
+class Map(_Table, frozen=True, kw_only=True):
+    """The world of walls that the robots do not know and explore."""
+
+    file: str | None = None
+    """Nav2 map_server YAML, MovingAI .map, or an image: white is free, black is occupied."""
+    layout: LayoutName | None = None
+    """Or one that is generated."""
+    resolution_m: Positive | None = None
+    """The side of a cell; by default what the file says, or the layout's own."""
+    size_m: tuple[Positive, Positive] | None = None
+    """Width and height of a layout; by default the layout's own."""
+    seed: Annotated[int, Meta(ge=0)] = 0
+    """Of the layout, so that runs of many seeds share one map."""
 
 
 class Robots(_Table, frozen=True, kw_only=True):
@@ -55,9 +79,14 @@ class Starts(_Table, frozen=True, kw_only=True):
     """Where robots stand at time 0."""
 
     random: bool = False
-    """Drawn uniformly in the domain, by the seed."""
+    """Drawn uniformly in the domain, or from the free cells of the map, by the seed."""
     poses_m: tuple[Point, ...] = ()
     """One for each robot, unless random."""
+    spread: Literal["separate", "together"] = "separate"
+    """On a map, random: each robot for itself, or side by side around one place."""
+    spots: Annotated[int, Meta(ge=0, le=10_000)] = 0
+    """On a map, random: draw from so many places spread over it, the same for every seed; 0: anywhere.
+    Together, a run takes the spot number seed mod spots."""
 
 
 class Vehicle(_Table, frozen=True, kw_only=True):
@@ -92,8 +121,8 @@ class Clock(_Table, frozen=True, kw_only=True):
 class Energy(_Table, frozen=True, kw_only=True):
     """The budget, eq. 7."""
 
-    points: Annotated[int, Meta(ge=1, le=2_000_000_000)]
-    """M: robot points of the whole team; each ships 1/M of the mass."""
+    points: Annotated[int, Meta(ge=0, le=2_000_000_000)] = 0
+    """M: robot points of the whole team; each ships 1/M of the mass. 0 in a mission with a map."""
     steps: Annotated[int, Meta(ge=1, le=2_000_000_000)] | None = None
     """Points that one robot may ship; by default t_e = M / n_a."""
 
@@ -130,9 +159,15 @@ class Targets(_Table, frozen=True, kw_only=True):
 
 
 class Sensor(_Table, frozen=True, kw_only=True):
-    """A disc in which a robot detects targets."""
+    """A disc in which a robot detects targets; on a map also a range finder."""
 
     range_m: Positive = 15.0
+    beams: Annotated[int, Meta(ge=1, le=10_000)] = 360
+    """Of one scan, evenly over the field of view."""
+    field_of_view_deg: Annotated[float, Meta(gt=0.0, le=360.0)] = 360.0
+    """Centred on the heading."""
+    noise_m: NotNegative = 0.0
+    """Standard deviation of a range."""
 
 
 class Radio(_Table, frozen=True, kw_only=True):
@@ -150,6 +185,10 @@ class Radio(_Table, frozen=True, kw_only=True):
     reorder: Probability = 0.0
     """A delivery is held back by up to reorder_s, so that later ones overtake it."""
     reorder_s: Seconds = 0.3
+    line_of_sight: bool = False
+    """On a map: no wall may stand between."""
+    wall_loss_m: NotNegative = 0.0
+    """On a map: each wall between shortens the range by so much."""
     beacon: Literal["versions", "state"] = "versions"
     """What a robot sends while it hears nobody: which versions it holds, or all that it knows.
     With state one message is enough to inform whoever comes into range, as Algorithm 3 presupposes."""
@@ -168,11 +207,46 @@ class Planner(_Table, frozen=True, kw_only=True):
     """How goals are chosen."""
 
     name: PlannerName = "transport"
-    """transport: optimal transport (Kabir & Lee). spectral: multiscale coverage (Mathew & Mezic)."""
+    """On a density: transport (Kabir & Lee), spectral (multiscale coverage, Mathew & Mezic). On a map:
+    frontier (Yamauchi), burgard, market (Zlot), kmeans (Puig, Garcia, Wu), hungarian (the cheapest
+    assignment of robots to frontiers)."""
     horizon: Annotated[int, Meta(ge=1, le=12)] = 3
     """transport: h, samples in one plan."""
     modes: Annotated[int, Meta(ge=1, le=64)] = 15
     """spectral: K, cosine modes along each axis."""
+    cost: Literal["occupancy", "length"] = "occupancy"
+    """map: a way costs its length times the smoothed occupancy (Burgard), or its length."""
+    smoothing_cells: Annotated[float, Meta(ge=0.0, le=100.0)] = 1.5
+    """cost = occupancy: deviation of the Gaussian."""
+    occupied_from: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.5
+    """map: no way leads through a cell that is occupied with this probability or more."""
+    replan_on: Literal["events", "arrivals"] = "events"
+    """map: robots get new targets when one arrives or its target is no frontier any more, or only when
+    one arrives."""
+    replan_whose: Literal["team", "own"] = "team"
+    """map: all of them, or only the robot that it happens to."""
+    replan_gap: Annotated[int, Meta(ge=1, le=10_000)] = 3
+    """map: steps from one assignment to the next, at least."""
+    remember_s: Seconds = 60.0
+    """map, decentralized: how long the target of a robot that is not heard counts as taken."""
+    patience: Annotated[int, Meta(ge=1)] = 60
+    """map: steps without progress after which a target counts as inaccessible."""
+    coordinated: bool = True
+    """burgard: false lets each robot take the frontier that is cheapest for it."""
+    beta: NotNegative = 1.0
+    """burgard: weight of the cost; 1 across one sensor range of open floor is worth one utility."""
+    coverage: Literal["histogram", "linear", "disc"] = "histogram"
+    """burgard: P(d) as learned from measured ranges (2000), 1 - d / range (2005), or 1 within range."""
+    discount: Literal["multiply", "subtract"] = "multiply"
+    """burgard: utilities near a target are multiplied by 1 - P(d) (2000), or lessened by P(d) (2005)."""
+    sight: bool = False
+    """burgard: P(d) is 0 behind a wall (2005)."""
+    goals: Literal["random", "greedy", "quadtree"] = "quadtree"
+    """market: how goals in the unknown are proposed."""
+    goal_count: Annotated[int, Meta(ge=1, le=64)] = 5
+    """market: goals of one robot at a time."""
+    lease_s: Annotated[float, Meta(gt=0.0, le=1e6)] = 5.0
+    """market: how long a seller waits for bids, or for a winner to confirm."""
 
 
 class Publish(_Table, frozen=True, kw_only=True):
@@ -204,10 +278,12 @@ class Scenario(_Table, frozen=True, kw_only=True):
     """Robots claim the sample they head for, if their planner heads for samples."""
     limit_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     """Simulated time after which the mission is cut; by default 1.5 times the energy's."""
-    domain: Domain
+    domain: Domain = Domain(min_m=(0.0, 0.0), max_m=(0.0, 0.0))
+    map: Map | None = None
+    """Given one, the robots explore it; they then need no domain, energy, samples or density."""
     robots: Robots
-    energy: Energy
-    samples: Samples
+    energy: Energy = Energy()
+    samples: Samples = Samples()
     density: tuple[Gaussian, ...] = ()
     starts: Starts = Starts()
     targets: Targets = Targets()
@@ -236,13 +312,20 @@ class Scenario(_Table, frozen=True, kw_only=True):
         return self.coordination == "centralized"
 
     @property
+    def mapping(self) -> bool:
+        """Whether the robots explore an unknown map, and not a density."""
+        return self.map is not None
+
+    @property
     def claiming(self) -> bool:
         """Whether robots claim samples: asked for, and the planner has samples to claim."""
         return self.claims and self.planner.name == "transport"
 
     @property
     def register_width(self) -> int:
-        """Integers in the register by which robots coordinate; 0 for a planner without one."""
+        """Integers in the register by which robots coordinate, at most; 0 for a planner without one."""
+        if self.mapping:
+            return 64 + 8 * self.robots.count
         return self.planner.modes**2 if self.planner.name == "spectral" else 0
 
     @property
@@ -260,6 +343,8 @@ class Scenario(_Table, frozen=True, kw_only=True):
         """Simulated time at which the mission is cut."""
         if self.limit_s is not None:
             return round(self.limit_s * 1e9)
+        if self.mapping:
+            return _MAP_LIMIT_PERIODS * self.period_ns
         slowest = 1.0 + self.clock.spread + self.clock.drift_ppm * 1e-6
         return round(1.5 * (self.steps_per_robot + 100) * self.period_ns * slowest)
 
@@ -316,6 +401,8 @@ def rooted(scenario: Scenario, folder: Path) -> Scenario:
 
     return msgspec.structs.replace(
         scenario,
+        map=scenario.map
+        and msgspec.structs.replace(scenario.map, file=place(scenario.map.file)),
         samples=msgspec.structs.replace(scenario.samples, file=place(scenario.samples.file)),
         targets=msgspec.structs.replace(scenario.targets, file=place(scenario.targets.file)),
     )
@@ -391,12 +478,15 @@ def _override(tree: dict[str, Any], override: str) -> None:
     table[path[-1]] = value
 
 
+_MAP_LIMIT_PERIODS = 20_000
+
 _PERIODS_UNDER_WAY = 1000
 """Robots remember what they sent for as long as an answer may take."""
 
 _KNOWN: dict[str, tuple[str, ...]] = {
     "": Scenario.__struct_fields__,
     "domain": Domain.__struct_fields__,
+    "map": Map.__struct_fields__,
     "robots": Robots.__struct_fields__,
     "starts": Starts.__struct_fields__,
     "vehicle": Vehicle.__struct_fields__,
@@ -437,33 +527,72 @@ def _choices(place: str) -> str:
     kind: Any = Scenario
     for part in place.split("."):
         kind = get_type_hints(kind)[part]
+        if isinstance(kind, UnionType):  # a table, or a name, that need not be there
+            kind = get_args(kind)[0]
     return ", ".join(get_args(kind))
 
 
 def _complaints(scenario: Scenario) -> Iterable[str]:
     """What types alone cannot say. The first one is reported."""
     yield from _not_finite(to_tree(scenario))
-    (x_min, y_min), (x_max, y_max) = scenario.domain.min_m, scenario.domain.max_m
-    if x_min >= x_max or y_min >= y_max:
-        yield "domain: min_m must lie below max_m in x and in y"
-    yield from _complaints_of_starts(scenario)
-    image_or_mixture = scenario.samples.file is None or is_image(scenario.samples.file)
-    if scenario.samples.file is None and not scenario.density:
-        yield "samples: no source; add [[density]] tables or set samples.file"
-    if image_or_mixture and scenario.samples.count is None:
-        yield "samples.count: missing; set the number of samples N"
+    yield from _complaints_of_map(scenario) if scenario.map else _complaints_of_density(scenario)
     for key, name in (("samples", scenario.samples.file), ("targets", scenario.targets.file)):
         if name is not None and Path(name).suffix.lower() not in POINT_FILES | IMAGE_FILES:
             known = ", ".join(sorted(POINT_FILES | IMAGE_FILES))
             yield f"{key}.file: {name} has an unknown kind; use one of {known}"
-    if scenario.energy.points < scenario.robots.count:
-        yield "energy.points: fewer than robots; set at least one point for each"
     clock = scenario.clock
     shortest_s = clock.period_s * (1.0 - clock.spread) * (1.0 - clock.drift_ppm * 1e-6)
     if clock.jitter_s + 1e-9 >= shortest_s:  # a step must not overtake the next one
         yield f"clock.jitter_s: must be below the shortest period after spread and drift, {shortest_s:g} s"
     if scenario.radio.delay_s + scenario.radio.jitter_s > _PERIODS_UNDER_WAY * shortest_s:
         yield f"radio.delay_s: with the jitter over {_PERIODS_UNDER_WAY} periods; make it shorter"
+
+
+def _complaints_of_density(scenario: Scenario) -> Iterable[str]:
+    (x_min, y_min), (x_max, y_max) = scenario.domain.min_m, scenario.domain.max_m
+    if scenario.domain == Domain(min_m=(0.0, 0.0), max_m=(0.0, 0.0)):
+        yield "domain: missing; set it"
+    if x_min >= x_max or y_min >= y_max:
+        yield "domain: min_m must lie below max_m in x and in y"
+    yield from _complaints_of_starts(scenario)
+    if scenario.planner.name in MAP_PLANNERS:
+        yield f"planner.name: {scenario.planner.name} explores a map; add a [map]"
+    image_or_mixture = scenario.samples.file is None or is_image(scenario.samples.file)
+    if scenario.samples.file is None and not scenario.density:
+        yield "samples: no source; add [[density]] tables or set samples.file"
+    if image_or_mixture and scenario.samples.count is None:
+        yield "samples.count: missing; set the number of samples N"
+    if scenario.energy.points == 0:
+        yield "energy: missing; set it"
+    if scenario.energy.points < scenario.robots.count:
+        yield "energy.points: fewer than robots; set at least one point for each"
+
+
+def _complaints_of_map(scenario: Scenario) -> Iterable[str]:
+    assert scenario.map is not None
+    if (scenario.map.file is None) == (scenario.map.layout is None):
+        yield "map: set either map.file or map.layout"
+    if scenario.map.file is not None and scenario.map.size_m is not None:
+        yield "map.size_m: only for a layout; a file has a size of its own"
+    if scenario.planner.name not in MAP_PLANNERS:
+        known = ", ".join(sorted(MAP_PLANNERS))
+        yield f"planner.name: {scenario.planner.name} explores a density; on a map use {known}"
+    if scenario.density or scenario.samples.file or scenario.samples.count or scenario.energy.points:
+        yield "map: cannot be joined with a density; remove density, samples and energy"
+    if scenario.targets.file is None and scenario.targets.count:
+        yield "targets.count: on a map targets come from a file; set targets.file"
+    if not scenario.starts.random and len(scenario.starts.poses_m) != scenario.robots.count:
+        yield _starts_given(scenario)
+    bounded = scenario.centralized and scenario.supervisor.range_m != math.inf
+    if bounded and scenario.supervisor.pose_m is None:
+        yield "supervisor.pose_m: missing; a supervisor of limited range needs its place"
+
+
+def _starts_given(scenario: Scenario) -> str:
+    return (
+        f"starts.poses_m: {len(scenario.starts.poses_m)} given for {scenario.robots.count} robots; "
+        f"give one for each or set starts.random=true"
+    )
 
 
 def _not_finite(tree: Any, path: str = "") -> Iterable[str]:
@@ -485,10 +614,7 @@ def _complaints_of_starts(scenario: Scenario) -> Iterable[str]:
     if starts.random:
         return
     if len(starts.poses_m) != count:
-        yield (
-            f"starts.poses_m: {len(starts.poses_m)} given for {count} robots; "
-            f"give one for each or set starts.random=true"
-        )
+        yield _starts_given(scenario)
     (x_min, y_min), (x_max, y_max) = scenario.domain.min_m, scenario.domain.max_m
     for i, (x, y) in enumerate(starts.poses_m):
         if not (x_min <= x <= x_max and y_min <= y <= y_max):

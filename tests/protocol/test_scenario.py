@@ -137,7 +137,7 @@ REFUSED = {
     "no-robots": ("robots.count=0", "robots.count", ">= 1"),
     "too-many-robots": ("robots.count=1001", "robots.count", "<= 1000"),
     "no-samples": ("samples.count=0", "samples.count", ">= 1"),
-    "no-energy": ("energy.points=0", "energy.points", ">= 1"),
+    "no-energy": ("energy.points=0", "energy", "set it"),
     "too-little-energy": ("energy.points=2", "energy.points", "at least one point for each"),
     "certain-loss": ("radio.drop=1.0", "radio.drop", "< 1.0"),
     "horizon-of-13": ("planner.horizon=13", "planner.horizon", "<= 12"),
@@ -247,7 +247,7 @@ def test_register_is_as_wide_as_the_modes() -> None:
     assert mission("planner.modes=10").register_width == 0
 
 
-@pytest.mark.parametrize("key", ["name", "domain", "robots", "energy", "samples"])
+@pytest.mark.parametrize("key", ["name", "domain", "robots", "energy"])
 def test_missing_key_is_named(key: str) -> None:
     """What has no default must be set."""
     tree = to_tree(mission())
