@@ -322,6 +322,11 @@ class Scenario(_Table, frozen=True, kw_only=True):
         return self.claims and self.planner.name == "transport"
 
     @property
+    def learns_ranges(self) -> bool:
+        """Whether robots tell one another some of the ranges that they measure."""
+        return self.planner.name == "burgard" and self.planner.coverage == "histogram"
+
+    @property
     def register_width(self) -> int:
         """Integers in the register by which robots coordinate, at most; 0 for a planner without one."""
         if self.mapping:
