@@ -39,6 +39,7 @@ class Purpose(enum.IntEnum):
     TARGETS = 11
     STARTS = 12
     SUBSET = 13
+    MAP = 14
 
 
 @kernel
