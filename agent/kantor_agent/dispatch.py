@@ -65,9 +65,7 @@ class Dispatch:
         self._gap = planner.replan_gap
         self._revision = -1
 
-    def decide(
-        self, group: Sequence[Member], absent: Sequence[int], tick: int
-    ) -> dict[int, Task]:
+    def decide(self, group: Sequence[Member], absent: Sequence[int], tick: int) -> dict[int, Task]:
         """New tasks by robot, for those who get one now. group: everybody in contact, by place."""
         members, others = self._chosen(group, tick)
         if not members:

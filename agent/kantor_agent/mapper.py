@@ -7,6 +7,8 @@ decision of everybody rests on the same knowledge, one step old, as the supervis
 
 import math
 
+import numpy as np
+
 from kantor_agent.chart import Chart
 from kantor_agent.dispatch import Dispatch, member_of, order_in, register_of
 from kantor_agent.navigation import Navigator
@@ -28,8 +30,6 @@ from kantor_protocol.machine import (
 from kantor_protocol.messages import News
 from kantor_protocol.radio import Radio, replica_of
 from kantor_protocol.scenario import Scenario
-
-import numpy as np
 
 _CONTACT_STEPS = 8
 """A robot whose register was not renewed for so many steps is out of contact."""
@@ -167,7 +167,9 @@ class Mapper:
             self._scanned_step = observation.step
             moved = observation.pose != self._scanned_pose
             self._scanned_pose = observation.pose
-            self._replica.append(self._evidence.take(observation.scan, observation.pose, moved=moved))
+            self._replica.append(
+                self._evidence.take(observation.scan, observation.pose, moved=moved)
+            )
         target = self._task.target
         if target == NOWHERE:
             return

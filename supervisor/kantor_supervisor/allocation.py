@@ -64,7 +64,5 @@ class Allocation:
                 continue
             task = self._tasks.get(robot, Task())
             arrived = told.arrived and told.task.target == task.target
-            group.append(
-                told._replace(task=task, since=self._since.get(robot, 0), arrived=arrived)
-            )
+            group.append(told._replace(task=task, since=self._since.get(robot, 0), arrived=arrived))
         return group
