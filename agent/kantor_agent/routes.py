@@ -39,8 +39,9 @@ _RATIO_MAX = _RING / _SLANT - 2.0
 """Highest to lowest cost for which the ring is wide enough."""
 _LEAST, _MOST = 1e-200, 1e200
 """Costs in between can be divided by one another."""
-_NARROWER = 1.0 - 2.0**-20
-"""A bucket's width in shortest steps: rounding lets no step end in the bucket where it began."""
+_NARROWER = 1.0 - 2.0**-16
+"""A bucket's width in shortest steps: rounding lets no step end in the bucket where it began, on no map
+of `CELLS_MAX` cells."""
 _ENTRIES = 8
 """Of one cell in all buckets: every neighbour improves it once at most."""
 _LOWEST_BIT = np.array([0] + [(byte & -byte).bit_length() - 1 for byte in range(1, 256)])
