@@ -60,7 +60,9 @@ class Asked:
 class World:
     """A chart whose frontiers a test chooses, and a dispatch over it."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, *overrides: str, me: int | None = None):
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, *overrides: str, me: int | None = None
+    ) -> None:
         self.asked = Asked()
         monkeypatch.setitem(dispatch.ALLOCATORS, "frontier", lambda *_: self.asked)
         scenario = mission(*overrides)
