@@ -85,7 +85,7 @@ def _follow_beam(
     beam ended. Where two borders lie equally near, as at the corner of a cell, it says nothing of either.
     """
     du, dv = math.cos(angle_rad), math.sin(angle_rad)
-    column, row = int(math.floor(u)), int(math.floor(v))
+    column, row = math.floor(u), math.floor(v)
     if not (0 <= row < rows and 0 <= column < columns):
         return count
     cell, entered = row * columns + column, -math.inf  # it stands here: no wall

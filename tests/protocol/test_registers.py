@@ -53,9 +53,9 @@ def leb128(value: int) -> bytes:
 
 
 def register(origin: int, stamp: int, *numbers: int) -> bytes:
-    """Origin, stamp, zigzag-folded numbers."""
+    """Origin, stamp, how many numbers, the numbers zigzag-folded."""
     folded = (2 * number if number >= 0 else -2 * number - 1 for number in numbers)
-    return b"".join(leb128(value) for value in (origin, stamp, *folded))
+    return b"".join(leb128(value) for value in (origin, stamp, len(numbers), *folded))
 
 
 def content(stamps: list[int], *registers: bytes) -> bytes:
