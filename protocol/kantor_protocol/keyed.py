@@ -41,6 +41,7 @@ class Purpose(enum.IntEnum):
     SUBSET = 13
     MAP = 14
     SCAN = 15
+    CENTROIDS = 16
 
 
 @kernel
