@@ -239,7 +239,7 @@ def test_what_is_transparent_is_unknown_in_scale_mode(folder: Path) -> None:
     trinary = nav2(folder, encoded(image), image="map.png", free_thresh="0.3")
     ground, (warning,) = read(trinary)
     assert ground.cells.tolist() == [[FREE, FREE]]
-    assert "1 pixels that are not opaque" in warning
+    assert "pixels that are not opaque" in warning
     assert "mode: scale" in warning
 
 
@@ -400,6 +400,15 @@ def test_plain_image(folder: Path, kind: str) -> None:
     assert ground.frame == Frame(0.05, (0.0, 0.0), 16, 16)
     assert ground.cells[3::8, 3::8].tolist() == [[UNKNOWN, OCCUPIED], [FREE, UNKNOWN]]
     assert read(folder / f"plain.{suffix}", 0.2)[0].frame.resolution_m == 0.2
+
+
+def test_what_is_transparent_is_unknown_in_a_plain_image(folder: Path) -> None:
+    """Whatever its colour; what is opaque counts by its colour alone."""
+    grey = np.array([[255, 0, 255, 0, 205]], dtype=np.uint8)
+    alpha = np.array([[255, 255, 254, 0, 255]], dtype=np.uint8)
+    ground = ground_of(saved(folder, "clear.png", encoded(np.dstack([grey, grey, grey, alpha]))))
+
+    assert ground.cells.tolist() == [[FREE, OCCUPIED, UNKNOWN, UNKNOWN, UNKNOWN]]
 
 
 @pytest.mark.parametrize("resolution_m", [0.0, -1.0, math.nan, math.inf, 1e-9])
