@@ -6,6 +6,7 @@ from kantor_agent.planners.base import Goal, Planner
 from kantor_agent.planners.burgard import Burgard
 from kantor_agent.planners.frontier import Frontier
 from kantor_agent.planners.hungarian import Hungarian
+from kantor_agent.planners.kmeans import KMeans
 from kantor_agent.planners.spectral import Spectral
 from kantor_agent.planners.team import Allocator
 from kantor_agent.planners.transport import Transport
@@ -21,6 +22,7 @@ ALLOCATORS: dict[str, Callable[[Scenario, int, int | None], Allocator]] = {
     "frontier": Frontier,
     "burgard": Burgard,
     "hungarian": Hungarian,
+    "kmeans": KMeans,
 }
 """Those that explore a map: targets for a group. Scenario, seed, and the robot that asks or None."""
 
