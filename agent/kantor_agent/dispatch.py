@@ -133,10 +133,12 @@ class Dispatch:
         )
 
     def _needs(self, member: Member) -> bool:
-        target = member.task.target
+        chart, target = self._terrain.chart, member.task.target
         if target == NOWHERE:
-            return self._revision != self._terrain.chart.revision
-        return member.arrived or (self._on_events and not self._terrain.chart.is_frontier(target))
+            return self._revision != chart.revision
+        if member.arrived or chart.void[target]:
+            return True
+        return self._on_events and not chart.is_frontier(target)
 
     def _frontiers(self, group: Sequence[Member]) -> npt.NDArray[np.int64]:
         """All but those at which somebody stands that has looked around."""

@@ -83,6 +83,7 @@ class Mapper:
         elapsed_ns = min(inputs.now_ns - self._now_ns, self._period_ns)
         self._now_ns, self._step = inputs.now_ns, self._step + 1
         self._chart.fold(self._replica)
+        self._give_up()
         if not self._resting:
             self._decide()
         self._look(inputs.observation)
@@ -103,6 +104,15 @@ class Mapper:
             self._pose = observation.pose
 
     # Deciding.
+
+    def _give_up(self) -> None:
+        """Tell of a target that showed or led to nothing, before there is another target."""
+        target = self._task.target
+        in_vain = self._arrived and self._chart.is_frontier(target)
+        stuck = not self._arrived and self._step - self._progressed > self._patience
+        if target != NOWHERE and not self._chart.void[target] and (in_vain or stuck):
+            self._replica.append(np.array([void(self._frame, target)]))
+            self._progressed = self._step
 
     def _decide(self) -> None:
         """Take a new task, if there is one; rest when no frontier can be reached."""
@@ -152,7 +162,7 @@ class Mapper:
     # Acting.
 
     def _look(self, observation: Observation) -> None:
-        """Add the scan to the own layer, once; give up a target that shows or leads to nothing."""
+        """Add the scan to the own layer, once."""
         if observation.step != self._scanned_step:
             self._scanned_step = observation.step
             moved = observation.pose != self._scanned_pose
@@ -160,15 +170,7 @@ class Mapper:
             self._replica.append(
                 self._evidence.take(observation.scan, observation.pose, moved=moved)
             )
-        target = self._task.target
-        if target == NOWHERE:
-            return
-        stood_before = self._arrived
-        self._arrived = self._is_at(target)
-        stuck = self._step - self._progressed > self._patience
-        if ((stood_before and self._arrived) or stuck) and self._chart.is_frontier(target):
-            self._replica.append(np.array([void(self._frame, target)]))
-            self._progressed = self._step
+        self._arrived = self._task.target != NOWHERE and self._is_at(self._task.target)
 
     def _is_at(self, cell: int) -> bool:
         x_m, y_m = self._frame.centre_of(cell)
