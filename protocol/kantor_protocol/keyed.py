@@ -40,6 +40,7 @@ class Purpose(enum.IntEnum):
     STARTS = 12
     SUBSET = 13
     MAP = 14
+    MARKET = 17
 
 
 @kernel

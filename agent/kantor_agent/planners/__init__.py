@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 from kantor_agent.planners.base import Goal, Planner
 from kantor_agent.planners.frontier import Frontier
+from kantor_agent.planners.market import Market
 from kantor_agent.planners.spectral import Spectral
 from kantor_agent.planners.team import Allocator
 from kantor_agent.planners.transport import Transport
@@ -17,6 +18,7 @@ PLANNERS: dict[str, Callable[[Scenario], Planner]] = {
 
 ALLOCATORS: dict[str, Callable[[Scenario, int, int | None], Allocator]] = {
     "frontier": Frontier,
+    "market": Market,
 }
 """Those that explore a map: targets for a group. Scenario, seed, and the robot that asks or None."""
 
