@@ -7,6 +7,7 @@ What a robot tells of itself, and the supervisor of all robots, are registers (`
 """
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -14,11 +15,30 @@ import numpy.typing as npt
 from kantor_agent.planners import ALLOCATORS
 from kantor_agent.planners.team import Member, Situation, Task
 from kantor_agent.terrain import Terrain
-from kantor_protocol.grid import NOWHERE
+from kantor_protocol.grid import NOWHERE, Frame
+from kantor_protocol.registers import Registers
 from kantor_protocol.scenario import Scenario
 
 ARRIVED, RESTING = 1, 2
+_CONTACT_PERIODS = 8
 _CELL, _FLAGS, _TARGET, _SINCE, _MEMO = 0, 1, 2, 3, 4
+
+
+class Patience(NamedTuple):
+    """How long a participant counts on what it was told, in its own steps."""
+
+    contact_steps: int
+    """Whoever's register was not renewed for longer is out of contact."""
+    remember_steps: int
+    """The target of a robot out of contact counts as taken for so long."""
+
+    @classmethod
+    def of(cls, scenario: Scenario, period_ns: int) -> "Patience":
+        """For a participant that steps once in period_ns."""
+        return cls(
+            _CONTACT_PERIODS * scenario.period_ns // period_ns,
+            round(scenario.planner.remember_s * 1e9) // period_ns,
+        )
 
 
 def register_of(member: Member, *, resting: bool) -> list[int]:
@@ -27,16 +47,34 @@ def register_of(member: Member, *, resting: bool) -> list[int]:
     return [member.cell + 1, flags, member.task.target + 1, member.since, *member.task.memo]
 
 
-def member_of(robot: int, register: npt.NDArray[np.int64], cells: int) -> Member | None:
+def member_of(robot: int, register: npt.NDArray[np.int64], cells: int, tick: int) -> Member | None:
     """What a robot has told of itself; None while it has told nothing sound, or rests."""
     cell, flags, target, since, *memo = register.tolist()
     if not (1 <= cell <= cells and 0 <= target <= cells) or flags & RESTING:
         return None
+    since = min(since, tick)
     while memo and memo[-1] == 0:  # registers lose them too
         memo.pop()
     return Member(
         robot, cell - 1, Task(target - 1, tuple(memo)), since, arrived=bool(flags & ARRIVED)
     )
+
+
+def roll_call(
+    registers: Registers, robots: int, frame: Frame, tick: int, patience: Patience
+) -> tuple[list[Member], list[int]]:
+    """Who is in contact, by place, as all others know them; and where those were heading who are not."""
+    group, absent = [], []
+    for robot in range(robots):
+        member = member_of(robot, registers.values[robot], frame.cells, tick)
+        if member is None:
+            continue
+        age = 0 if robot == registers.me else registers.age_steps(robot)
+        if age <= patience.contact_steps:
+            group.append(member)
+        elif age <= patience.remember_steps and member.task.target != NOWHERE:
+            absent.append(member.task.target)
+    return group, absent
 
 
 def orders_of(tasks: Mapping[int, Task], robots: int, tick: int) -> list[int]:
@@ -65,9 +103,7 @@ class Dispatch:
         self._gap = planner.replan_gap
         self._revision = -1
 
-    def decide(
-        self, group: Sequence[Member], absent: Sequence[int], tick: int
-    ) -> dict[int, Task]:
+    def decide(self, group: Sequence[Member], absent: Sequence[int], tick: int) -> dict[int, Task]:
         """New tasks by robot, for those who get one now. group: everybody in contact, by place."""
         members, others = self._chosen(group, tick)
         if not members:

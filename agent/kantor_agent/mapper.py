@@ -7,8 +7,10 @@ decision of everybody rests on the same knowledge, one step old, as the supervis
 
 import math
 
+import numpy as np
+
 from kantor_agent.chart import Chart
-from kantor_agent.dispatch import Dispatch, member_of, order_in, register_of
+from kantor_agent.dispatch import Dispatch, Patience, order_in, register_of, roll_call
 from kantor_agent.navigation import Navigator
 from kantor_agent.planners.team import Member, Task
 from kantor_agent.terrain import Terrain
@@ -29,10 +31,6 @@ from kantor_protocol.messages import News
 from kantor_protocol.radio import Radio, replica_of
 from kantor_protocol.scenario import Scenario
 
-import numpy as np
-
-_CONTACT_STEPS = 8
-"""A robot whose register was not renewed for so many steps is out of contact."""
 _SURE_STEPS = 3
 """So many steps in a row without a frontier end the mission of a robot."""
 _ON_TARGET_CELLS = 0.75
@@ -65,7 +63,7 @@ class Mapper:
         self._target = SUPERVISOR if scenario.centralized else EVERYBODY
         self._centralized = scenario.centralized
         self._period_ns = scenario.period_ns
-        self._remember = round(scenario.planner.remember_s / scenario.clock.period_s)
+        self._counting_on = Patience.of(scenario, scenario.period_ns)
         self._patience = scenario.planner.patience
         self._now_ns = 0
         self._step = 0
@@ -109,7 +107,10 @@ class Mapper:
         """Take a new task, if there is one; rest when no frontier can be reached."""
         registers = self._replica.registers
         supervisor = registers.values.shape[0] - 1
-        if self._centralized and 0 <= registers.age_steps(supervisor) <= _CONTACT_STEPS:
+        if (
+            self._centralized
+            and 0 <= registers.age_steps(supervisor) <= self._counting_on.contact_steps
+        ):
             self._obey(order_in(registers.values[supervisor], self._me, self._frame.cells))
         elif registers.stamps[self._me] > 0:
             self._choose()
@@ -121,7 +122,10 @@ class Mapper:
             self._take(Task(target))
 
     def _choose(self) -> None:
-        group, absent = self._known_robots()
+        registers = self._replica.registers
+        group, absent = roll_call(
+            registers, self._robots, self._frame, self._tick, self._counting_on
+        )
         task = self._dispatch.decide(group, absent, self._tick).get(self._me)
         if task is not None:
             self._take(task)
@@ -131,21 +135,6 @@ class Mapper:
             self._arrived = False
             self._progressed, self._left = self._step, 0
         self._task, self._since = task, self._tick
-
-    def _known_robots(self) -> tuple[list[Member], list[int]]:
-        """Who is in contact, this robot as the others know it; and where others were heading for."""
-        registers = self._replica.registers
-        group, absent = [], []
-        for robot in range(self._robots):
-            member = member_of(robot, registers.values[robot], self._frame.cells)
-            if member is None:
-                continue
-            age = 0 if robot == self._me else registers.age_steps(robot)
-            if age <= _CONTACT_STEPS:
-                group.append(member)
-            elif age <= self._remember and member.task.target != NOWHERE:
-                absent.append(member.task.target)
-        return group, absent
 
     def _may_go_on(self) -> bool:
         """Whether there may still be something for this robot to do."""
@@ -167,7 +156,9 @@ class Mapper:
             self._scanned_step = observation.step
             moved = observation.pose != self._scanned_pose
             self._scanned_pose = observation.pose
-            self._replica.append(self._evidence.take(observation.scan, observation.pose, moved=moved))
+            self._replica.append(
+                self._evidence.take(observation.scan, observation.pose, moved=moved)
+            )
         target = self._task.target
         if target == NOWHERE:
             return

@@ -39,10 +39,13 @@ _RATIO_MAX = _RING / _SLANT - 2.0
 """Highest to lowest cost for which the ring is wide enough."""
 _LEAST, _MOST = 1e-200, 1e200
 """Costs in between can be divided by one another."""
-_NARROWER = 1.0 - 2.0**-20
-"""A bucket's width in shortest steps: rounding lets no step end in the bucket where it began."""
+_NARROWER = 1.0 - 2.0**-16
+"""A bucket's width in shortest steps: rounding lets no step end in the bucket where it began, on no map
+of `CELLS_MAX` cells."""
 _ENTRIES = 8
 """Of one cell in all buckets: every neighbour improves it once at most."""
+_LOWEST_BIT = np.array([0] + [(byte & -byte).bit_length() - 1 for byte in range(1, 256)])
+"""Of a byte."""
 
 
 @kernel
@@ -94,17 +97,23 @@ def spread_by_buckets(
     until: int,
     least: float,
     value: np.ndarray,
+    around: np.ndarray,
     heads: np.ndarray,
     links: np.ndarray,
     members: np.ndarray,
 ) -> None:
     """Settle all cells, or those up to `until`. `value` is infinite before, and the source passable.
 
+    around: the memory of `value` with a margin at both ends, columns + 1 wide, so that all eight
+    neighbours can be compared without asking first which of them there are: one jump that is hard to
+    foresee instead of sixteen.
+
     A bucket is a chain of entries: `heads` has its first, `links` what follows an entry, `members` an
     entry's cell. When a cell moves to a lower bucket its entry stays in the higher one, and is passed
     over there.
     """
     per = 1.0 / (least * _NARROWER)
+    margin = (around.shape[0] - value.shape[0]) >> 1
     heads[:] = -1
     heads[0], links[0], members[0] = 0, -1, source
     value[source] = 0.0
@@ -124,14 +133,17 @@ def spread_by_buckets(
         if cell == until:
             return
         straight, slant = value[cell] + price[cell], value[cell] + _SLANT * price[cell]
+        better = 0
         for step in range(8):
-            if not (moves[cell] >> step) & 1:
-                continue
+            offer = slant if (_SLANTED >> step) & 1 else straight
+            better |= int(offer < around[margin + cell + offsets[step]]) << step
+        better &= int(moves[cell])
+        while better != 0:
+            step = _LOWEST_BIT[better]
+            better &= better - 1
             n = cell + offsets[step]
             offer = slant if (_SLANTED >> step) & 1 else straight
             had = value[n]
-            if offer >= had:
-                continue
             value[n] = offer
             its = int(offer * per)
             if had < math.inf and int(had * per) == its:
@@ -254,7 +266,8 @@ class Routes:
         if rows < 1 or columns < 1 or rows * columns > CELLS_MAX:
             raise ValueError(f"a grid of {rows} x {columns} cells: 1 to {CELLS_MAX} are possible")
         self.rows, self.columns, self.cells = rows, columns, rows * columns
-        self._value = np.full(self.cells, np.inf)
+        self._around = np.full(self.cells + 2 * (columns + 1), np.inf)
+        self._value = self._around[columns + 1 : -(columns + 1)]
         self._source = -1
         self._price = np.empty(self.cells)
         self._passable = np.zeros((rows + 2, columns + 2), dtype=np.uint8)
@@ -293,7 +306,7 @@ class Routes:
         walk = (self._price, self._moves, self._offsets, int(source), int(until))
         if most <= _RATIO_MAX * least and least >= _LEAST and most <= _MOST:
             room = (self._heads, self._links, self._members)
-            spread_by_buckets(*walk, least, self._value, *room)
+            spread_by_buckets(*walk, least, self._value, self._around, *room)
         else:
             spread_by_heap(*walk, self._value, self._links, self._members)
         return self._value

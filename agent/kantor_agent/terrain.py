@@ -41,7 +41,7 @@ class Terrain:
 
         The value function V of Burgard et al., section 2.2.1. Kept until the chart changes.
         """
-        cost = self.cost
+        cost = self._with(cell, self.cost)
         if cell not in self._travel:
             self._travel[cell] = self._routes.spread(cost, cell).copy()
         return self._travel[cell]
@@ -52,17 +52,24 @@ class Terrain:
         until: cells that are farther than this one may have too high a value.
         """
         cost = np.where(self.chart.cells == UNKNOWN, 1.0, self.cost)
-        return self._routes.spread(cost, cell, until=until).copy()
+        return self._routes.spread(self._with(cell, cost), cell, until=until).copy()
 
     def way(self, cell: int, target: int) -> npt.NDArray[np.int64]:
         """The cells from here to there, both included; empty if there is no way."""
-        self._routes.spread(self.cost, cell, until=target)
+        self._routes.spread(self._with(cell, self.cost), cell, until=target)
         return self._routes.way(target)
 
     def cells_between(self, one: int, other: int) -> float:
         """As the crow flies, in cells."""
         columns = self.frame.columns
         return math.hypot(one // columns - other // columns, one % columns - other % columns)
+
+    def _with(self, cell: int, cost: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """The costs with an open cell where a robot stands: whatever noise says, there is no wall."""
+        if 0 <= cell < cost.shape[0] and not np.isfinite(cost[cell]):
+            cost = cost.copy()
+            cost[cell] = 1.0
+        return cost
 
     def _measured(self) -> npt.NDArray[np.float64]:
         chart, planner = self.chart, self._planner

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.grid import FREE, OCCUPIED, Frame, next_cell
+from kantor_protocol.grid import FREE, NOWHERE, OCCUPIED, Frame, next_cell
 from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import Pose
 from kantor_protocol.scenario import Sensor
@@ -65,6 +65,17 @@ def _touch(
 
 
 @kernel
+def _nearest_border(u: float, v: float, du: float, dv: float, reach: float) -> float:
+    """How far along a beam it leaves a cell, as near as possible to where it ended. All in cells."""
+    column, row, before = int(u), int(v), -math.inf
+    while True:
+        row, column, share = next_cell(row, column, u, v, du, dv)
+        if not share < reach:
+            return before if reach - before <= share - reach else share
+        before = share
+
+
+@kernel
 def _follow_beam(
     u: float,
     v: float,
@@ -79,35 +90,34 @@ def _follow_beam(
     touched: np.ndarray,
     count: int,
 ) -> int:
-    """Touch the cells of one beam. reach, tolerance: in cells.
+    """Touch the cells of one beam. reach, tolerance: in cells; an infinite tolerance stands for noise.
 
-    A wall's face is a border of cells, so what was hit is the cell whose border lies nearest to where the
-    beam ended. Where two borders lie equally near, as at the corner of a cell, it says nothing of either.
+    A wall's face is a border of cells, and the beam ended at it, give or take the tolerance. If it enters
+    just one cell there, this is the wall; if it enters several, as at a corner, it says nothing of
+    them. What it entered before is free. With noise the face is the border nearest to where it ended.
     """
     du, dv = math.cos(angle_rad), math.sin(angle_rad)
-    column, row = int(math.floor(u)), int(math.floor(v))
-    if not (0 <= row < rows and 0 <= column < columns):
+    if not (0.0 <= u < columns and 0.0 <= v < rows):
         return count
-    cell, entered = row * columns + column, -math.inf  # it stands here: no wall
+    if not returned:
+        tolerance = 0.0
+    elif tolerance == math.inf:
+        reach, tolerance = _nearest_border(u, v, du, dv, reach), 0.0
+    column, row = int(u), int(v)
+    count = _touch(row * columns + column, _PASSED, scan, mark, touched, count)  # it stands here
+    wall, entered = NOWHERE, 0
     while True:
         row, column, share = next_cell(row, column, u, v, du, dv)
         inside = 0 <= row < rows and 0 <= column < columns
-        if share > reach or not inside:
+        if not (inside and share <= reach + tolerance):
             break
-        count = _touch(cell, _PASSED, scan, mark, touched, count)
-        cell, entered = row * columns + column, share
-    if not returned:
-        return _touch(cell, _PASSED, scan, mark, touched, count)
-    before, beyond = reach - entered, share - reach
-    if before > tolerance and beyond > tolerance:
-        return count
-    if before <= tolerance and beyond <= tolerance:
-        return count
-    if before <= beyond:
-        return _touch(cell, _HIT, scan, mark, touched, count)
-    count = _touch(cell, _PASSED, scan, mark, touched, count)
-    if inside:
-        count = _touch(row * columns + column, _HIT, scan, mark, touched, count)
+        cell = row * columns + column
+        if share < reach - tolerance or not returned:
+            count = _touch(cell, _PASSED, scan, mark, touched, count)
+        else:
+            wall, entered = cell, entered + 1
+    if entered == 1 and not share <= reach + tolerance:
+        count = _touch(wall, _HIT, scan, mark, touched, count)
     return count
 
 

@@ -40,6 +40,8 @@ class Purpose(enum.IntEnum):
     STARTS = 12
     SUBSET = 13
     MAP = 14
+    SCAN = 15
+    CENTROIDS = 16
     MARKET = 17
 
 

@@ -48,9 +48,7 @@ class Radio:
         return Envelope(source=self._me, sequence=step, target=target, body=encode_news(news))
 
 
-def replica_of(
-    me: ParticipantId, scenario: Scenario, units: Units | None, samples: int
-) -> Replica:
+def replica_of(me: ParticipantId, scenario: Scenario, units: Units | None, samples: int) -> Replica:
     """An empty replica for a participant of a scenario; see Replica."""
     place, origins = scenario.roster.index(me), len(scenario.roster)
     relay, beacon = me == SUPERVISOR, scenario.radio.beacon == "state"

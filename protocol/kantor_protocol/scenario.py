@@ -406,8 +406,7 @@ def rooted(scenario: Scenario, folder: Path) -> Scenario:
 
     return msgspec.structs.replace(
         scenario,
-        map=scenario.map
-        and msgspec.structs.replace(scenario.map, file=place(scenario.map.file)),
+        map=scenario.map and msgspec.structs.replace(scenario.map, file=place(scenario.map.file)),
         samples=msgspec.structs.replace(scenario.samples, file=place(scenario.samples.file)),
         targets=msgspec.structs.replace(scenario.targets, file=place(scenario.targets.file)),
     )
@@ -582,7 +581,12 @@ def _complaints_of_map(scenario: Scenario) -> Iterable[str]:
     if scenario.planner.name not in MAP_PLANNERS:
         known = ", ".join(sorted(MAP_PLANNERS))
         yield f"planner.name: {scenario.planner.name} explores a density; on a map use {known}"
-    if scenario.density or scenario.samples.file or scenario.samples.count or scenario.energy.points:
+    if (
+        scenario.density
+        or scenario.samples.file
+        or scenario.samples.count
+        or scenario.energy.points
+    ):
         yield "map: cannot be joined with a density; remove density, samples and energy"
     if scenario.targets.file is None and scenario.targets.count:
         yield "targets.count: on a map targets come from a file; set targets.file"

@@ -4,9 +4,10 @@ It is one more participant. Robots hear of one another's layers through it, and 
 """
 
 from kantor_agent.chart import Chart
-from kantor_agent.dispatch import Dispatch, member_of, orders_of
+from kantor_agent.dispatch import Dispatch, Patience, orders_of, roll_call
 from kantor_agent.planners.team import Member, Task
 from kantor_agent.terrain import Terrain
+from kantor_protocol.clock import clocks
 from kantor_protocol.evidence import entries
 from kantor_protocol.grid import Frame
 from kantor_protocol.machine import EVERYBODY, Inputs, Outputs, ParticipantId, Pose, State
@@ -30,6 +31,7 @@ class Allocation:
         self._since: dict[int, int] = {}
         self._pose = Pose(*scenario.supervisor_m)
         self._period_ns = scenario.period_ns
+        self._counting_on = Patience.of(scenario, clocks(scenario, seed)[me].period_ns)
         self._step = 0
 
     def step(self, inputs: Inputs, /) -> Outputs:
@@ -38,7 +40,7 @@ class Allocation:
         self._radio.hear(inputs.inbox, self._learn)
         self._chart.fold(self._replica)
         tick = inputs.now_ns // self._period_ns
-        for robot, task in self._dispatch.decide(self._group(), (), tick).items():
+        for robot, task in self._dispatch.decide(*self._roll_call(tick), tick).items():
             self._tasks[robot], self._since[robot] = task, tick
         self._replica.registers.write(orders_of(self._tasks, self._robots, tick))
         outputs = Outputs(
@@ -54,17 +56,15 @@ class Allocation:
     def _learn(self, source: int, news: News) -> bool:
         return self._replica.learn(source, news.have, news.logs, news.claims, news.registers)
 
-    def _group(self) -> list[Member]:
-        """The robots as they are, with the tasks that they have been given."""
-        group = []
-        for robot in range(self._robots):
-            told = member_of(robot, self._replica.registers.values[robot], self._frame.cells)
-            if told is None:
-                self._tasks.pop(robot, None)
-                continue
-            task = self._tasks.get(robot, Task())
-            arrived = told.arrived and told.task.target == task.target
-            group.append(
-                told._replace(task=task, since=self._since.get(robot, 0), arrived=arrived)
-            )
-        return group
+    def _roll_call(self, tick: int) -> tuple[list[Member], list[int]]:
+        """The robots in contact with the tasks that they have been given; the targets of the others."""
+        told, absent = roll_call(
+            self._replica.registers, self._robots, self._frame, tick, self._counting_on
+        )
+        self._tasks = {member.robot: self._tasks.get(member.robot, Task()) for member in told}
+        return [self._as_ordered(member) for member in told], absent
+
+    def _as_ordered(self, told: Member) -> Member:
+        task = self._tasks[told.robot]
+        arrived = told.arrived and told.task.target == task.target
+        return told._replace(task=task, since=self._since.get(told.robot, 0), arrived=arrived)

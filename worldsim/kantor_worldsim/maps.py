@@ -55,9 +55,9 @@ def read(path: str | Path, resolution_m: float | None = None) -> tuple[Ground, l
 
     - `.yaml`, `.yml`: as Nav2's map_server reads it (`_classes`). The file has the resolution.
     - `.map`: MovingAI. `.`, `G` and `S` are free, `@`, `O`, `T` and `W` occupied; 1 m a cell.
-    - `.png`, `.pgm`, `.jpg`, `.jpeg`, `.bmp`, `.tif`, `.tiff`: as Nav2 reads an image in trinary mode with
-      the thresholds that map_saver writes: less bright than 0.35 is occupied, brighter than
-      0.804 is free, between is unknown, and so is Nav2's grey 205; 0.05 m a cell.
+    - `.png`, `.pgm`, `.jpg`, `.jpeg`, `.bmp`, `.tif`, `.tiff`: less bright than 0.35 is occupied,
+      brighter than 0.804 is free, as by the thresholds 0.65 and 0.196 that Nav2 writes. What lies
+      between is unknown, such as its grey 205, and what is not opaque. 0.05 m a cell.
 
     resolution_m: the side of a cell, instead of the format's. The lower left corner is at (0, 0)
     unless a YAML file says otherwise. Raises ScenarioError for what cannot be read, has no free
@@ -86,7 +86,7 @@ def read(path: str | Path, resolution_m: float | None = None) -> tuple[Ground, l
 # Images, as Nav2's map_server reads them.
 
 
-class Nav2(msgspec.Struct, frozen=True):
+class _Nav2(msgspec.Struct, frozen=True):
     """What a YAML file of Nav2's map_server says. Other keys are ignored, as there."""
 
     image: str
@@ -124,7 +124,7 @@ def _from_yaml(path: Path, resolution_m: float | None) -> tuple[Ground, list[str
 
 
 def _from_image(path: Path, resolution_m: float | None) -> tuple[Ground, list[str]]:
-    said = Nav2(
+    said = _Nav2(
         image=path.name,
         resolution=resolution_m or IMAGE_RESOLUTION_M,
         origin=(0.0, 0.0, 0.0),
@@ -132,11 +132,15 @@ def _from_image(path: Path, resolution_m: float | None) -> tuple[Ground, list[st
         free_thresh=0.196,
         negate=False,
     )
-    return _ground(f"map.file: {path}", _picture(path, "map.file:"), said, (0.0, 0.0))
+    picture = _picture(path, "map.file:")
+    ground, traps = _ground(f"map.file: {path}", picture._replace(alpha=None), said, (0.0, 0.0))
+    if picture.alpha is not None:
+        ground.cells[picture.alpha[::-1] < 255] = UNKNOWN
+    return ground, traps
 
 
 def _ground(
-    place: str, picture: _Picture, said: Nav2, origin_m: tuple[float, float]
+    place: str, picture: _Picture, said: _Nav2, origin_m: tuple[float, float]
 ) -> tuple[Ground, list[str]]:
     classes = _classes(picture, said)
     rows, columns = classes.shape
@@ -144,13 +148,13 @@ def _ground(
     return Ground(frame, np.ascontiguousarray(classes[::-1])), _traps(place, picture, said, classes)
 
 
-def _said(path: Path) -> Nav2:
+def _said(path: Path) -> _Nav2:
     """The YAML file, checked."""
     import yaml  # noqa: PLC0415  only where such a map is used
 
     place = f"map.file: {path}"
     try:
-        said = msgspec.convert(yaml.safe_load(path.read_bytes()), Nav2, strict=False)
+        said = msgspec.convert(yaml.safe_load(path.read_bytes()), _Nav2, strict=False)
     except FileNotFoundError:
         raise ScenarioError(f"{place}: no such file") from None
     except msgspec.ValidationError as error:
@@ -166,7 +170,7 @@ def _said(path: Path) -> Nav2:
     return msgspec.structs.replace(said, mode=said.mode.lower())
 
 
-def _complaints(said: Nav2) -> list[str]:
+def _complaints(said: _Nav2) -> list[str]:
     x_m, y_m, yaw_rad = said.origin
     found = []
     if said.mode.lower() not in ("trinary", "scale", "raw"):
@@ -226,7 +230,7 @@ def _pixels(image: "Image") -> _Picture:
     return _Picture(np.asarray(image.convert("RGB")).sum(axis=2, dtype=np.uint16), 3, 255, None)
 
 
-def _classes(picture: _Picture, said: Nav2) -> Cells:
+def _classes(picture: _Picture, said: _Nav2) -> Cells:
     """(rows, columns), top row first: what each pixel says, by `loadMapFromFile` of nav2_map_server.
 
     There brightness is the mean of the channels, in trinary mode with alpha as one of them, and
@@ -248,7 +252,7 @@ def _classes(picture: _Picture, said: Nav2) -> Cells:
     return classes
 
 
-def _by_occupancy(shade: npt.NDArray[np.float64], said: Nav2) -> Cells:
+def _by_occupancy(shade: npt.NDArray[np.float64], said: _Nav2) -> Cells:
     occupancy = shade if said.negate else 1.0 - shade
     free, occupied = occupancy < said.free_thresh, occupancy > said.occupied_thresh
     span = said.occupied_thresh - said.free_thresh
@@ -258,7 +262,7 @@ def _by_occupancy(shade: npt.NDArray[np.float64], said: Nav2) -> Cells:
     return _as_cells(free, occupied)
 
 
-def _by_percent(shade: npt.NDArray[np.float64], said: Nav2) -> Cells:
+def _by_percent(shade: npt.NDArray[np.float64], said: _Nav2) -> Cells:
     percent = np.floor(shade * 255.0 + 0.5)
     free = percent <= np.rint(said.free_thresh * 100.0)
     occupied = (percent >= np.rint(said.occupied_thresh * 100.0)) & (percent <= 100.0)
@@ -269,24 +273,24 @@ def _as_cells(free: npt.NDArray[np.bool_], occupied: npt.NDArray[np.bool_]) -> C
     return np.where(occupied, OCCUPIED, np.where(free, FREE, UNKNOWN)).astype(np.uint8)
 
 
-def _traps(place: str, picture: _Picture, said: Nav2, classes: Cells) -> list[str]:
-    """What Nav2 reads as well, but hardly anybody means."""
+def _traps(place: str, picture: _Picture, said: _Nav2, classes: Cells) -> list[str]:
+    """What Nav2 reads so as well, but hardly anybody means."""
+    if said.mode != "trinary":
+        return []
     found = []
     grey = picture.colour == _GREY_UNKNOWN * picture.channels * (picture.white // 255)
     taken = classes[grey & (classes != UNKNOWN)]
-    if said.mode != "raw" and taken.size:
+    if taken.size:
         found.append(
             f"{place}: {taken.size} pixels of grey 205, which Nav2 writes for unknown, are read as "
             f"{'free' if taken[0] == FREE else 'occupied'}; for unknown give negate: 0, "
             "free_thresh: 0.196 and occupied_thresh: 0.65"
         )
-    if said.mode == "trinary" and picture.alpha is not None:
-        seen = int(((picture.alpha < 255) & (classes != UNKNOWN)).sum())
-        if seen:
-            found.append(
-                f"{place}: {seen} pixels that are not opaque are read as free or occupied, since trinary "
-                "mode takes alpha as one more colour; remove the alpha channel, or give mode: scale"
-            )
+    if picture.alpha is not None and ((picture.alpha < 255) & (classes != UNKNOWN)).any():
+        found.append(
+            f"{place}: pixels that are not opaque are read as free or occupied, since trinary mode "
+            "takes alpha as one more colour; remove the alpha channel, or give mode: scale"
+        )
     return found
 
 

@@ -45,13 +45,14 @@ def starts_on(
             f"robots.count: {count}, but the map has {free.size} free cells in one part; "
             "give fewer robots or a larger map"
         )
+    draws = generator(seed, Purpose.STARTS)
+    cells: Sequence[int] | Numbers
     if spread == "separate":
         places = _on_spots(ground, free, spots, count) if spots else free
-        cells = generator(seed, Purpose.STARTS).choice(places, count, replace=False)
-    elif spots:
-        cells = _around(ground, int(_spread_out(ground, free, spots)[seed % spots]), count)
+        cells = draws.choice(places, count, replace=False)
     else:
-        cells = _around(ground, int(generator(seed, Purpose.STARTS).choice(free)), count)
+        middle = _spread_out(ground, free, spots)[seed % spots] if spots else draws.choice(free)
+        cells = _around(ground, int(middle), count)
     return np.array([ground.frame.centre_of(int(cell)) for cell in cells], dtype=np.float64)
 
 

@@ -254,9 +254,9 @@ def _is_open(terrain: Terrain, goal: int) -> bool:
     return bool(terrain.chart.cells[goal] == UNKNOWN)
 
 
-def _is_reachable(field: Field, here: int, goal: int) -> bool:
-    """Whether a way may lead to a goal; a robot in a place where none begins cannot tell."""
-    return bool(field[goal] < math.inf or field[here] == math.inf)
+def _is_reachable(field: Field, goal: int) -> bool:
+    """Whether a way may lead to a goal."""
+    return bool(field[goal] < math.inf)
 
 
 # All tours in one place.
@@ -292,7 +292,7 @@ class _Exchange:
             self._tours[member.robot] = [
                 goal
                 for goal in self._tours[member.robot]
-                if _is_open(terrain, goal) and _is_reachable(field, member.cell, goal)
+                if _is_open(terrain, goal) and _is_reachable(field, goal)
             ]
 
     def _propose(
@@ -495,7 +495,7 @@ class _Trader:
         return (
             len(self._tour) < self._rules.capacity
             and _is_open(self._terrain, goal)
-            and bool(self._field[goal] < math.inf)
+            and _is_reachable(self._field, goal)
         )
 
     def _insert(self, goal: int) -> None:
@@ -586,8 +586,7 @@ class _Trader:
         if not (due or task.target == NOWHERE) or self._tick < self._turned + self._gap:
             return task.target
         self._turned = self._tick
-        here = self._member.cell
-        self._tour = [held for held in self._tour if _is_reachable(self._field, here, held.goal)]
+        self._tour = [held for held in self._tour if _is_reachable(self._field, held.goal)]
         if not self._tour:
             held, rules = self._held_by_mates(), self._rules
             for goal in rules.propose(self._terrain, self._field, self._me, self._tick, held):
