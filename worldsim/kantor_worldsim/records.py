@@ -7,11 +7,13 @@ seed give the same bytes in process and over the bus.
 
 import msgspec
 
+from kantor_protocol.grid import Frame
 from kantor_protocol.machine import Envelope, Inputs, Observation, Outputs, ParticipantId
 from kantor_protocol.messages import Array
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.weights import Units
 from kantor_worldsim.channel import Verdict
+from kantor_worldsim.maps import Ground
 from kantor_worldsim.world import Found, Ruling, Site
 
 VERSION = 1
@@ -28,6 +30,10 @@ class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
     starts_m: Array
     first_look: dict[ParticipantId, tuple[Found, ...]]
     """Targets seen at time 0."""
+    frame: Frame | None = None
+    """How the cells of the map lie, if there is one."""
+    ground: Array | None = None
+    """(rows, columns) the true map."""
 
     @property
     def site(self) -> Site:
@@ -36,11 +42,16 @@ class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
             self.samples_m.open("<f8", 2),
             self.targets_m.open("<f8", 2),
             self.starts_m.open("<f8", 2),
+            None
+            if self.frame is None or self.ground is None
+            else Ground(self.frame, self.ground.open("|u1", 2)),
         )
 
     @property
     def units(self) -> Units:
-        """The mass of the run."""
+        """The mass of the run; there is none to explore a map."""
+        if self.scenario.mapping:
+            return Units(whole=0, sample=0, point=0)
         return Units.of(self.scenario.energy.points, self.samples_m.shape[0])
 
 
@@ -103,6 +114,8 @@ def opening_of(
         Array.of(site.targets_m),
         Array.of(site.starts_m),
         first_look,
+        None if site.ground is None else site.ground.frame,
+        None if site.ground is None else Array.of(site.ground.cells),
     )
 
 

@@ -14,6 +14,7 @@ from kantor_protocol.scenario import Scenario
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units
 from kantor_worldsim.density import samples_of, starts_of, targets_of
+from kantor_worldsim.maps import Ground
 from kantor_worldsim.sensors import sense_targets
 
 Found = tuple[int, float, float]
@@ -32,6 +33,8 @@ class Site(NamedTuple):
     """(T, 2)"""
     starts_m: npt.NDArray[np.float64]
     """(n, 2)"""
+    ground: Ground | None = None
+    """The true map, in a mission with one."""
 
     @classmethod
     def of(cls, scenario: Scenario, seed: int) -> "Site":
@@ -49,6 +52,8 @@ class Ruling(msgspec.Struct, frozen=True, array_like=True, gc=False):
     found: tuple[Found, ...] = ()
     violations: tuple[str, ...] = ()
     """Rules it broke: `step`, `speed`, `energy`, `units`. The offending part had no effect."""
+    bumps: int = 0
+    """On a map: whether the move ended at a wall."""
 
 
 class _Body:
