@@ -21,7 +21,7 @@ from kantor_protocol.scenario import Scenario
 
 ARRIVED, RESTING = 1, 2
 _CONTACT_PERIODS = 8
-_CELL, _FLAGS, _TARGET, _SINCE, _MEMO = 0, 1, 2, 3, 4
+CELL, FLAGS, TARGET, SINCE, MEMO = 0, 1, 2, 3, 4
 
 
 class Patience(NamedTuple):
@@ -85,7 +85,7 @@ def orders_of(tasks: Mapping[int, Task], robots: int, tick: int) -> list[int]:
 
 def order_in(register: npt.NDArray[np.int64], robot: int, cells: int) -> int:
     """The target that the supervisor has given a robot, or NOWHERE."""
-    target = int(register[_MEMO + robot]) - 1
+    target = int(register[MEMO + robot]) - 1
     return target if 0 <= target < cells else NOWHERE
 
 

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from kantor_agent.chart import Chart
-from kantor_agent.dispatch import Dispatch, Patience, order_in, register_of, roll_call
+from kantor_agent.dispatch import CELL, TARGET, Dispatch, Patience, order_in, register_of, roll_call
 from kantor_agent.navigation import Navigator
 from kantor_agent.planners.team import Member, Task
 from kantor_agent.terrain import Terrain
@@ -60,6 +60,7 @@ class Mapper:
         self._dispatch = Dispatch(scenario, self._terrain, seed, self._me)
         self._navigator = Navigator(self._terrain)
         self._vehicle = VEHICLES[scenario.vehicle.name](scenario.vehicle)
+        self._clearance_cells = 2.0 * scenario.vehicle.radius_m / frame.resolution_m
         self._target = SUPERVISOR if scenario.centralized else EVERYBODY
         self._centralized = scenario.centralized
         self._period_ns = scenario.period_ns
@@ -177,7 +178,7 @@ class Mapper:
         return away_m <= _ON_TARGET_CELLS * self._frame.resolution_m
 
     def _move(self, dt_s: float) -> None:
-        if self._task.target == NOWHERE or self._arrived:
+        if self._task.target == NOWHERE or self._arrived or self._queues():
             return
         place = self._navigator.head(self._pose, self._task.target)
         if place is None:
@@ -185,6 +186,22 @@ class Mapper:
         if self._left == 0 or self._navigator.left < self._left:
             self._progressed, self._left = self._step, self._navigator.left
         self._pose = self._vehicle.drive(self._pose, *place, dt_s)
+
+    def _queues(self) -> bool:
+        """Whether a lower robot on the way to the same target is too close: it goes first.
+
+        Bodies do not merge. Points would, at the next bend, and could never be told apart again.
+        """
+        if self._clearance_cells == 0.0:
+            return False
+        told = self._replica.registers.values
+        here = int(told[self._me, CELL]) - 1
+        return any(
+            told[robot, TARGET] == self._task.target + 1
+            and self._terrain.cells_between(int(told[robot, CELL]) - 1, here)
+            <= self._clearance_cells
+            for robot in range(self._me)
+        )
 
     def _publish(self) -> Outputs:
         if self._resting:
