@@ -480,6 +480,12 @@ class Survey:
         return self.books.union.item(SEEN)
 
     @property
+    def stamps(self) -> npt.NDArray[np.int32]:
+        """(seen,) the ticks at which the cells that count were first seen."""
+        ticks = self.books.first_tick[self._land.counting]
+        return np.asarray(ticks[ticks >= 0])
+
+    @property
     def own_cells(self) -> npt.NDArray[np.int64]:
         """(n,) how many cells each robot has seen itself; a view."""
         return self.books.counts[: len(self.ways_m), OWN_CELLS]
