@@ -4,6 +4,7 @@
 
 planner   CPU time of one planner step, beside the paper's algorithm taken to the letter in numpy
 spectral  the same of multiscale coverage by its modes, and what its registers cost
+routes    CPU time of the value function over a map, beside two other libraries
 fleet     robot-steps that one CPU second buys when the whole fleet is in one process
 peers     the same of other simulators, if they are installed
 lockstep  ticks a second with a process for every robot, beside a bare Zenoh barrier
@@ -24,7 +25,7 @@ from typing import Any
 
 from tables import Table, show
 
-SECTIONS = ("planner", "spectral", "fleet", "peers", "lockstep", "wire")
+SECTIONS = ("planner", "spectral", "routes", "fleet", "peers", "lockstep", "wire")
 LIBRARIES = ("kantor", "eclipse-zenoh", "numpy", "numba", "msgspec")
 
 

@@ -122,11 +122,11 @@ class Chart:
 
     def p_occ(self) -> npt.NDArray[np.float64]:
         """(cells,) probability of a wall, 0.5 where nothing is known."""
-        return _P_OCC[np.sign(self._votes) + 1]
+        return np.asarray(_P_OCC[np.sign(self._votes) + 1])
 
     def explored(self) -> npt.NDArray[np.bool_]:
         """(cells,) known to anybody."""
-        return self.cells != UNKNOWN
+        return np.asarray(self.cells != UNKNOWN)
 
     def metres(self, one: int, other: int) -> float:
         """Between the middles of two cells, as the crow flies."""

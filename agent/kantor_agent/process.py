@@ -3,7 +3,9 @@
 from collections.abc import Callable
 
 from kantor_agent.core import Agent
+from kantor_agent.mapper import Mapper
 from kantor_protocol.credentials import Identity
+from kantor_protocol.machine import StateMachine
 from kantor_protocol.messages import Mission
 from kantor_protocol.process import participate
 
@@ -14,9 +16,11 @@ def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str]
     Raises BusError and NotWantedError.
     """
 
-    def build(mission: Mission) -> Agent:
+    def build(mission: Mission) -> StateMachine:
         starts_m = mission.starts.open("<f8", 2)
         x_m, y_m = starts_m[mission.scenario.robot_ids.index(identity.user)].tolist()
+        if mission.frame is not None:
+            return Mapper(identity.user, mission.scenario, mission.seed, (x_m, y_m), mission.frame)
         samples_m = mission.samples.open("<f8", 2)
         return Agent(identity.user, mission.scenario, mission.seed, (x_m, y_m), samples_m)
 

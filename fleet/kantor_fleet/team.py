@@ -3,8 +3,10 @@
 from collections.abc import Callable, Iterable, Mapping
 
 from kantor_agent.core import Agent
+from kantor_agent.mapper import Mapper
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, StateMachine
 from kantor_protocol.scenario import Scenario
+from kantor_supervisor.allocation import Allocation
 from kantor_supervisor.core import Supervisor
 from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.stage import Listener, Stage
@@ -18,9 +20,14 @@ def team(scenario: Scenario, seed: int, site: Site) -> dict[ParticipantId, State
 
 def participant(name: ParticipantId, scenario: Scenario, seed: int, site: Site) -> StateMachine:
     """One participant as it is at time 0."""
+    frame = site.ground.frame if site.ground is not None else None
     if name == SUPERVISOR:
+        if frame is not None:
+            return Allocation(name, scenario, seed, frame)
         return Supervisor(name, scenario, site.samples_m.shape[0])
     x_m, y_m = site.starts_m[scenario.robot_ids.index(name)].tolist()
+    if frame is not None:
+        return Mapper(name, scenario, seed, (x_m, y_m), frame)
     return Agent(name, scenario, seed, (x_m, y_m), site.samples_m)
 
 

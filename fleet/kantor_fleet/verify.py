@@ -96,7 +96,8 @@ def _verdict_of_execution(
 def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict:
     """The whole run anew, in process, record by record."""
     scenario, seed = opening.scenario, opening.seed
-    from_files = scenario.samples.file or scenario.targets.file
+    world = scenario.map
+    from_files = scenario.samples.file or scenario.targets.file or (world and world.file)
     site = opening.site if from_files else Site.of(scenario, seed)
     expected = iter(payload for payload, _ in records)
     compared, differing = 0, -1

@@ -1,7 +1,7 @@
 """What range scans say about the cells of a map (Burgard et al., eq. 1-3, in log odds), and how it travels.
 
-A scan gives every cell that a beam passes or ends in one piece of evidence: against or for a wall. Sums
-are clamped, so that no cell is ever certain. What a robot tells others is the sign of its sum: an entry
+A scan gives every cell that a beam passes or ends in one piece of evidence: against or for a wall,
+whichever its beams say in sum. Sums are clamped, so that no cell is ever certain. What a robot tells others is the sign of its sum: an entry
 in its log whenever a cell becomes free or occupied to it. The log is append-only and its robot alone
 writes it, so that it is replicated as every other log (`replica.py`), and nobody merges merged maps.
 
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.grid import FREE, OCCUPIED, Frame, next_cell
+from kantor_protocol.grid import FREE, NOWHERE, OCCUPIED, Frame, next_cell
 from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import Pose
 from kantor_protocol.scenario import Sensor
@@ -33,7 +33,9 @@ HIT, PASS, CERTAIN = 85, -40, 294
 """Evidence in 1/100 of log odds: +0.85, -0.40, and at most ln 19 in size (P within [0.05, 0.95])."""
 
 _LEARNT_BEAMS = 8
-_PASSED, _HIT = 0, 1
+_NOISE_CELLS_MAX = 0.5
+"""A wall is looked for this far around where a noisy beam ended, at most: further, and there are always
+several cells to choose from."""
 
 
 def entries(frame: Frame) -> int:
@@ -53,14 +55,13 @@ def beam_rad(heading_rad: float, field_of_view_rad: float, beams: int, beam: int
 
 
 @kernel
-def _touch(
-    cell: int, kind: int, scan: int, mark: np.ndarray, touched: np.ndarray, count: int
-) -> int:
-    """Note that a beam passed or hit a cell; a hit outweighs any number of passes of the same scan."""
-    if mark[cell] < 2 * scan:
+def _touch(cell: int, evidence: int, votes: np.ndarray, touched: np.ndarray, count: int) -> int:
+    """Note what one beam says of a cell."""
+    if votes[cell] == 0:
         touched[count] = cell
         count += 1
-    mark[cell] = max(mark[cell], 2 * scan + kind)
+        votes[cell] = 1  # sums of HIT and PASS are multiples of 5: a touched cell is never at 0
+    votes[cell] += evidence
     return count
 
 
@@ -70,45 +71,34 @@ def _follow_beam(
     v: float,
     angle_rad: float,
     reach: float,
-    returned: bool,
     tolerance: float,
     rows: int,
     columns: int,
-    scan: int,
-    mark: np.ndarray,
+    votes: np.ndarray,
     touched: np.ndarray,
     count: int,
 ) -> int:
-    """Touch the cells of one beam. reach, tolerance: in cells.
+    """Touch the cells of one beam. reach, tolerance: in cells; negative tolerance: nothing was met.
 
-    A wall's face is a border of cells, so what was hit is the cell whose border lies nearest to where the
-    beam ended. Where two borders lie equally near, as at the corner of a cell, it says nothing of either.
+    A wall's face is a border of cells, and the beam ended at it, give or take the tolerance. If it enters
+    just one cell there, this is the wall; if it enters several, as at a corner, it says nothing of
+    them. What it entered before is free.
     """
+    column, row = int(u), int(v)
     du, dv = math.cos(angle_rad), math.sin(angle_rad)
-    column, row = int(math.floor(u)), int(math.floor(v))
-    if not (0 <= row < rows and 0 <= column < columns):
-        return count
-    cell, entered = row * columns + column, -math.inf  # it stands here: no wall
+    count = _touch(row * columns + column, PASS, votes, touched, count)  # it stands here
+    wall, entered = NOWHERE, 0
     while True:
         row, column, share = next_cell(row, column, u, v, du, dv)
-        inside = 0 <= row < rows and 0 <= column < columns
-        if share > reach or not inside:
+        if not share <= reach + max(0.0, tolerance):
             break
-        count = _touch(cell, _PASSED, scan, mark, touched, count)
-        cell, entered = row * columns + column, share
-    if not returned:
-        return _touch(cell, _PASSED, scan, mark, touched, count)
-    before, beyond = reach - entered, share - reach
-    if before > tolerance and beyond > tolerance:
-        return count
-    if before <= tolerance and beyond <= tolerance:
-        return count
-    if before <= beyond:
-        return _touch(cell, _HIT, scan, mark, touched, count)
-    count = _touch(cell, _PASSED, scan, mark, touched, count)
-    if inside:
-        count = _touch(row * columns + column, _HIT, scan, mark, touched, count)
-    return count
+        entered += share >= reach - tolerance
+        if not (0 <= row < rows and 0 <= column < columns):
+            return count
+        wall = row * columns + column
+        if entered == 0:
+            count = _touch(wall, PASS, votes, touched, count)
+    return _touch(wall, HIT, votes, touched, count) if entered == 1 else count
 
 
 @kernel
@@ -122,26 +112,27 @@ def _integrate(
     tolerance: float,
     rows: int,
     columns: int,
-    scan: int,
-    mark: np.ndarray,
+    votes: np.ndarray,
     touched: np.ndarray,
     odds: np.ndarray,
     kinds: np.ndarray,
     changed: np.ndarray,
 ) -> int:
     """Add one scan; how many cells changed their kind, as entries in `changed`."""
-    count = 0
-    for beam in range(codes.shape[0]):
-        angle_rad = beam_rad(heading_rad, field_of_view_rad, codes.shape[0], beam)
-        returned = codes[beam] <= CODES
-        reach = codes[beam] / CODES * range_cells if returned else range_cells
-        count = _follow_beam(
-            u, v, angle_rad, reach, returned, tolerance, rows, columns, scan, mark, touched, count
-        )
+    if not (0.0 <= u < columns and 0.0 <= v < rows):
+        return 0
+    count, beams = 0, codes.shape[0]
+    for beam in range(beams):
+        angle_rad = beam_rad(heading_rad, field_of_view_rad, beams, beam)
+        reach, margin = range_cells, -1.0
+        if codes[beam] <= CODES:
+            reach, margin = codes[beam] / CODES * range_cells, tolerance
+        count = _follow_beam(u, v, angle_rad, reach, margin, rows, columns, votes, touched, count)
     changes = 0
     for i in range(count):
         cell = touched[i]
-        step = HIT if mark[cell] == 2 * scan + _HIT else PASS
+        step = HIT if votes[cell] > 1 else PASS
+        votes[cell] = 0
         odds[cell] = min(CERTAIN, max(-CERTAIN, odds[cell] + step))
         kind = kinds[cell]
         if odds[cell] > 0:
@@ -169,16 +160,16 @@ class Evidence:
         self._beams = sensor.beams
         self._ranges = ranges
         range_cells = sensor.range_m / frame.resolution_m
-        exact = sensor.noise_m == 0.0
+        noise_cells = min(3.0 * sensor.noise_m / frame.resolution_m, _NOISE_CELLS_MAX)
         self._sensor = (
             math.radians(sensor.field_of_view_deg),
             range_cells,
-            range_cells / CODES if exact else math.inf,
+            range_cells / CODES + noise_cells,
             frame.rows,
             frame.columns,
         )
         self._scans = 0
-        self._mark = np.full(cells, -1, dtype=np.int64)
+        self._votes = np.zeros(cells, dtype=np.int32)
         self._touched = np.zeros(cells, dtype=np.int64)
         self._changed = np.zeros(cells, dtype=np.int64)
 
@@ -201,8 +192,7 @@ class Evidence:
             v,
             pose.heading_rad,
             *self._sensor,
-            self._scans,
-            self._mark,
+            self._votes,
             self._touched,
             self.odds,
             self.kinds,

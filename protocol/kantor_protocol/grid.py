@@ -101,7 +101,7 @@ def free_way(
     1.0: the way is free. At a corner both cells beside it must be passable.
     """
     rows, columns = cells.shape
-    column, row = int(math.floor(u)), int(math.floor(v))
+    column, row = math.floor(u), math.floor(v)
     du, dv = to_u - u, to_v - v
     while True:
         last_row, last_column = row, column
@@ -112,7 +112,5 @@ def free_way(
             return max(0.0, share)
         if row == last_row and du != 0.0 and dv != 0.0:  # a corner: the cell above or below as well
             beyond, _, up = next_cell(last_row, last_column, u, v, 0.0, dv)
-            if up == share and (
-                not 0 <= beyond < rows or cells[beyond, last_column] != passable
-            ):
+            if up == share and (not 0 <= beyond < rows or cells[beyond, last_column] != passable):
                 return max(0.0, share)

@@ -39,6 +39,10 @@ class Purpose(enum.IntEnum):
     TARGETS = 11
     STARTS = 12
     SUBSET = 13
+    MAP = 14
+    SCAN = 15
+    CENTROIDS = 16
+    MARKET = 17
 
 
 @kernel

@@ -48,8 +48,8 @@ class Radio:
         return Envelope(source=self._me, sequence=step, target=target, body=encode_news(news))
 
 
-def replica_of(me: ParticipantId, scenario: Scenario, units: Units, samples: int) -> Replica:
-    """An empty replica for a participant of a scenario."""
+def replica_of(me: ParticipantId, scenario: Scenario, units: Units | None, samples: int) -> Replica:
+    """An empty replica for a participant of a scenario; see Replica."""
     place, origins = scenario.roster.index(me), len(scenario.roster)
     relay, beacon = me == SUPERVISOR, scenario.radio.beacon == "state"
     patience = patience_steps(me, scenario)
@@ -58,7 +58,7 @@ def replica_of(me: ParticipantId, scenario: Scenario, units: Units, samples: int
         origins,
         samples,
         units,
-        ledger=scenario.merge == "ledger",
+        ledger=scenario.mapping or scenario.merge == "ledger",
         claims=scenario.claiming,
         relay=relay,
         beacon=beacon,
@@ -67,6 +67,7 @@ def replica_of(me: ParticipantId, scenario: Scenario, units: Units, samples: int
             place,
             origins,
             scenario.register_width,
+            sums=not scenario.mapping,
             relay=relay,
             beacon=beacon,
             patience_steps=patience,

@@ -51,9 +51,7 @@ def add(
 
 
 @kernel
-def _take_head(
-    content: np.ndarray, at: int, origins: int, width: int
-) -> tuple[int, int, int, int]:
+def _take_head(content: np.ndarray, at: int, origins: int, width: int) -> tuple[int, int, int, int]:
     """Read what precedes the numbers of a register: (origin, stamp, numbers, position), or MALFORMED."""
     origin, at = take_uint(content, at)
     stamp, at = take_uint(content, at)

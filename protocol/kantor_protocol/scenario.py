@@ -101,6 +101,8 @@ class Vehicle(_Table, frozen=True, kw_only=True):
     """unicycle: bound on the turn rate."""
     turn_radius_m: Positive = 15.0
     """dubins: the tightest circle."""
+    radius_m: NotNegative = 0.0
+    """On a map: of its body. Robots on the way to the same target keep two radii apart; 0: points."""
 
 
 class Clock(_Table, frozen=True, kw_only=True):
@@ -322,6 +324,11 @@ class Scenario(_Table, frozen=True, kw_only=True):
         return self.claims and self.planner.name == "transport"
 
     @property
+    def learns_ranges(self) -> bool:
+        """Whether robots tell one another some of the ranges that they measure."""
+        return self.planner.name == "burgard" and self.planner.coverage == "histogram"
+
+    @property
     def register_width(self) -> int:
         """Integers in the register by which robots coordinate, at most; 0 for a planner without one."""
         if self.mapping:
@@ -401,8 +408,7 @@ def rooted(scenario: Scenario, folder: Path) -> Scenario:
 
     return msgspec.structs.replace(
         scenario,
-        map=scenario.map
-        and msgspec.structs.replace(scenario.map, file=place(scenario.map.file)),
+        map=scenario.map and msgspec.structs.replace(scenario.map, file=place(scenario.map.file)),
         samples=msgspec.structs.replace(scenario.samples, file=place(scenario.samples.file)),
         targets=msgspec.structs.replace(scenario.targets, file=place(scenario.targets.file)),
     )
@@ -577,8 +583,15 @@ def _complaints_of_map(scenario: Scenario) -> Iterable[str]:
     if scenario.planner.name not in MAP_PLANNERS:
         known = ", ".join(sorted(MAP_PLANNERS))
         yield f"planner.name: {scenario.planner.name} explores a density; on a map use {known}"
-    if scenario.density or scenario.samples.file or scenario.samples.count or scenario.energy.points:
+    if (
+        scenario.density
+        or scenario.samples.file
+        or scenario.samples.count
+        or scenario.energy.points
+    ):
         yield "map: cannot be joined with a density; remove density, samples and energy"
+    if scenario.vehicle.name == "dubins":
+        yield "vehicle.name: dubins cannot stop at a wall; use first-order, second-order or unicycle"
     if scenario.targets.file is None and scenario.targets.count:
         yield "targets.count: on a map targets come from a file; set targets.file"
     if not scenario.starts.random and len(scenario.starts.poses_m) != scenario.robots.count:

@@ -85,7 +85,7 @@ def test_unsound_registers_are_refused_with_all_that_came_with_them() -> None:
     units = Units.of(30, 12)
     held = replica_of("r1", mission("planner=spectral", "planner.modes=1"), units, 12)
     logs = bytes([1, 0, 1, 1, 2 * 3, 2])
-    register = bytes([0, 1, 0, 1, 1, 2 * 9])
+    register = bytes([0, 1, 0, 1, 1, 1, 2 * 9])
 
     assert not held.learn(1, bytes(3), logs, b"", register + b"\x80")
     assert not held.learn(1, bytes(3), b"\x80", b"", register)

@@ -53,9 +53,9 @@ def leb128(value: int) -> bytes:
 
 
 def register(origin: int, stamp: int, *numbers: int) -> bytes:
-    """Origin, stamp, zigzag-folded numbers."""
+    """Origin, stamp, how many numbers, the numbers zigzag-folded."""
     folded = (2 * number if number >= 0 else -2 * number - 1 for number in numbers)
-    return b"".join(leb128(value) for value in (origin, stamp, *folded))
+    return b"".join(leb128(value) for value in (origin, stamp, len(numbers), *folded))
 
 
 def content(stamps: list[int], *registers: bytes) -> bytes:
@@ -349,3 +349,48 @@ def test_the_newest_wins_in_any_order(stamps: list[int]) -> None:
 
     assert one.values[1].tolist() == [50, 5, -5]
     assert one.total.tolist() == [50, 5, -5]
+
+
+# Registers that are written, not added to.
+
+
+def test_a_register_is_replaced_and_loses_its_zeros() -> None:
+    """The newest whole value holds, shorter ones too; zeros at the end are not sent."""
+    one = Registers(0, 2, WIDTH, sums=False)
+    two = Registers(1, 2, WIDTH, sums=False)
+    hear(one, 1, two.compose())
+    one.write([-7, 9, 4])
+    hear(two, 0, one.compose())
+    assert two.values[0].tolist() == [-7, 9, 4]
+    one.end_step()
+    one.write([5])
+
+    said = one.compose()
+    assert said == content([2, 0], register(0, 2, 5))
+    hear(two, 0, said)
+    assert (two.values[0].tolist(), two.total.tolist()) == ([5, 0, 0], [5, 0, 0])
+    assert (one.values[0].tolist(), one.total.tolist()) == ([5, 0, 0], [5, 0, 0])
+
+
+def test_age_tells_how_long_nothing_new_came() -> None:
+    """In own steps; negative while nothing was ever heard. Old news do not renew it."""
+    one = Registers(0, 2, WIDTH, sums=False)
+    two = Registers(1, 2, WIDTH, sums=False)
+    assert one.age_steps(1) < 0
+    hear(two, 0, one.compose())
+    two.write([1])
+    said = two.compose()
+    hear(one, 1, said)
+    assert one.age_steps(1) == 0
+    for _ in range(3):
+        one.end_step()
+    hear(one, 1, said)
+    assert one.age_steps(1) == 3
+
+
+def test_more_numbers_than_a_register_has_are_refused() -> None:
+    """Whoever writes too much is not understood."""
+    held = Registers(0, 2, WIDTH, sums=False)
+
+    assert not held.sound(content([0, 1], register(1, 1, 1, 2, 3, 4)))
+    assert held.sound(content([0, 1], register(1, 1, 1, -2, 3)))

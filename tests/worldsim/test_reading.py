@@ -231,7 +231,9 @@ _ALL_FIELDS = News(1, 0, 0.0, 0.0, b"", b"", b"\x00", b"\x00")
 
 
 @examples(200)
-@example(news=_ALL_FIELDS, at=len(encode(_ALL_FIELDS)) - 3, byte=0xA1, cut=0)  # a text for registers
+@example(
+    news=_ALL_FIELDS, at=len(encode(_ALL_FIELDS)) - 3, byte=0xA1, cut=0
+)  # a text for registers
 @given(news=NEWS, at=st.integers(0, 200), byte=st.integers(0, 255), cut=st.integers(0, 30))
 def test_news_is_read_as_the_codec_does(news: News, at: int, byte: int, cut: int) -> None:
     """Sound messages, messages with one byte changed, cut messages: the same parts or none.

@@ -1,7 +1,7 @@
 """The radio: who hears an envelope, when, and what gets lost. The only place that knows range.
 
 Range is between true poses at the time of sending, which is when a step begins: after the inbox was
-taken in, before the move. Every draw is keyed by (seed, purpose, link, sequence, copy): it depends on
+taken in, before the move. On a map walls between two poses may shorten it or end it. Every draw is keyed by (seed, purpose, link, sequence, copy): it depends on
 nothing that happened before, so one more message or one more robot changes no other draw.
 """
 
@@ -16,7 +16,9 @@ import numpy as np
 from kantor_protocol.kernels import kernel
 from kantor_protocol.keyed import Purpose, uniform
 from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
-from kantor_protocol.scenario import Scenario
+from kantor_protocol.scenario import Radio, Scenario
+from kantor_worldsim.maps import Ground
+from kantor_worldsim.sensors import walls_between
 
 _LINK_WIDTH = 4096
 """Links are numbered source * width + target; the roster is smaller, the supervisor comes last."""
@@ -58,6 +60,69 @@ class _Law(NamedTuple):
     duplicate: float
     reorder: float
     reorder_ns: int
+    supervisor_stands: bool
+    """It has a place on the map, so that walls may stand before it."""
+
+
+class Walls(NamedTuple):
+    """What the radio minds of a map."""
+
+    left_m: float
+    bottom_m: float
+    resolution_m: float
+    line_of_sight: bool
+    loss_m: float
+    """Of range, for each wall."""
+    cells: np.ndarray
+    """(rows, columns), or nothing where walls do not matter."""
+
+    @classmethod
+    def of(cls, radio: Radio, ground: Ground | None) -> "Walls":
+        """Of a scenario's radio on a map, if there is one."""
+        if ground is None or not (radio.line_of_sight or radio.wall_loss_m > 0.0):
+            return OPEN
+        frame, cells = ground
+        return cls(
+            *frame.origin_m, frame.resolution_m, radio.line_of_sight, radio.wall_loss_m, cells
+        )
+
+
+OPEN = Walls(0.0, 0.0, 1.0, False, 0.0, np.zeros((0, 0), dtype=np.uint8))
+"""No walls."""
+
+
+@kernel
+def _in_range(
+    left_m: float,
+    bottom_m: float,
+    resolution_m: float,
+    line_of_sight: bool,
+    loss_m: float,
+    cells: np.ndarray,
+    xy_m: np.ndarray,
+    one: int,
+    other: int,
+    range_m: float,
+    through: bool,
+) -> bool:
+    """Whether two participants hear each other. xy_m: (n, 2); through: whatever stands between."""
+    dx = xy_m[other, 0] - xy_m[one, 0]
+    dy = xy_m[other, 1] - xy_m[one, 1]
+    if not dx * dx + dy * dy <= range_m * range_m:  # nor when a place is unknown
+        return False
+    if through or cells.shape[0] == 0:
+        return True
+    walls = walls_between(
+        cells,
+        (xy_m[one, 0] - left_m) / resolution_m,
+        (xy_m[one, 1] - bottom_m) / resolution_m,
+        (xy_m[other, 0] - left_m) / resolution_m,
+        (xy_m[other, 1] - bottom_m) / resolution_m,
+    )
+    if line_of_sight and walls > 0:
+        return False
+    range_m -= walls * loss_m
+    return range_m >= 0.0 and dx * dx + dy * dy <= range_m * range_m
 
 
 @kernel
@@ -84,6 +149,13 @@ def _transmit(
     duplicate: float,
     reorder: float,
     reorder_ns: int,
+    supervisor_stands: bool,
+    left_m: float,
+    bottom_m: float,
+    resolution_m: float,
+    line_of_sight: bool,
+    loss_m: float,
+    cells: np.ndarray,
     xy_m: np.ndarray,
     sent: np.ndarray,
     envelopes: int,
@@ -105,7 +177,9 @@ def _transmit(
         duplicate,
         reorder,
         reorder_ns,
+        supervisor_stands,
     )
+    walls = (left_m, bottom_m, resolution_m, line_of_sight, loss_m, cells)
     receiver, which, due_ns = ruled[:, 0], ruled[:, 1], ruled[:, 2]
     count = 0
     out_of_range = 0
@@ -116,9 +190,8 @@ def _transmit(
                 continue
             by_supervisor = supervisor in (other, source)
             range_m = law.supervisor_range_m if by_supervisor else law.range_m
-            dx = xy_m[other, 0] - xy_m[source, 0]
-            dy = xy_m[other, 1] - xy_m[source, 1]
-            if not dx * dx + dy * dy <= range_m * range_m:  # nor when a place is unknown
+            through = by_supervisor and not law.supervisor_stands
+            if not _in_range(*walls, xy_m, source, other, range_m, through):
                 out_of_range += 1
                 continue
             here = _LINK_WIDTH - 1 if source == supervisor else source
@@ -145,8 +218,9 @@ def _transmit(
 class Channel:
     """Rules on transmissions and holds what is under way."""
 
-    def __init__(self, scenario: Scenario, seed: int) -> None:
+    def __init__(self, scenario: Scenario, seed: int, ground: Ground | None = None) -> None:
         radio = scenario.radio
+        self._walls = Walls.of(radio, ground)
         self._roster = scenario.roster
         self._places = {name: i for i, name in enumerate(scenario.roster)}
         self._targets = {**self._places, EVERYBODY: -1}
@@ -161,6 +235,7 @@ class Channel:
             radio.duplicate,
             radio.reorder,
             round(radio.reorder_s * 1e9),
+            scenario.supervisor.pose_m is not None,
         )
         self._xy_m = np.full((len(scenario.roster), 2), np.inf)
         self._under_way: dict[ParticipantId, list[tuple[int, int, int, Envelope]]] = {
@@ -194,7 +269,13 @@ class Channel:
             target = targets.get(envelope.target, nowhere)
             _SENT.pack_into(self._sent_bytes, _SENT.size * i, now_ns, source, sequence, target)
         count, out_of_range = _transmit(
-            *self._law, self._xy_m, self._sent, len(sent), self._supervisor, self._ruled
+            *self._law,
+            *self._walls,
+            self._xy_m,
+            self._sent,
+            len(sent),
+            self._supervisor,
+            self._ruled,
         )
         verdicts = []
         for to, row, due_ns in _RULED.iter_unpack(self._ruled_bytes[: _RULED.size * count]):
@@ -233,17 +314,25 @@ class Channel:
             self._ruled_bytes = self._ruled.data.cast("B")
 
 
-def links(xy_m: np.ndarray, range_m: float) -> int:
-    """Pairs of robots within range of each other. xy_m: (n, 2)."""
-    return int(_links(xy_m, range_m))
+def links(xy_m: np.ndarray, range_m: float, walls: Walls = OPEN) -> int:
+    """Pairs of robots that hear each other. xy_m: (n, 2)."""
+    return int(_links(*walls, xy_m, range_m))
 
 
 @kernel
-def _links(xy_m: np.ndarray, range_m: float) -> int:
+def _links(
+    left_m: float,
+    bottom_m: float,
+    resolution_m: float,
+    line_of_sight: bool,
+    loss_m: float,
+    cells: np.ndarray,
+    xy_m: np.ndarray,
+    range_m: float,
+) -> int:
+    walls = (left_m, bottom_m, resolution_m, line_of_sight, loss_m, cells)
     count = 0
     for i in range(xy_m.shape[0]):
         for j in range(i):
-            dx = xy_m[i, 0] - xy_m[j, 0]
-            dy = xy_m[i, 1] - xy_m[j, 1]
-            count += dx * dx + dy * dy <= range_m * range_m
+            count += _in_range(*walls, xy_m, i, j, range_m, False)
     return count

@@ -177,6 +177,7 @@ class _Doorway:
             self._starts,
             self._samples,
             plan.exchange,
+            plan.site.ground and plan.site.ground.frame,
         )
         self.host.send(event.name, encode(mission), patiently=True)
 

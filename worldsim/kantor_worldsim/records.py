@@ -9,12 +9,12 @@ import msgspec
 
 from kantor_protocol.grid import Frame
 from kantor_protocol.machine import Envelope, Inputs, Observation, Outputs, ParticipantId
-from kantor_protocol.messages import Array
+from kantor_protocol.messages import Array, RefusedError
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.weights import Units
 from kantor_worldsim.channel import Verdict
 from kantor_worldsim.maps import Ground
-from kantor_worldsim.world import Found, Ruling, Site
+from kantor_worldsim.world import Found, Ruling, Site, units_of
 
 VERSION = 1
 
@@ -30,29 +30,34 @@ class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
     starts_m: Array
     first_look: dict[ParticipantId, tuple[Found, ...]]
     """Targets seen at time 0."""
-    frame: Frame | None = None
-    """How the cells of the map lie, if there is one."""
     ground: Array | None = None
-    """(rows, columns) the true map."""
+    """(rows, columns) uint8: the true map, if the robots explore one; see `grid.py`."""
+    frame: Frame | None = None
+    """How its cells lie."""
 
     @property
     def site(self) -> Site:
-        """The arrays of the opening."""
+        """The arrays of the opening. Raises RefusedError."""
         return Site(
             self.samples_m.open("<f8", 2),
             self.targets_m.open("<f8", 2),
             self.starts_m.open("<f8", 2),
-            None
-            if self.frame is None or self.ground is None
-            else Ground(self.frame, self.ground.open("|u1", 2)),
+            self._ground,
         )
 
     @property
+    def _ground(self) -> Ground | None:
+        if self.ground is None or self.frame is None:
+            return None
+        if self.ground.shape != (self.frame.rows, self.frame.columns):
+            raise RefusedError(f"map of shape {self.ground.shape} in a frame of another")
+        # A copy: kernels are compiled for arrays that may be written.
+        return Ground(self.frame, self.ground.open("u1", 2).copy())
+
+    @property
     def units(self) -> Units:
-        """The mass of the run; there is none to explore a map."""
-        if self.scenario.mapping:
-            return Units(whole=0, sample=0, point=0)
-        return Units.of(self.scenario.energy.points, self.samples_m.shape[0])
+        """The mass of the run."""
+        return units_of(self.scenario, self.samples_m.shape[0])
 
 
 class Act(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -106,6 +111,7 @@ def opening_of(
     scenario: Scenario, seed: int, site: Site, first_look: dict[ParticipantId, tuple[Found, ...]]
 ) -> Opening:
     """The first record of a run."""
+    ground = site.ground
     return Opening(
         VERSION,
         scenario,
@@ -114,8 +120,8 @@ def opening_of(
         Array.of(site.targets_m),
         Array.of(site.starts_m),
         first_look,
-        None if site.ground is None else site.ground.frame,
-        None if site.ground is None else Array.of(site.ground.cells),
+        ground and Array.of(ground.cells),
+        ground and ground.frame,
     )
 
 

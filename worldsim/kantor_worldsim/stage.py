@@ -34,7 +34,7 @@ class Stage:
         self.scenario = scenario
         self.now_ns = 0
         self.limit_ns = scenario.limit_ns
-        self.channel = Channel(scenario, seed)
+        self.channel = Channel(scenario, seed, site.ground)
         self._robots = frozenset(scenario.robot_ids)
         self._world = World(scenario, seed, site)
         self._listeners = tuple(listeners)

@@ -1,0 +1,222 @@
+"""A robot that explores an unknown map: one pure state machine.
+
+A step: take in the inbox and the observation; decide on what is known to all in contact; add the scan to
+the own layer; move; publish. What the scan of this step shows is published with it, so that the next
+decision of everybody rests on the same knowledge, one step old, as the supervisor's does.
+"""
+
+import math
+
+import numpy as np
+
+from kantor_agent.chart import Chart
+from kantor_agent.dispatch import CELL, TARGET, Dispatch, Patience, order_in, register_of, roll_call
+from kantor_agent.navigation import Navigator
+from kantor_agent.planners.team import Member, Task
+from kantor_agent.terrain import Terrain
+from kantor_agent.vehicles import VEHICLES
+from kantor_protocol.evidence import Evidence, entries, void
+from kantor_protocol.grid import NOWHERE, Frame
+from kantor_protocol.machine import (
+    EVERYBODY,
+    SUPERVISOR,
+    Inputs,
+    Observation,
+    Outputs,
+    ParticipantId,
+    Pose,
+    State,
+)
+from kantor_protocol.messages import News
+from kantor_protocol.radio import Radio, replica_of
+from kantor_protocol.scenario import Scenario
+
+_SURE_STEPS = 3
+"""So many steps in a row without a frontier end the mission of a robot."""
+_ON_TARGET_CELLS = 0.75
+"""It has arrived when its target's middle is so near."""
+
+
+class Mapper:
+    """A robot of a scenario with a map. `step` is its only entrance."""
+
+    def __init__(
+        self,
+        me: ParticipantId,
+        scenario: Scenario,
+        seed: int,
+        start_m: tuple[float, float],
+        frame: Frame,
+    ) -> None:
+        """start_m: world frame, at time 0. frame: how the cells lie, not what is in them."""
+        self._me = scenario.roster.index(me)
+        self._frame = frame
+        self._robots = scenario.robots.count
+        self._replica = replica_of(me, scenario, None, entries(frame))
+        self._radio = Radio(me, scenario.roster)
+        self._chart = Chart(frame, len(scenario.roster))
+        self._terrain = Terrain(scenario, self._chart)
+        self._evidence = Evidence(frame, scenario.sensor, ranges=scenario.learns_ranges)
+        self._dispatch = Dispatch(scenario, self._terrain, seed, self._me)
+        self._navigator = Navigator(self._terrain)
+        self._vehicle = VEHICLES[scenario.vehicle.name](scenario.vehicle)
+        self._clearance_cells = 2.0 * scenario.vehicle.radius_m / frame.resolution_m
+        self._target = SUPERVISOR if scenario.centralized else EVERYBODY
+        self._centralized = scenario.centralized
+        self._period_ns = scenario.period_ns
+        self._counting_on = Patience.of(scenario, scenario.period_ns)
+        self._patience = scenario.planner.patience
+        self._now_ns = 0
+        self._step = 0
+        self._pose = Pose(*start_m)
+        self._scanned_step = -1
+        self._scanned_pose: Pose | None = None
+        self._task, self._since, self._arrived = Task(), 0, False
+        self._progressed, self._left = 0, 0
+        self._without = 0
+        self._resting = False
+
+    def step(self, inputs: Inputs, /) -> Outputs:
+        """One step; see the module."""
+        self._radio.hear(inputs.inbox, self._learn)
+        self._locate(inputs.observation)
+        elapsed_ns = min(inputs.now_ns - self._now_ns, self._period_ns)
+        self._now_ns, self._step = inputs.now_ns, self._step + 1
+        self._chart.fold(self._replica)
+        self._give_up()
+        if not self._resting:
+            self._decide()
+        self._look(inputs.observation)
+        if not self._resting:
+            self._move(elapsed_ns * 1e-9)
+        return self._publish()
+
+    @property
+    def _tick(self) -> int:
+        return self._now_ns // self._period_ns
+
+    def _learn(self, source: int, news: News) -> bool:
+        return self._replica.learn(source, news.have, news.logs, news.claims, news.registers)
+
+    def _locate(self, observation: Observation) -> None:
+        """Take the pose that the world accepted. A late word on an older step changes nothing."""
+        if observation.step == self._step:
+            self._pose = observation.pose
+
+    # Deciding.
+
+    def _give_up(self) -> None:
+        """Tell of a target that showed or led to nothing, before there is another target."""
+        target = self._task.target
+        in_vain = self._arrived and self._chart.is_frontier(target)
+        stuck = not self._arrived and self._step - self._progressed > self._patience
+        if target != NOWHERE and not self._chart.void[target] and (in_vain or stuck):
+            self._replica.append(np.array([void(self._frame, target)]))
+            self._progressed = self._step
+
+    def _decide(self) -> None:
+        """Take a new task, if there is one; rest when no frontier can be reached."""
+        registers = self._replica.registers
+        supervisor = registers.values.shape[0] - 1
+        if (
+            self._centralized
+            and 0 <= registers.age_steps(supervisor) <= self._counting_on.contact_steps
+        ):
+            self._obey(order_in(registers.values[supervisor], self._me, self._frame.cells))
+        elif registers.stamps[self._me] > 0:
+            self._choose()
+        self._without = 0 if self._may_go_on() else self._without + 1
+        self._resting = self._without >= _SURE_STEPS
+
+    def _obey(self, target: int) -> None:
+        if target != self._task.target:
+            self._take(Task(target))
+
+    def _choose(self) -> None:
+        registers = self._replica.registers
+        group, absent = roll_call(
+            registers, self._robots, self._frame, self._tick, self._counting_on
+        )
+        task = self._dispatch.decide(group, absent, self._tick).get(self._me)
+        if task is not None:
+            self._take(task)
+
+    def _take(self, task: Task) -> None:
+        if task.target != self._task.target:
+            self._arrived = False
+            self._progressed, self._left = self._step, 0
+        self._task, self._since = task, self._tick
+
+    def _may_go_on(self) -> bool:
+        """Whether there may still be something for this robot to do."""
+        if self._step <= _SURE_STEPS:
+            return True
+        frontiers = self._chart.frontiers
+        if not frontiers.size:
+            return False
+        if self._task.target != NOWHERE and self._chart.is_frontier(self._task.target):
+            return True
+        cell = self._frame.cell_of(self._pose.x_m, self._pose.y_m)
+        return bool(np.isfinite(self._terrain.travel(cell)[frontiers]).any())
+
+    # Acting.
+
+    def _look(self, observation: Observation) -> None:
+        """Add the scan to the own layer, once."""
+        if observation.step != self._scanned_step:
+            self._scanned_step = observation.step
+            moved = observation.pose != self._scanned_pose
+            self._scanned_pose = observation.pose
+            self._replica.append(
+                self._evidence.take(observation.scan, observation.pose, moved=moved)
+            )
+        self._arrived = self._task.target != NOWHERE and self._is_at(self._task.target)
+
+    def _is_at(self, cell: int) -> bool:
+        x_m, y_m = self._frame.centre_of(cell)
+        away_m = math.hypot(self._pose.x_m - x_m, self._pose.y_m - y_m)
+        return away_m <= _ON_TARGET_CELLS * self._frame.resolution_m
+
+    def _move(self, dt_s: float) -> None:
+        if self._task.target == NOWHERE or self._arrived or self._queues():
+            return
+        place = self._navigator.head(self._pose, self._task.target)
+        if place is None:
+            return
+        if self._left == 0 or self._navigator.left < self._left:
+            self._progressed, self._left = self._step, self._navigator.left
+        self._pose = self._vehicle.drive(self._pose, *place, dt_s)
+
+    def _queues(self) -> bool:
+        """Whether a lower robot on the way to the same target is too close: it goes first.
+
+        Bodies do not merge. Points would, at the next bend, and could never be told apart again.
+        """
+        if self._clearance_cells == 0.0:
+            return False
+        told = self._replica.registers.values
+        here = int(told[self._me, CELL]) - 1
+        return any(
+            told[robot, TARGET] == self._task.target + 1
+            and self._terrain.cells_between(int(told[robot, CELL]) - 1, here)
+            <= self._clearance_cells
+            for robot in range(self._me)
+        )
+
+    def _publish(self) -> Outputs:
+        if self._resting:
+            self._task = Task()
+        cell = self._frame.cell_of(self._pose.x_m, self._pose.y_m)
+        me = Member(self._me, cell, self._task, self._since, self._arrived)
+        self._replica.registers.write(register_of(me, resting=self._resting))
+        envelope = self._radio.say(self._replica, self._target, self._step, self._pose)
+        self._replica.end_step()
+        target = self._task.target
+        return Outputs(
+            step=self._step,
+            pose=self._pose,
+            goal=None if target == NOWHERE else self._frame.centre_of(target),
+            outbox=(envelope,),
+            state=State.FINISHED if self._resting else State.EXPLORING,
+            refused=self._radio.refused,
+        )

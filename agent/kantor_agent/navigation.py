@@ -1,0 +1,69 @@
+"""From a target cell to the next place to head for, round the walls that are known."""
+
+import numpy as np
+import numpy.typing as npt
+
+from kantor_agent.terrain import Terrain
+from kantor_protocol.grid import FREE, NOWHERE, free_way
+from kantor_protocol.kernels import kernel
+from kantor_protocol.machine import Pose
+
+_AHEAD_CELLS = 64
+"""How far along its way a robot looks for a shortcut."""
+
+
+@kernel
+def _farthest_in_sight(cells: np.ndarray, way: np.ndarray, first: int, u: float, v: float) -> int:
+    """The last place along the way to which a straight line is free, or -1; cells: (rows, columns)."""
+    columns = cells.shape[1]
+    last = -1
+    for i in range(first, min(way.shape[0], first + _AHEAD_CELLS)):
+        row, column = way[i] // columns, way[i] % columns
+        if free_way(cells, FREE, u, v, column + 0.5, row + 0.5) < 1.0:
+            break
+        last = i
+    return last
+
+
+class Navigator:
+    """Keeps the way to the target, and cuts its corners where nothing stands in between."""
+
+    def __init__(self, terrain: Terrain) -> None:
+        self._terrain = terrain
+        self._frame = terrain.frame
+        self._target = NOWHERE
+        self._way: npt.NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self._passed = 0
+
+    @property
+    def left(self) -> int:
+        """Cells of the way that are left; falls as the robot gets on."""
+        return int(self._way.shape[0]) - self._passed
+
+    def head(self, pose: Pose, target: int) -> tuple[float, float] | None:
+        """Where to head for, world frame; None if no way is known."""
+        cell = self._frame.cell_of(pose.x_m, pose.y_m)
+        if cell == NOWHERE:
+            return None
+        ahead = self._look_ahead(pose) if target == self._target else -1
+        if ahead < 0:
+            self._target, self._passed = target, 0
+            self._way = self._terrain.way(cell, target)
+            ahead = self._look_ahead(pose)
+        if ahead < 0:
+            self._target = NOWHERE
+            return None
+        self._passed = ahead
+        return self._frame.centre_of(int(self._way[ahead]))
+
+    def _look_ahead(self, pose: Pose) -> int:
+        frame = self._frame
+        return int(
+            _farthest_in_sight(
+                self._terrain.chart.cells.reshape(frame.rows, frame.columns),
+                self._way,
+                self._passed,
+                (pose.x_m - frame.origin_m[0]) / frame.resolution_m,
+                (pose.y_m - frame.origin_m[1]) / frame.resolution_m,
+            )
+        )

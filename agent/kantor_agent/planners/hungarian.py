@@ -1,0 +1,99 @@
+"""The cheapest assignment of robots to frontiers, by the Hungarian method: no utilities, costs alone.
+
+Neighbouring frontiers cost nearly the same, so that robots would drive side by side to one opening. Robots
+are therefore assigned to frontiers that lie half a sensor range apart, and from what others head for.
+"""
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import linear_sum_assignment
+
+from kantor_agent.planners.team import Situation, Task
+from kantor_protocol.grid import NOWHERE
+from kantor_protocol.kernels import kernel
+from kantor_protocol.scenario import Scenario
+
+_APART = 0.5
+"""Of the sensor's range, from one frontier to choose from to the next."""
+
+
+@kernel
+def spread_out(
+    frontiers: np.ndarray,
+    order: np.ndarray,
+    taken: np.ndarray,
+    apart: float,
+    columns: int,
+    kept: np.ndarray,
+) -> int:
+    """Keep frontiers[order[i]], one after another, that lie `apart` cells from all kept and taken; how many.
+
+    kept: (k,) room for places in `frontiers`.
+    """
+    count = 0
+    for i in range(order.shape[0]):
+        cell = frontiers[order[i]]
+        row, column = cell // columns, cell % columns
+        near = False
+        for j in range(taken.shape[0] + count):
+            at = taken[j] if j < taken.shape[0] else frontiers[kept[j - taken.shape[0]]]
+            rise, run = at // columns - row, at % columns - column
+            if rise * rise + run * run < apart * apart:
+                near = True
+                break
+        if not near:
+            kept[count] = order[i]
+            count += 1
+    return count
+
+
+class Hungarian:
+    """Robots without a frontier of their own drive to their cheapest."""
+
+    negotiates = False
+
+    def __init__(self, _scenario: Scenario, _seed: int, _me: int | None) -> None:
+        """The strategy has no options."""
+
+    def assign(self, situation: Situation, /) -> list[Task]:
+        """A frontier for each member; none for those that can reach none."""
+        terrain, frontiers = situation.terrain, situation.frontiers
+        if frontiers.size == 0:
+            return [Task() for _ in situation.members]
+        ways = [terrain.travel(member.cell)[frontiers] for member in situation.members]
+        travel = np.array(ways)
+        picked = travel.argmin(axis=1)
+        spots = _spots(situation, travel.min(axis=0))
+        for robot, spot in _cheapest(travel[:, spots]):
+            picked[robot] = spots[spot]
+        reached = np.isfinite(travel[np.arange(picked.size), picked]).tolist()
+        cells = frontiers[picked].tolist()
+        return [Task(cell) if can else Task() for cell, can in zip(cells, reached, strict=True)]
+
+
+def _spots(situation: Situation, cheapest: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """Places in `frontiers`, apart from one another, the cheapest (f,) for anybody first."""
+    held = [member.task.target for member in situation.others]
+    taken = [target for target in (*held, *situation.absent) if target != NOWHERE]
+    order = np.argsort(cheapest, kind="stable")[: np.isfinite(cheapest).sum()]
+    kept = np.empty_like(order)
+    count = spread_out(
+        situation.frontiers,
+        order,
+        np.array(taken, dtype=np.int64),
+        _APART * situation.terrain.sensor_cells,
+        situation.terrain.frame.columns,
+        kept,
+    )
+    return kept[:count]
+
+
+def _cheapest(travel: npt.NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Pairs (robot, spot): as many as can be, of least total cost. travel: (robots, spots)."""
+    possible = np.isfinite(travel)
+    if not possible.any():
+        return []
+    never = (min(travel.shape) + 1.0) * (travel[possible].max() + 1.0)
+    robots, spots = linear_sum_assignment(np.where(possible, travel, never))
+    pairs = zip(robots.tolist(), spots.tolist(), strict=True)
+    return [pair for pair in pairs if possible[pair]]

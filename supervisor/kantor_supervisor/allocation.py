@@ -1,0 +1,70 @@
+"""The supervisor of a mission with a map: it gathers all layers and gives every robot its target.
+
+It is one more participant. Robots hear of one another's layers through it, and drive by their own charts.
+"""
+
+from kantor_agent.chart import Chart
+from kantor_agent.dispatch import Dispatch, Patience, orders_of, roll_call
+from kantor_agent.planners.team import Member, Task
+from kantor_agent.terrain import Terrain
+from kantor_protocol.clock import clocks
+from kantor_protocol.evidence import entries
+from kantor_protocol.grid import Frame
+from kantor_protocol.machine import EVERYBODY, Inputs, Outputs, ParticipantId, Pose, State
+from kantor_protocol.messages import News
+from kantor_protocol.radio import Radio, replica_of
+from kantor_protocol.scenario import Scenario
+
+
+class Allocation:
+    """The supervisor of a scenario with a map. `step` is its only entrance."""
+
+    def __init__(self, me: ParticipantId, scenario: Scenario, seed: int, frame: Frame) -> None:
+        """frame: how the cells lie, not what is in them."""
+        self._frame = frame
+        self._robots = scenario.robots.count
+        self._replica = replica_of(me, scenario, None, entries(frame))
+        self._radio = Radio(me, scenario.roster)
+        self._chart = Chart(frame, len(scenario.roster))
+        self._dispatch = Dispatch(scenario, Terrain(scenario, self._chart), seed, None)
+        self._tasks: dict[int, Task] = {}
+        self._since: dict[int, int] = {}
+        self._pose = Pose(*scenario.supervisor_m)
+        self._period_ns = scenario.period_ns
+        self._counting_on = Patience.of(scenario, clocks(scenario, seed)[me].period_ns)
+        self._step = 0
+
+    def step(self, inputs: Inputs, /) -> Outputs:
+        """Take in what the robots sent, give targets, tell everybody what they lack."""
+        self._step += 1
+        self._radio.hear(inputs.inbox, self._learn)
+        self._chart.fold(self._replica)
+        tick = inputs.now_ns // self._period_ns
+        for robot, task in self._dispatch.decide(*self._roll_call(tick), tick).items():
+            self._tasks[robot], self._since[robot] = task, tick
+        self._replica.registers.write(orders_of(self._tasks, self._robots, tick))
+        outputs = Outputs(
+            step=self._step,
+            pose=self._pose,
+            outbox=(self._radio.say(self._replica, EVERYBODY, self._step, self._pose),),
+            state=State.EXPLORING,
+            refused=self._radio.refused,
+        )
+        self._replica.end_step()
+        return outputs
+
+    def _learn(self, source: int, news: News) -> bool:
+        return self._replica.learn(source, news.have, news.logs, news.claims, news.registers)
+
+    def _roll_call(self, tick: int) -> tuple[list[Member], list[int]]:
+        """The robots in contact with the tasks that they have been given; the targets of the others."""
+        told, absent = roll_call(
+            self._replica.registers, self._robots, self._frame, tick, self._counting_on
+        )
+        self._tasks = {member.robot: self._tasks.get(member.robot, Task()) for member in told}
+        return [self._as_ordered(member) for member in told], absent
+
+    def _as_ordered(self, told: Member) -> Member:
+        task = self._tasks[told.robot]
+        arrived = told.arrived and told.task.target == task.target
+        return told._replace(task=task, since=self._since.get(told.robot, 0), arrived=arrived)

@@ -1,0 +1,238 @@
+"""Dispatch: who gets a target, when, and on what knowledge; the same in supervisor and robot."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kantor_agent import dispatch
+from kantor_agent.chart import Chart
+from kantor_agent.dispatch import (
+    Dispatch,
+    Patience,
+    member_of,
+    order_in,
+    orders_of,
+    register_of,
+    roll_call,
+)
+from kantor_agent.planners.team import Member, Situation, Task
+from kantor_agent.terrain import Terrain
+from kantor_protocol.evidence import entries
+from kantor_protocol.grid import NOWHERE, Frame
+from kantor_protocol.registers import Registers
+from kantor_protocol.replica import Replica
+from kantor_protocol.scenario import Scenario, parse
+from strategies import examples
+
+FRAME = Frame(1.0, (0.0, 0.0), 5, 9)
+MISSION = """
+name = "rooms"
+robots = { count = 3 }
+starts = { random = true }
+map = { layout = "blank" }
+sensor = { range_m = 3.0 }
+planner = { name = "frontier", cost = "length" }
+"""
+
+
+def mission(*overrides: str) -> Scenario:
+    """Three robots on a map, with overrides."""
+    return parse(MISSION, "rooms", overrides)
+
+
+class Asked:
+    """A strategy that notes what it is asked, and sends everybody to the first frontier."""
+
+    negotiates = False
+
+    def __init__(self, *_: object) -> None:
+        self.situations: list[Situation] = []
+
+    def assign(self, situation: Situation) -> list[Task]:
+        """Notes it."""
+        self.situations.append(situation)
+        return [Task(int(situation.frontiers[0])) for _ in situation.members]
+
+
+class World:
+    """A chart whose frontiers a test chooses, and a dispatch over it."""
+
+    def __init__(
+        self, monkeypatch: pytest.MonkeyPatch, *overrides: str, me: int | None = None
+    ) -> None:
+        self.asked = Asked()
+        monkeypatch.setitem(dispatch.ALLOCATORS, "frontier", lambda *_: self.asked)
+        scenario = mission(*overrides)
+        self.chart = Chart(FRAME, 3)
+        self.log = Replica(0, 3, entries(FRAME), None, ledger=True, claims=False)
+        self.dispatch = Dispatch(scenario, Terrain(scenario, self.chart), 0, me)
+
+    def see(self, *cells: int) -> None:
+        """Cells are free."""
+        self.log.append(np.array([2 * cell for cell in cells]))
+        self.chart.fold(self.log)
+
+    def decide(self, *group: Member, tick: int = 10) -> dict[int, Task]:
+        """New tasks."""
+        return self.dispatch.decide(group, (), tick)
+
+
+def robot(place: int, target: int = NOWHERE, since: int = 0, *, arrived: bool = False) -> Member:
+    """A member that stands in the middle."""
+    return Member(place, 22, Task(target), since, arrived)
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> World:
+    """Three frontiers in a row."""
+    made = World(monkeypatch)
+    made.see(21, 22, 23)
+    return made
+
+
+def test_nobody_is_asked_while_everybody_is_on_the_way(world: World) -> None:
+    """A target that still is a frontier is kept."""
+    assert world.decide(robot(0, 21), robot(1, 23)) == {}
+    assert world.asked.situations == []
+
+
+@pytest.mark.parametrize("event", ["arrival", "no frontier any more", "idle"])
+def test_an_event_at_one_gives_all_new_targets(world: World, event: str) -> None:
+    """The whole team, by place."""
+    eventful = {
+        "arrival": robot(1, 23, arrived=True),
+        "no frontier any more": robot(1, 20),
+        "idle": robot(1),
+    }[event]
+
+    assert set(world.decide(robot(0, 21), eventful)) == {0, 1}
+
+
+def test_between_two_assignments_lies_a_gap(world: World) -> None:
+    """Of planner.replan_gap ticks since anybody in the group got its task."""
+    assert world.decide(robot(0, 21, since=8), robot(1), tick=10) == {}
+    assert set(world.decide(robot(0, 21, since=8), robot(1), tick=11)) == {0, 1}
+
+
+def test_a_robot_on_its_own_gets_a_target_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """replan_whose = own: the others are told to the strategy as others."""
+    world = World(monkeypatch, "planner.replan_whose=own")
+    world.see(21, 22, 23)
+
+    assert set(world.decide(robot(0, 21), robot(1, 23, arrived=True))) == {1}
+    assert [m.robot for m in world.asked.situations[0].others] == [0]
+
+
+def test_arrivals_alone_count_if_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """replan_on = arrivals: a target that was seen from afar is driven to all the same."""
+    world = World(monkeypatch, "planner.replan_on=arrivals")
+    world.see(21, 22, 23)
+
+    assert world.decide(robot(0, 20)) == {}
+    assert set(world.decide(robot(0, 21, arrived=True))) == {0}
+
+
+def test_where_somebody_has_looked_around_nobody_is_sent(world: World) -> None:
+    """It would be the nearest frontier of whoever stands on it, for ever."""
+    world.decide(robot(0, 21, arrived=True))
+
+    assert world.asked.situations[0].frontiers.tolist() == [22, 23]
+
+
+def test_an_idle_robot_asks_again_only_when_the_chart_has_changed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """There is nothing new to decide on the same map."""
+    world = World(monkeypatch)
+    world.see(21, 22)
+    world.decide(robot(0))
+    assert world.decide(robot(0), tick=20) == {}
+    world.see(23)
+    assert set(world.decide(robot(0), tick=30)) == {0}
+
+
+def test_a_negotiating_robot_is_asked_in_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For itself alone; whoever it hears stands beside it."""
+    world = World(monkeypatch, me=1)
+    world.asked.negotiates = True
+    world.see(21, 22)
+
+    assert set(world.decide(robot(0, 21), robot(1, 22))) == {1}
+    assert [m.robot for m in world.asked.situations[0].others] == [0]
+
+
+# What they tell one another.
+
+
+@given(
+    cell=st.integers(0, FRAME.cells - 1),
+    target=st.integers(NOWHERE, FRAME.cells - 1),
+    since=st.integers(0, 100),
+    arrived=st.booleans(),
+    memo=st.lists(st.integers(-(2**51), 2**51), max_size=8),
+)
+def test_a_robot_is_known_as_it_is(
+    cell: int, target: int, since: int, memo: list[int], *, arrived: bool
+) -> None:
+    """Register and back; a memo loses zeros at its end."""
+    while memo and memo[-1] == 0:
+        memo.pop()
+    me = Member(1, cell, Task(target, tuple(memo)), since, arrived)
+    register = np.zeros(20, dtype=np.int64)
+    told = register_of(me, resting=False)
+    register[: len(told)] = told
+
+    assert member_of(1, register, FRAME.cells, 100) == me
+    register[1] += 2
+    assert member_of(1, register, FRAME.cells, 100) is None
+
+
+@examples(200)
+@given(numbers=st.lists(st.integers(-(2**52), 2**52), min_size=12, max_size=12))
+def test_whatever_a_register_holds_it_names_cells_of_the_map(numbers: Sequence[int]) -> None:
+    """Hostile numbers give nobody, or somebody within the map and not in the future."""
+    register = np.array(numbers, dtype=np.int64)
+    member = member_of(0, register, FRAME.cells, 7)
+
+    assert NOWHERE <= order_in(register, 2, FRAME.cells) < FRAME.cells
+    if member is not None:
+        assert 0 <= member.cell < FRAME.cells
+        assert NOWHERE <= member.task.target < FRAME.cells
+        assert member.since <= 7
+
+
+def test_orders_name_a_target_for_every_robot() -> None:
+    """Nowhere for whom there is none."""
+    told = orders_of({0: Task(4), 2: Task(0)}, 3, 9)
+    register = np.zeros(20, dtype=np.int64)
+    register[: len(told)] = told
+
+    assert [order_in(register, i, FRAME.cells) for i in range(3)] == [4, NOWHERE, 0]
+
+
+def test_who_is_silent_leaves_the_group_and_then_memory() -> None:
+    """First its target counts as taken, then it is free again."""
+    held = Registers(0, 2, 12, sums=False)
+    other = Registers(1, 2, 12, sums=False, beacon=True)
+    held.write(register_of(robot(0, 3), resting=False))
+    other.write(register_of(robot(1, 5), resting=False))
+    held.learn(1, other.compose())
+    patience = Patience(contact_steps=2, remember_steps=5)
+    seen = []
+    for _ in range(8):
+        group, absent = roll_call(held, 2, FRAME, 0, patience)
+        seen.append(([m.robot for m in group], absent))
+        held.end_step()
+
+    assert seen == [([0, 1], [])] * 3 + [([0], [5])] * 3 + [([0], [])] * 2
+
+
+def test_patience_is_counted_in_own_steps() -> None:
+    """A supervisor that steps twice a period waits twice as many steps."""
+    scenario = mission("planner.remember_s=3", "clock.period_s=0.5")
+
+    assert Patience.of(scenario, scenario.period_ns) == (8, 6)
+    assert Patience.of(scenario, scenario.period_ns // 2) == (16, 12)
