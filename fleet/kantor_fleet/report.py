@@ -189,17 +189,15 @@ def _draw_explored(axes: Axes, run: Run, exploration: Exploration, thin: slice) 
     known = np.array(exploration.shares[thin]).T
     for share, colour in zip(known, colours, strict=True):
         axes.plot(times_s, 100.0 * share, color=colour, lw=1.0, alpha=0.9, clip_on=False)
-    axes.lines[0].set_label("known to a robot")
+    axes.lines[0].set_label("a robot")
     seen = 100.0 * np.cumsum(np.bincount(survey.stamps, minlength=1)) / max(1, survey.total)
     end = run.end_ns * 1e-9
     ticks_s = np.append(np.arange(seen.shape[0]) * period_s, max(end, 0.0))
-    (union,) = axes.plot(
-        ticks_s, np.append(seen, seen[-1]), color=FIRST, lw=2.0, label="seen by anybody"
-    )
+    (union,) = axes.plot(ticks_s, np.append(seen, seen[-1]), color=FIRST, lw=2.0, label="anybody")
     handles = [union, axes.lines[0]]
     for share, tick, mark in ((95.0, survey.t95_tick, "o"), (99.0, survey.t99_tick, "s")):
         if tick is not None:
-            label = f"{share:.0f} % at {tick * period_s:.1f} s"
+            label = f"{share:.0f} %: {tick * period_s:.1f} s"
             style: dict[str, Any] = {"ms": 6.0, "mfc": "white", "mec": FIRST, "label": label}
             handles += axes.plot([tick * period_s], [share], mark, zorder=4.0, **style)
     axes.set_ylim(0.0, 102.0)
