@@ -29,7 +29,7 @@ from kantor_worldsim.survey import Survey
 _WEIGHT = ListedColormap(colormaps["YlOrBr"](np.linspace(0.2, 0.65, 256)))
 """The weight left in a sample, from hardly any to all."""
 
-_TIME = ListedColormap(0.45 + 0.55 * colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3])
+_TIME = ListedColormap(0.5 + 0.5 * colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3])
 """When a cell was first seen: pale, since the robots' ways lie over it."""
 _WALL, _UNSEEN_WALL = 0.5, 0.88
 """How much darker a known wall is than the floor of that time; the grey of an unknown one."""

@@ -202,7 +202,7 @@ def _draw_explored(axes: Axes, run: Run, exploration: Exploration, thin: slice) 
             handles += axes.plot([tick * period_s], [share], mark, zorder=4.0, **style)
     axes.set_ylim(0.0, 102.0)
     tidy(axes, "", "explored, %")
-    add_caption(axes, handles, columns=4)
+    add_caption(axes, handles, columns=2)
 
 
 def _draw_bounds(
