@@ -33,10 +33,10 @@ from kantor_protocol.scenario import Scenario
 
 _SURE_STEPS = 3
 """So many steps in a row without a frontier end the mission of a robot."""
+_PROGRESS_CELLS = 0.25
+"""A robot gets on when its way gets shorter by as much."""
 _ON_TARGET_CELLS = 0.75
 """It has arrived when its target's middle is so near."""
-_PROGRESS_CELLS = 0.01
-"""A robot that does not get on by so much within planner.patience gives its target up."""
 
 
 class Mapper:
