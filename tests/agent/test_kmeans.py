@@ -96,6 +96,10 @@ def test_to_an_accessible_region_it_is_as_far_as_the_way_to_a_frontier_beside_it
     assert regions.nearest.tolist() == [[7]]
 
 
+def test_of_contour_cells_equally_far_the_first_is_the_nearest() -> None:
+    assert regions_of(scene("##?", ".a.", "?##"), 1).nearest.tolist() == [[2]]
+
+
 def test_to_an_inaccessible_region_it_is_as_far_as_the_crow_flies() -> None:
     regions = regions_of(scene("ab??????"), 2, 6)
     # Columns 1 to 4, and 5 to 7; of the second only column 5 is on the edge.
