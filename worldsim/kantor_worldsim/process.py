@@ -23,7 +23,7 @@ from kantor_protocol.messages import (
 )
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.loop import simulate
-from kantor_worldsim.metrics import Metrics, Result
+from kantor_worldsim.metrics import Following, Result
 from kantor_worldsim.recording import Recording
 from kantor_worldsim.stage import Stage, Step
 from kantor_worldsim.world import Site
@@ -87,7 +87,7 @@ class _Doorway:
         self,
         host: Host,
         plan: Plan,
-        metrics: Metrics,
+        metrics: Following,
         stopped: Callable[[], bool],
         show: Callable[[Progress], None],
     ) -> None:
@@ -98,6 +98,8 @@ class _Doorway:
         """Nonce of the process that plays each participant and has its mission."""
         self.refused = 0
         """Messages that were malformed, or from a process that does not play that participant."""
+        self.first_looks: dict[ParticipantId, Observation] = {}
+        """Wall: what each participant sees before its first step."""
         self._plan = plan
         self._metrics = metrics
         self._show = show
@@ -207,7 +209,8 @@ class _Doorway:
     def go(self, name: ParticipantId) -> None:
         """Wall: start a participant's clock."""
         now_ns = self.stage.now_ns if self.stage is not None else 0
-        message = Go(VERSION, self.ready[name], now_ns, self._plan.speed)
+        look = self.first_looks.get(name)
+        message = Go(VERSION, self.ready[name], now_ns, self._plan.speed, look)
         self.host.send(name, encode(message), patiently=True)
 
     def tell(self, _record: object) -> None:
@@ -268,6 +271,7 @@ class _Relay:
         for name in plan.scenario.roster:
             given = stage.inputs(name, 0)
             self._observed[name] = {0: given.observation}
+            doorway.first_looks[name] = given.observation
             self._handed[name] = []
 
     def run(self) -> str:
@@ -355,16 +359,17 @@ class _Relay:
         self._doorway.host.send(name, encode(Turn(VERSION, inputs)), patiently=False)
 
 
-def progress(metrics: Metrics, scenario: Scenario, phase: str, detail: str) -> Progress:
+def progress(metrics: Following, scenario: Scenario, phase: str, detail: str) -> Progress:
     """How a mission goes, for observers."""
     glance = metrics.glance()
+    energy_total = 0 if scenario.mapping else scenario.steps_per_robot * scenario.robots.count
     return Progress(
         VERSION,
         now_ns=glance.now_ns,
         phase=phase,
         detail=detail,
         energy_spent=glance.energy_spent,
-        energy_total=scenario.steps_per_robot * scenario.robots.count,
+        energy_total=energy_total,
         detected=glance.detected,
         targets=glance.targets,
         w_ub=glance.w_ub,
@@ -373,4 +378,5 @@ def progress(metrics: Metrics, scenario: Scenario, phase: str, detail: str) -> P
         robots_done=glance.robots_done,
         robots=scenario.robots.count,
         mass_left=glance.mass_left,
+        distance_m=glance.distance_m,
     )
