@@ -96,9 +96,9 @@ def test_quadtree_leaf_of_two_ranges_is_not_split() -> None:
 
 
 def test_quadtree_passes_over_what_is_known_to_three_quarters() -> None:
-    """Range 1, two leaves: with 1 of 4 cells unknown the left has no goal, with 2 the right has one."""
-    assert quadtree_goals(terrain_of("...?", ".?.?", range_m=1.0)) == [4 + 3]
-    assert quadtree_goals(terrain_of("....", ".?.?", range_m=1.0)) == []
+    """Range 1, leaves of 2 x 2: one of four cells is too little, and so are 4 of 16."""
+    assert quadtree_goals(terrain_of("....", ".???", "??..", "??..", range_m=1.0)) == [7, 13]
+    assert quadtree_goals(terrain_of("....", ".?.?", "?...", "?...", range_m=1.0)) == []
 
 
 def test_quadtree_centre_that_is_known_is_no_goal() -> None:
@@ -732,6 +732,7 @@ def test_offer_waits_for_all_in_contact_but_not_for_ever() -> None:
     """r1 is heard and hears nothing: bidding ends with the lease, and the next goal is offered."""
     net = hall()
     net.until(lambda: net.memo(0).offered == W)
+    net.under_way = []
     net.play(4, only(1))
     assert net.memo(0).offered == W
     net.play(1, only(1))
