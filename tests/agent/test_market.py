@@ -779,6 +779,19 @@ def test_seller_lets_go_only_of_what_the_heir_holds_for_good(
     assert [held.heir for held in trader._tour if held.goal == E] == after, what
 
 
+def test_two_that_name_each_other_do_not_both_let_go() -> None:
+    """Each holds E and has named the other: neither holds it for good, so neither lets go."""
+    net = hall()
+    for robot in (0, 1):
+        net.markets[robot]._form._tour.append(_Holding(E, heir=1 - robot, named=1, until=6))
+    net.markets[0]._form._tour.pop(1)
+    for _ in range(10):
+        net.play(1)
+        assert net.holders(E)
+
+    assert net.holders(E) == [0]
+
+
 def test_goal_held_twice_is_kept_by_the_lower_place() -> None:
     """Also if it is only as good as the same: within half a range."""
     net = hall()
