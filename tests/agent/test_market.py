@@ -750,7 +750,7 @@ def test_silent_robot_out_of_contact_does_not_hold_up_an_offer() -> None:
 
 def answer(seen: int, *tour: tuple[int, int]) -> Member:
     """r1 with what it has seen of r0."""
-    return member(1, 311, Task(23, packed(Memo(9, NOWHERE, 0, 0, (seen, 0), (0, 0), tour))))
+    return member(1, 311, Task(23, packed(Memo(9, NOWHERE, 0, 0, (seen, 0, 0), (0, 0, 0), tour))))
 
 
 @pytest.mark.parametrize(
@@ -762,29 +762,29 @@ def answer(seen: int, *tour: tuple[int, int]) -> Member:
         ("confirmed an earlier award", answer(59, (E, NOBODY)), [1]),
         ("has not answered yet", answer(59), [1]),
         ("declined", answer(60), [NOBODY]),
-        ("has named an heir itself", answer(60, (E, 0)), [NOBODY]),
+        ("has named an heir itself", answer(60, (E, 2)), [NOBODY]),
     ],
 )
 def test_seller_lets_go_only_of_what_the_heir_holds_for_good(
     what: str, word: Member, after: list[int]
 ) -> None:
     """r0 has named r1 in its memo 60."""
-    net = hall()
-    trader = net.markets[0]._form
-    trader._tour = [_Holding(W), _Holding(E, heir=1, named=60, until=70)]
-    terrain = net.terrains[0]
+    market = Market(mission(), 0, 0)
+    market._form._tour = [_Holding(W), _Holding(E, heir=1, named=60, until=70)]
 
-    net.markets[0].assign(situation(terrain, [net.members[0]], [word], 61))
+    market.assign(situation(terrain_of(*HALL), [member(0, 5)], [word], 61))
 
-    assert [held.heir for held in trader._tour if held.goal == E] == after, what
+    assert [held.heir for held in market._form._tour if held.goal == E] == after, what
 
 
 def test_two_that_name_each_other_do_not_both_let_go() -> None:
     """Each holds E and has named the other: neither holds it for good, so neither lets go."""
     net = hall()
+    net.play(2)
+    net.give(0, W)
     for robot in (0, 1):
-        net.markets[robot]._form._tour.append(_Holding(E, heir=1 - robot, named=1, until=6))
-    net.markets[0]._form._tour.pop(1)
+        holding = _Holding(E, heir=1 - robot, named=3, until=20)
+        net.markets[robot]._form._tour.append(holding)
     for _ in range(10):
         net.play(1)
         assert net.holders(E)
