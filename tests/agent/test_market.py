@@ -28,10 +28,13 @@ from kantor_agent.planners.market import (
 )
 from kantor_agent.planners.team import Member, Situation, Task
 from kantor_agent.terrain import Terrain
+from kantor_fleet.team import play
 from kantor_protocol.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
 from kantor_protocol.keyed import Purpose, uniform
 from kantor_protocol.registers import NUMBER_MAX
 from kantor_protocol.scenario import Scenario, parse
+from kantor_worldsim.records import Batch, Record
+from kantor_worldsim.world import Site
 from strategies import examples
 
 MISSION = """
@@ -977,3 +980,54 @@ def test_same_words_make_the_same_market(seed: int) -> None:
         net.play(40, radio)
 
     assert nets[0].members == nets[1].members
+
+
+# Whole missions.
+
+FIELD_TRIP = (
+    "map.layout=unstructured",
+    "map.size_m=[48.0, 48.0]",
+    "starts.spread=together",
+    "sensor.range_m=6.0",
+    "sensor.beams=90",
+    "vehicle.speed_m_s=1.0",
+    "limit_s=2000.0",
+)
+BAD_RADIO = (
+    "radio.range_m=15.0",
+    "radio.drop=0.3",
+    "radio.duplicate=0.2",
+    "radio.delay_s=1.0",
+    "radio.jitter_s=2.0",
+)
+
+
+def targets_of(scenario: Scenario, seed: int) -> tuple[str, dict[str, list[tuple[float, float]]]]:
+    """Why a mission ended, and the targets of each robot, one after another."""
+    targets: dict[str, list[tuple[float, float]]] = {name: [] for name in scenario.robot_ids}
+
+    def note(record: Record) -> None:
+        for act in record.acts if isinstance(record, Batch) else ():
+            goal = act.outputs and act.outputs.goal
+            if goal and targets[act.name][-1:] != [goal]:
+                targets[act.name].append(goal)
+
+    return play(scenario, seed, Site.of(scenario, seed), [note]), targets
+
+
+@pytest.mark.parametrize("rule", ["random", "greedy", "quadtree"])
+@pytest.mark.parametrize(
+    "how",
+    [("coordination=centralized",), (), BAD_RADIO],
+    ids=["centralized", "decentralized", "bad-radio"],
+)
+def test_mission_ends_and_nobody_dithers(rule: str, how: tuple[str, ...]) -> None:
+    """All is explored; of a robot's targets hardly one in ten is one of the four before it."""
+    scenario = mission(*FIELD_TRIP, *how, f"planner.goals={rule}")
+    reason, targets = targets_of(scenario, 1)
+
+    assert reason == "done"
+    back = [
+        goal in ways[max(0, i - 4) : i] for ways in targets.values() for i, goal in enumerate(ways)
+    ]
+    assert sum(back) <= 0.1 * len(back)
