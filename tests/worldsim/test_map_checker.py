@@ -1,5 +1,6 @@
 """The referees of mapping runs: silent on a good record, and each rule noticed when it alone is broken."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -12,7 +13,7 @@ from kantor_fleet.team import play
 from kantor_protocol.evidence import void
 from kantor_protocol.grid import FREE, OCCUPIED
 from kantor_protocol.machine import Envelope, Pose, State
-from kantor_protocol.messages import Array, News, decode_news, encode_news
+from kantor_protocol.messages import Array, News, RefusedError, decode_news, encode_news
 from kantor_protocol.packing import put_int, put_uint
 from kantor_protocol.replica import read_have, read_logs
 from kantor_worldsim.checkers import Checker, check
@@ -147,6 +148,10 @@ def _leaves_map(records: Records) -> list[Record]:
     return hurried(records, acts_of(records, "r1")[-1], goes(-3.0, 1.5))
 
 
+def _is_nowhere(records: Records) -> list[Record]:
+    return hurried(records, acts_of(records, "r1")[-1], goes(math.nan, math.inf))
+
+
 def _goes_through_wall(records: Records) -> list[Record]:
     """From the lower left room straight into the lower right one, where no door is."""
     act = next(act for act in acts_of(records, "r1") if act.ruling and act.ruling.pose.x_m < 6.0)
@@ -264,6 +269,7 @@ def _gives_up(records: Records) -> list[Record]:
 BROKEN: dict[str, tuple[tuple[str, ...], Callable[[Records], list[Record]]]] = {
     "wall-stands": (ALONE, _stands_in_wall),
     "wall-outside": (ALONE, _leaves_map),
+    "wall-nowhere": (ALONE, _is_nowhere),
     "wall-through": (ALONE, _goes_through_wall),
     "map-another-kind": (ALONE, _tells_another_kind),
     "map-left-out": (ALONE, _leaves_one_out),
@@ -305,7 +311,8 @@ def test_broken_rule_is_named(name: str) -> None:
     records = explored(*run)
 
     assert rules(records) == set()
-    assert rules(broken(records)) == {name.partition("-")[0]}
+    also = {"speed"} if name == "wall-nowhere" else set()  # as far as nobody can go
+    assert rules(broken(records)) == {name.partition("-")[0]} | also
 
 
 def test_every_rule_can_be_broken() -> None:
@@ -356,6 +363,12 @@ def test_mission_without_a_way_out_is_sound() -> None:
     play(scenario, 1, site_of(scenario, ground), [records.append])
 
     assert rules(records) == set()
+
+
+def test_opening_without_a_map_is_refused() -> None:
+    """A record that cannot be judged is no crash later on."""
+    with pytest.raises(RefusedError, match="no map in its opening"):
+        check(opened(explored(), ground=None))
 
 
 def test_checker_stands_what_nobody_can_read() -> None:

@@ -72,7 +72,7 @@ class Witness:
             name: Evidence(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
             for name in names
         }
-        last: dict[str, tuple[int, object]] = {name: (-1, None) for name in names}
+        last: dict[str, tuple[int, object]] = dict.fromkeys(names, (-1, None))
         for tick, act in acts_of(records):
             look, (step, pose) = act.observation, last[act.name]
             if look.step > step:
