@@ -21,7 +21,7 @@ from kantor_protocol.scenario import Scenario
 
 ARRIVED, RESTING = 1, 2
 _CONTACT_PERIODS = 8
-_CELL, _FLAGS, _TARGET, _SINCE, _MEMO = 0, 1, 2, 3, 4
+CELL, FLAGS, TARGET, SINCE, MEMO = 0, 1, 2, 3, 4
 
 
 class Patience(NamedTuple):
@@ -85,7 +85,7 @@ def orders_of(tasks: Mapping[int, Task], robots: int, tick: int) -> list[int]:
 
 def order_in(register: npt.NDArray[np.int64], robot: int, cells: int) -> int:
     """The target that the supervisor has given a robot, or NOWHERE."""
-    target = int(register[_MEMO + robot]) - 1
+    target = int(register[MEMO + robot]) - 1
     return target if 0 <= target < cells else NOWHERE
 
 
@@ -133,10 +133,12 @@ class Dispatch:
         )
 
     def _needs(self, member: Member) -> bool:
-        target = member.task.target
+        chart, target = self._terrain.chart, member.task.target
         if target == NOWHERE:
-            return self._revision != self._terrain.chart.revision
-        return member.arrived or (self._on_events and not self._terrain.chart.is_frontier(target))
+            return self._revision != chart.revision
+        if member.arrived or chart.void[target]:
+            return True
+        return self._on_events and not chart.is_frontier(target)
 
     def _frontiers(self, group: Sequence[Member]) -> npt.NDArray[np.int64]:
         """All but those at which somebody stands that has looked around."""

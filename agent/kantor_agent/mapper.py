@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from kantor_agent.chart import Chart
-from kantor_agent.dispatch import Dispatch, Patience, order_in, register_of, roll_call
+from kantor_agent.dispatch import CELL, TARGET, Dispatch, Patience, order_in, register_of, roll_call
 from kantor_agent.navigation import Navigator
 from kantor_agent.planners.team import Member, Task
 from kantor_agent.terrain import Terrain
@@ -60,6 +60,7 @@ class Mapper:
         self._dispatch = Dispatch(scenario, self._terrain, seed, self._me)
         self._navigator = Navigator(self._terrain)
         self._vehicle = VEHICLES[scenario.vehicle.name](scenario.vehicle)
+        self._clearance_cells = 2.0 * scenario.vehicle.radius_m / frame.resolution_m
         self._target = SUPERVISOR if scenario.centralized else EVERYBODY
         self._centralized = scenario.centralized
         self._period_ns = scenario.period_ns
@@ -82,6 +83,7 @@ class Mapper:
         elapsed_ns = min(inputs.now_ns - self._now_ns, self._period_ns)
         self._now_ns, self._step = inputs.now_ns, self._step + 1
         self._chart.fold(self._replica)
+        self._give_up()
         if not self._resting:
             self._decide()
         self._look(inputs.observation)
@@ -102,6 +104,15 @@ class Mapper:
             self._pose = observation.pose
 
     # Deciding.
+
+    def _give_up(self) -> None:
+        """Tell of a target that showed or led to nothing, before there is another target."""
+        target = self._task.target
+        in_vain = self._arrived and self._chart.is_frontier(target)
+        stuck = not self._arrived and self._step - self._progressed > self._patience
+        if target != NOWHERE and not self._chart.void[target] and (in_vain or stuck):
+            self._replica.append(np.array([void(self._frame, target)]))
+            self._progressed = self._step
 
     def _decide(self) -> None:
         """Take a new task, if there is one; rest when no frontier can be reached."""
@@ -151,7 +162,7 @@ class Mapper:
     # Acting.
 
     def _look(self, observation: Observation) -> None:
-        """Add the scan to the own layer, once; give up a target that shows or leads to nothing."""
+        """Add the scan to the own layer, once."""
         if observation.step != self._scanned_step:
             self._scanned_step = observation.step
             moved = observation.pose != self._scanned_pose
@@ -159,15 +170,7 @@ class Mapper:
             self._replica.append(
                 self._evidence.take(observation.scan, observation.pose, moved=moved)
             )
-        target = self._task.target
-        if target == NOWHERE:
-            return
-        stood_before = self._arrived
-        self._arrived = self._is_at(target)
-        stuck = self._step - self._progressed > self._patience
-        if ((stood_before and self._arrived) or stuck) and self._chart.is_frontier(target):
-            self._replica.append(np.array([void(self._frame, target)]))
-            self._progressed = self._step
+        self._arrived = self._task.target != NOWHERE and self._is_at(self._task.target)
 
     def _is_at(self, cell: int) -> bool:
         x_m, y_m = self._frame.centre_of(cell)
@@ -175,7 +178,7 @@ class Mapper:
         return away_m <= _ON_TARGET_CELLS * self._frame.resolution_m
 
     def _move(self, dt_s: float) -> None:
-        if self._task.target == NOWHERE or self._arrived:
+        if self._task.target == NOWHERE or self._arrived or self._queues():
             return
         place = self._navigator.head(self._pose, self._task.target)
         if place is None:
@@ -183,6 +186,22 @@ class Mapper:
         if self._left == 0 or self._navigator.left < self._left:
             self._progressed, self._left = self._step, self._navigator.left
         self._pose = self._vehicle.drive(self._pose, *place, dt_s)
+
+    def _queues(self) -> bool:
+        """Whether a lower robot on the way to the same target is too close: it goes first.
+
+        Bodies do not merge. Points would, at the next bend, and could never be told apart again.
+        """
+        if self._clearance_cells == 0.0:
+            return False
+        told = self._replica.registers.values
+        here = int(told[self._me, CELL]) - 1
+        return any(
+            told[robot, TARGET] == self._task.target + 1
+            and self._terrain.cells_between(int(told[robot, CELL]) - 1, here)
+            <= self._clearance_cells
+            for robot in range(self._me)
+        )
 
     def _publish(self) -> Outputs:
         if self._resting:

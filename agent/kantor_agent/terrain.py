@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from kantor_agent.chart import Chart
 from kantor_agent.routes import Routes, length_cost, smoothed_cost
-from kantor_protocol.grid import FREE, UNKNOWN
+from kantor_protocol.grid import FREE, NOWHERE, UNKNOWN
 from kantor_protocol.scenario import Scenario
 
 _FREE_P = 0.05
@@ -46,10 +46,13 @@ class Terrain:
             self._travel[cell] = self._routes.spread(cost, cell).copy()
         return self._travel[cell]
 
-    def optimistic(self, cell: int) -> npt.NDArray[np.float64]:
-        """`travel` for who takes what is unknown for open floor (Zlot et al.)."""
+    def optimistic(self, cell: int, *, until: int = NOWHERE) -> npt.NDArray[np.float64]:
+        """`travel` for who takes what is unknown for open floor (Zlot et al.).
+
+        until: cells that are farther than this one may have too high a value.
+        """
         cost = np.where(self.chart.cells == UNKNOWN, 1.0, self.cost)
-        return self._routes.spread(self._with(cell, cost), cell).copy()
+        return self._routes.spread(self._with(cell, cost), cell, until=until).copy()
 
     def way(self, cell: int, target: int) -> npt.NDArray[np.int64]:
         """The cells from here to there, both included; empty if there is no way."""

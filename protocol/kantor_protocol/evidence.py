@@ -1,7 +1,7 @@
 """What range scans say about the cells of a map (Burgard et al., eq. 1-3, in log odds), and how it travels.
 
-A scan gives every cell that a beam passes or ends in one piece of evidence: against or for a wall. Sums
-are clamped, so that no cell is ever certain. What a robot tells others is the sign of its sum: an entry
+A scan gives every cell that a beam passes or ends in one piece of evidence: against or for a wall,
+whichever its beams say in sum. Sums are clamped, so that no cell is ever certain. What a robot tells others is the sign of its sum: an entry
 in its log whenever a cell becomes free or occupied to it. The log is append-only and its robot alone
 writes it, so that it is replicated as every other log (`replica.py`), and nobody merges merged maps.
 
@@ -33,7 +33,9 @@ HIT, PASS, CERTAIN = 85, -40, 294
 """Evidence in 1/100 of log odds: +0.85, -0.40, and at most ln 19 in size (P within [0.05, 0.95])."""
 
 _LEARNT_BEAMS = 8
-_PASSED, _HIT = 0, 1
+_NOISE_CELLS_MAX = 0.5
+"""A wall is looked for this far around where a noisy beam ended, at most: further, and there are always
+several cells to choose from."""
 
 
 def entries(frame: Frame) -> int:
@@ -53,26 +55,14 @@ def beam_rad(heading_rad: float, field_of_view_rad: float, beams: int, beam: int
 
 
 @kernel
-def _touch(
-    cell: int, kind: int, scan: int, mark: np.ndarray, touched: np.ndarray, count: int
-) -> int:
-    """Note that a beam passed or hit a cell; a hit outweighs any number of passes of the same scan."""
-    if mark[cell] < 2 * scan:
+def _touch(cell: int, evidence: int, votes: np.ndarray, touched: np.ndarray, count: int) -> int:
+    """Note what one beam says of a cell."""
+    if votes[cell] == 0:
         touched[count] = cell
         count += 1
-    mark[cell] = max(mark[cell], 2 * scan + kind)
+        votes[cell] = 1  # sums of HIT and PASS are multiples of 5: a touched cell is never at 0
+    votes[cell] += evidence
     return count
-
-
-@kernel
-def _nearest_border(u: float, v: float, du: float, dv: float, reach: float) -> float:
-    """How far along a beam it leaves a cell, as near as possible to where it ended. All in cells."""
-    column, row, before = int(u), int(v), -math.inf
-    while True:
-        row, column, share = next_cell(row, column, u, v, du, dv)
-        if not share < reach:
-            return before if reach - before <= share - reach else share
-        before = share
 
 
 @kernel
@@ -81,44 +71,34 @@ def _follow_beam(
     v: float,
     angle_rad: float,
     reach: float,
-    returned: bool,
     tolerance: float,
     rows: int,
     columns: int,
-    scan: int,
-    mark: np.ndarray,
+    votes: np.ndarray,
     touched: np.ndarray,
     count: int,
 ) -> int:
-    """Touch the cells of one beam. reach, tolerance: in cells; an infinite tolerance stands for noise.
+    """Touch the cells of one beam. reach, tolerance: in cells; negative tolerance: nothing was met.
 
     A wall's face is a border of cells, and the beam ended at it, give or take the tolerance. If it enters
     just one cell there, this is the wall; if it enters several, as at a corner, it says nothing of
-    them. What it entered before is free. With noise the face is the border nearest to where it ended.
+    them. What it entered before is free.
     """
-    du, dv = math.cos(angle_rad), math.sin(angle_rad)
-    if not (0.0 <= u < columns and 0.0 <= v < rows):
-        return count
-    if not returned:
-        tolerance = 0.0
-    elif tolerance == math.inf:
-        reach, tolerance = _nearest_border(u, v, du, dv, reach), 0.0
     column, row = int(u), int(v)
-    count = _touch(row * columns + column, _PASSED, scan, mark, touched, count)  # it stands here
+    du, dv = math.cos(angle_rad), math.sin(angle_rad)
+    count = _touch(row * columns + column, PASS, votes, touched, count)  # it stands here
     wall, entered = NOWHERE, 0
     while True:
         row, column, share = next_cell(row, column, u, v, du, dv)
-        inside = 0 <= row < rows and 0 <= column < columns
-        if not (inside and share <= reach + tolerance):
+        if not share <= reach + max(0.0, tolerance):
             break
-        cell = row * columns + column
-        if share < reach - tolerance or not returned:
-            count = _touch(cell, _PASSED, scan, mark, touched, count)
-        else:
-            wall, entered = cell, entered + 1
-    if entered == 1 and not share <= reach + tolerance:
-        count = _touch(wall, _HIT, scan, mark, touched, count)
-    return count
+        entered += share >= reach - tolerance
+        if not (0 <= row < rows and 0 <= column < columns):
+            return count
+        wall = row * columns + column
+        if entered == 0:
+            count = _touch(wall, PASS, votes, touched, count)
+    return _touch(wall, HIT, votes, touched, count) if entered == 1 else count
 
 
 @kernel
@@ -132,26 +112,27 @@ def _integrate(
     tolerance: float,
     rows: int,
     columns: int,
-    scan: int,
-    mark: np.ndarray,
+    votes: np.ndarray,
     touched: np.ndarray,
     odds: np.ndarray,
     kinds: np.ndarray,
     changed: np.ndarray,
 ) -> int:
     """Add one scan; how many cells changed their kind, as entries in `changed`."""
-    count = 0
-    for beam in range(codes.shape[0]):
-        angle_rad = beam_rad(heading_rad, field_of_view_rad, codes.shape[0], beam)
-        returned = codes[beam] <= CODES
-        reach = codes[beam] / CODES * range_cells if returned else range_cells
-        count = _follow_beam(
-            u, v, angle_rad, reach, returned, tolerance, rows, columns, scan, mark, touched, count
-        )
+    if not (0.0 <= u < columns and 0.0 <= v < rows):
+        return 0
+    count, beams = 0, codes.shape[0]
+    for beam in range(beams):
+        angle_rad = beam_rad(heading_rad, field_of_view_rad, beams, beam)
+        reach, margin = range_cells, -1.0
+        if codes[beam] <= CODES:
+            reach, margin = codes[beam] / CODES * range_cells, tolerance
+        count = _follow_beam(u, v, angle_rad, reach, margin, rows, columns, votes, touched, count)
     changes = 0
     for i in range(count):
         cell = touched[i]
-        step = HIT if mark[cell] == 2 * scan + _HIT else PASS
+        step = HIT if votes[cell] > 1 else PASS
+        votes[cell] = 0
         odds[cell] = min(CERTAIN, max(-CERTAIN, odds[cell] + step))
         kind = kinds[cell]
         if odds[cell] > 0:
@@ -179,16 +160,16 @@ class Evidence:
         self._beams = sensor.beams
         self._ranges = ranges
         range_cells = sensor.range_m / frame.resolution_m
-        exact = sensor.noise_m == 0.0
+        noise_cells = min(3.0 * sensor.noise_m / frame.resolution_m, _NOISE_CELLS_MAX)
         self._sensor = (
             math.radians(sensor.field_of_view_deg),
             range_cells,
-            range_cells / CODES if exact else math.inf,
+            range_cells / CODES + noise_cells,
             frame.rows,
             frame.columns,
         )
         self._scans = 0
-        self._mark = np.full(cells, -1, dtype=np.int64)
+        self._votes = np.zeros(cells, dtype=np.int32)
         self._touched = np.zeros(cells, dtype=np.int64)
         self._changed = np.zeros(cells, dtype=np.int64)
 
@@ -211,8 +192,7 @@ class Evidence:
             v,
             pose.heading_rad,
             *self._sensor,
-            self._scans,
-            self._mark,
+            self._votes,
             self._touched,
             self.odds,
             self.kinds,

@@ -42,6 +42,7 @@ class Purpose(enum.IntEnum):
     MAP = 14
     SCAN = 15
     CENTROIDS = 16
+    MARKET = 17
 
 
 @kernel

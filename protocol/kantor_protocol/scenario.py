@@ -101,6 +101,8 @@ class Vehicle(_Table, frozen=True, kw_only=True):
     """unicycle: bound on the turn rate."""
     turn_radius_m: Positive = 15.0
     """dubins: the tightest circle."""
+    radius_m: NotNegative = 0.0
+    """On a map: of its body. Robots on the way to the same target keep two radii apart; 0: points."""
 
 
 class Clock(_Table, frozen=True, kw_only=True):
@@ -588,6 +590,8 @@ def _complaints_of_map(scenario: Scenario) -> Iterable[str]:
         or scenario.energy.points
     ):
         yield "map: cannot be joined with a density; remove density, samples and energy"
+    if scenario.vehicle.name == "dubins":
+        yield "vehicle.name: dubins cannot stop at a wall; use first-order, second-order or unicycle"
     if scenario.targets.file is None and scenario.targets.count:
         yield "targets.count: on a map targets come from a file; set targets.file"
     if not scenario.starts.random and len(scenario.starts.poses_m) != scenario.robots.count:

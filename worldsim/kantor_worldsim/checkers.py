@@ -9,7 +9,7 @@ then costs little more than reading it.
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,9 +25,11 @@ from kantor_protocol.weights import WeightsSubscriber
 from kantor_worldsim import reading as of
 from kantor_worldsim.channel import DROPPED
 from kantor_worldsim.exact import ROUNDING
+from kantor_worldsim.map_checker import MapRules
 from kantor_worldsim.metrics import Row
 from kantor_worldsim.reading import Reader, Reading
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
+from kantor_worldsim.survey import Survey
 from kantor_worldsim.world import SPEED_TOLERANCE
 
 _COMPLAINTS_MAX = 100
@@ -552,14 +554,18 @@ class Checker:
                 (spectral; not once an output is missing from the record)
     order       steps count up by one, time never runs back, an opening first, nothing after the end
     ruling      the world found no fault of its own
+
+    A mission with a map has no weights, energy or ledger; its own rules stand in `MapRules`.
     """
 
-    def __init__(self, reader: Reader | None = None) -> None:
-        """reader: the one that another referee of the same run reads by."""
+    def __init__(self, reader: Reader | None = None, survey: Survey | None = None) -> None:
+        """reader, survey: those that another referee of the same run follows it by."""
         self.complaints: list[str] = []
         self.count = 0
         """All complaints, also those beyond the ones that are kept."""
         self._reader = reader or Reader()
+        self._survey = survey
+        self._map_rules: MapRules | None = None
         self._opening: Opening | None = None
         self._ended = False
         self._now_ns = 0
@@ -580,9 +586,9 @@ class Checker:
             self._ended = True
             self._end()
 
-    def take_row(self, row: Row) -> None:
+    def take_row(self, row: tuple[Any, ...]) -> None:
         """Hold a row's bounds against its exact distance, if they claim to be bounds."""
-        if row.w1_exact is None or row.w_ub_tight is None:
+        if not isinstance(row, Row) or row.w1_exact is None or row.w_ub_tight is None:
             return
         least = row.w1_exact * (1.0 - ROUNDING)
         for form, bound in (("tight", row.w_ub_tight), ("paper", row.w_ub_paper)):
@@ -608,7 +614,7 @@ class Checker:
             sample_units=self._units.sample,
             point_units=self._units.point,
             budget=scenario.steps_per_robot,
-            ledger=scenario.merge == "ledger",
+            ledger=scenario.merge == "ledger" and not scenario.mapping,
             supervisor=scenario.robots.count,
             speed_m_s=scenario.vehicle.speed_m_s,
             range_m=scenario.radio.range_m,
@@ -635,10 +641,14 @@ class Checker:
             by_x=np.argsort(site.samples_m[:, 0]),
         )
         self._arguments = (*self._state, *self._law)
+        self._visiting = scenario.planner.name == "spectral"
         self._registers = np.zeros((len(names), scenario.register_width), dtype=np.int64)
         self._rectangle = rectangle_of(scenario.domain)
         self._said: dict[ParticipantId, Pose] = {}
         self._missed: set[ParticipantId] = set()
+        if scenario.mapping:
+            self._map_rules = MapRules(self._survey or Survey(self._reader), self._complain)
+            self._map_rules.open(opening)
 
     def _check(self, batch: Batch) -> None:
         if batch.now_ns < self._now_ns:
@@ -652,8 +662,10 @@ class Checker:
         if noted:
             self._put_into_words(batch, int(self._state.found[0]))
             self._check_keyframes(batch)
-        if self._scenario.register_width:
+        if self._visiting:
             self._check_registers(batch)
+        if self._map_rules is not None:
+            self.count += self._map_rules.check(batch)
 
     def _lengthen(self, name: str) -> None:
         """Double one of the arrays that grow with the run."""

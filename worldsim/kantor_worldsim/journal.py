@@ -10,7 +10,7 @@ import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import msgspec
 from mcap.exceptions import McapError
@@ -18,7 +18,6 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
-from kantor_worldsim.metrics import Row
 from kantor_worldsim.records import Batch, Ending, Record, decode_record, encode_record
 
 RECORD_TOPIC = "/kantor/record"
@@ -94,7 +93,7 @@ class Journal:
         if self._file is not None:
             self._write(RECORD_TOPIC, payload)
 
-    def take_row(self, row: Row) -> None:
+    def take_row(self, row: Any) -> None:
         """Write one row of metrics, for viewers; it is not part of the digest."""
         if self._file is not None:
             self._write(METRICS_TOPIC, json.dumps(row._asdict()).encode())

@@ -24,7 +24,7 @@ about: every shipped point where it was shipped, what is left shared evenly by t
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
@@ -81,6 +81,9 @@ class Glance(NamedTuple):
     """Deliveries a simulated second over the last ten rows."""
     robots_done: int
     mass_left: float
+    """On a map the share of cells that nobody has seen."""
+    distance_m: float | None = None
+    """On a map: what all robots have driven."""
 
 
 class Bounds(msgspec.Struct, frozen=True):
@@ -100,6 +103,52 @@ class BytesPerRobotTick(msgspec.Struct, frozen=True):
     """Weights and all radio bodies."""
 
 
+class ByRegions(msgspec.Struct, frozen=True):
+    """A variance over so many regions of the map (Puig, Garcia, Wu, section 4)."""
+
+    r2: float
+    r4: float
+    r8: float
+    r16: float
+    r32: float
+    r64: float
+
+
+class MapResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What came of exploring a map. Only cells that can ever be seen count; ticks are periods."""
+
+    explored: float
+    """Share of them that somebody has seen."""
+    completed_tick: int | None
+    """When no reachable free cell that somebody had seen had an unknown neighbour any more, or null."""
+    t95_tick: int | None
+    """When that share was seen by somebody."""
+    t99_tick: int | None
+    all_t99_tick: int | None
+    """When every robot knew of that share, by itself or from others."""
+    distance_m: float
+    """Driven by all robots."""
+    longest_m: float
+    """By one of them, at most."""
+    overlap: float
+    """What robots have seen themselves, summed, over what somebody has seen; minus 1."""
+    bumps: int
+    """Moves that ended at a wall."""
+    switches: int
+    """Goals given up, a sensor range or farther from the new one, before the robot had come within a cell."""
+    stall_ticks: int
+    """The longest that a robot stood still that had not finished."""
+    log_bytes_per_robot_tick: float
+    """Map traffic: what a robot sends of logs in a step."""
+    wtv_final: ByRegions
+    """Eq. 10, squared ticks: variance of the regions' mean time at which a cell was first seen."""
+    wtv_mean: ByRegions
+    """Eq. 9, the same with unseen cells counted as seen when the closest robot could be there, over time."""
+    epv_final: ByRegions
+    """Variance of the regions' explored share, squared percent."""
+    epv_mean: ByRegions
+
+
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """result.json. The names are stable."""
 
@@ -113,7 +162,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     robots: int
     ticks: int
     finished_tick: int | None
-    """The step at which the last robot saw no weight left, or null."""
+    """The step at which the last robot saw no weight left, or no frontier to go to, or null."""
     first_contact_tick: int | None
     """The step in which a robot first took in another's message, or null."""
     detected: int
@@ -140,6 +189,9 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     """What the checker found, at most the first ten."""
     digest: str
     wall_s: float
+    map: MapResult | None = None
+    """Of a mission that explores a map; bounds, energy and mass then say nothing but mass_left, the share
+    of cells that nobody has seen."""
 
 
 # Slots of Tally.counts and Tally.shipped.
@@ -367,20 +419,24 @@ def _sum_up(
         first += way.shape[0]
 
 
-class Metrics:
-    """Follows the records of one run."""
+class Following:
+    """Follows the records of one run: what is the same whatever is explored.
 
-    def __init__(self, exact_every: int | None = None, reader: Reader | None = None) -> None:
-        """exact_every: periods from one exact distance to the next; 0: at the end only; None: never.
+    A kind of mission adds what it measures: `_begin`, `_attend`, `_row`, `_glimpse` and `_measured`.
+    """
 
-        reader: the one that another referee of the same run reads by.
-        """
-        self.rows: list[Row] = []
+    columns: ClassVar[tuple[str, ...]]
+    """The names in a row."""
+
+    def __init__(self, reader: Reader | None = None) -> None:
+        """reader: the one that another referee of the same run reads by."""
+        self.rows: list[Any] = []
         self.finds: list[tuple[float, ParticipantId, int, float, float]] = []
         """(time, robot, target, x, y), world frame."""
-        self._exact_every = exact_every
         self._reader = reader or Reader()
         self._opening: Opening | None = None
+        self._every = 1
+        """Periods from one row to the next."""
 
     def take(self, record: Record) -> None:
         """Follow one record."""
@@ -420,6 +476,156 @@ class Metrics:
         self._tally.counts[_LEAST] = self._units.whole
         self._tally.standing[:, 2] = _NEVER
         self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
+        self._out_of_range = self._absences = 0
+        self._ending = Ending(0, "cut")
+        self._tick = 0
+        for name, found in opening.first_look.items():
+            self.finds += [(0.0, name, target, x, y) for target, x, y in found]
+        self._begin(opening)
+        self._row()
+
+    def _follow(self, batch: Batch) -> None:
+        tick = batch.now_ns // self._period_ns
+        if tick != self._tick:
+            if self._tick and self._tick % self._every == 0:
+                self._row()
+            self._tick, self._tally.shipped[_NOW] = tick, 0.0
+        self._walk.advance(batch.now_ns)
+        self._out_of_range += batch.out_of_range
+        self._absences += len(batch.absent)
+        reading = self._reader.read(batch)
+        if _follow(*reading, *self._arguments):
+            self._note_finds(batch)
+        self._attend(batch, reading)
+
+    @property
+    def steps(self) -> int:
+        """Of all robots so far."""
+        return self._tally.counts.item(_STEPS)
+
+    @property
+    def deliveries(self) -> int:
+        """So far."""
+        return self._tally.counts.item(_DELIVERIES)
+
+    @property
+    def drops(self) -> int:
+        """So far."""
+        return self._tally.counts.item(_DROPS)
+
+    def _note_finds(self, batch: Batch) -> None:
+        for act in batch.acts:
+            if act.ruling is not None and act.outputs is not None:
+                time_s = act.now_ns * 1e-9
+                self.finds += [
+                    (time_s, act.name, target, x, y) for target, x, y in act.ruling.found
+                ]
+
+    def _begin(self, opening: Opening) -> None:
+        """Prepare for the run, before its first row."""
+        raise NotImplementedError
+
+    def _attend(self, batch: Batch, reading: tuple[Any, ...]) -> None:
+        """Follow a batch that has been counted. reading: a Reading as arguments of a kernel."""
+
+    def _row(self, *, last: bool = False) -> None:
+        """Measure."""
+        raise NotImplementedError
+
+    def _glimpse(self) -> dict[str, Any]:
+        """By the last row: `w_ub`, `mass_left` and what else there is in a Glance."""
+        raise NotImplementedError
+
+    def _measured(self) -> dict[str, Any]:
+        """What a Result has beside the counts."""
+        raise NotImplementedError
+
+    def glance(self) -> Glance:
+        """How the run stands, by the last row."""
+        if not self.rows:
+            return Glance(0, 0, 0, 0, 0.0, 0, 0.0, 0, 1.0)
+        last = self.rows[-1]
+        before = self.rows[max(0, len(self.rows) - 11)]
+        elapsed_s = last.time_s - before.time_s
+        rate = (last.deliveries - before.deliveries) / elapsed_s if elapsed_s > 0.0 else 0.0
+        return Glance(
+            now_ns=round(last.time_s * 1e9),
+            energy_spent=int(self._tally.counts[_ENERGY]),
+            detected=len(self.finds),
+            targets=self._targets,
+            links=last.links,
+            messages_per_s=rate,
+            robots_done=int(self._tally.standing[:, 1].sum()),
+            **self._glimpse(),
+        )
+
+    def result(
+        self,
+        *,
+        exchange: str,
+        digest: str,
+        wall_s: float,
+        refused_at_door: int = 0,
+        record: str,
+        complaints: tuple[str, ...],
+    ) -> Result:
+        """The summary; call it after the last record. complaints: the checker's."""
+        scenario, counts = self._scenario, self._tally.counts.tolist()
+        robots = scenario.robots.count
+        finished = self._tally.standing[:robots, 2].tolist()
+        steps = max(1, counts[_STEPS])
+        assert self._opening is not None
+        return Result(
+            scenario=scenario.name,
+            seed=self._opening.seed,
+            exchange=exchange,
+            clock=scenario.clock.order,
+            planner=scenario.planner.name,
+            merge=scenario.merge,
+            claims=scenario.claiming,
+            robots=robots,
+            ticks=self._tick,
+            finished_tick=None if _NEVER in finished else max(finished),
+            first_contact_tick=None if counts[_FIRST_CONTACT] == _NEVER else counts[_FIRST_CONTACT],
+            detected=len(self.finds),
+            targets=self._targets,
+            detection_rate=len(self.finds) / self._targets if self._targets else None,
+            energy_spent=counts[_ENERGY],
+            bytes_per_robot_tick=BytesPerRobotTick(
+                counts[_BYTES_WEIGHTS] / steps, counts[_BYTES_TOTAL] / steps
+            ),
+            deliveries=counts[_DELIVERIES],
+            drops=counts[_DROPS],
+            out_of_range_refused=self._out_of_range,
+            messages_refused=int(self._tally.standing[:, 0].sum()) + refused_at_door,
+            absences=self._absences,
+            ended=self._ending.reason,
+            record=record,
+            violations=counts[_VIOLATIONS] + len(complaints),
+            complaints=complaints[:10],
+            digest=digest,
+            wall_s=wall_s,
+            **self._measured(),
+        )
+
+
+class Metrics(Following):
+    """Follows the records of one run that explores a density."""
+
+    columns = Row._fields
+    rows: list[Row]
+
+    def __init__(self, exact_every: int | None = None, reader: Reader | None = None) -> None:
+        """exact_every: periods from one exact distance to the next; 0: at the end only; None: never.
+
+        reader: the one that another referee of the same run reads by.
+        """
+        super().__init__(reader)
+        self._exact_every = exact_every
+
+    def _begin(self, opening: Opening) -> None:
+        scenario = opening.scenario
+        robots, samples = scenario.robots.count, self._walk.xy_m.shape[0]
         self._terms = np.zeros((2, robots))
         self._to_sum_up = (
             *self._tally[3:],
@@ -437,35 +643,10 @@ class Metrics:
         self._every = scenario.metrics.every or max(1, size)
         self._auction = Auction(robots, samples, self._every)
         self._points: list[tuple[float, float, int]] = []
-        self._out_of_range = self._absences = 0
-        self._ending = Ending(0, "cut")
-        self._tick = 0
-        for name, found in opening.first_look.items():
-            self.finds += [(0.0, name, target, x, y) for target, x, y in found]
-        self._row()
 
-    def _follow(self, batch: Batch) -> None:
-        tick = batch.now_ns // self._period_ns
-        if tick != self._tick:
-            if self._tick and self._tick % self._every == 0:
-                self._row()
-            self._tick, self._tally.shipped[_NOW] = tick, 0.0
-        self._walk.advance(batch.now_ns)
-        self._out_of_range += batch.out_of_range
-        self._absences += len(batch.absent)
-        reading = self._reader.read(batch)
-        if _follow(*reading, *self._arguments):
-            self._note_finds(batch)
+    def _attend(self, _batch: Batch, reading: tuple[Any, ...]) -> None:
         if self._exact_every is not None:
             self._note_points(of.Reading(*reading))
-
-    def _note_finds(self, batch: Batch) -> None:
-        for act in batch.acts:
-            if act.ruling is not None and act.outputs is not None:
-                time_s = act.now_ns * 1e-9
-                self.finds += [
-                    (time_s, act.name, target, x, y) for target, x, y in act.ruling.found
-                ]
 
     def _note_points(self, reading: of.Reading) -> None:
         """Where a point was shipped, and how many units."""
@@ -532,76 +713,16 @@ class Metrics:
             np.ones(samples_m.shape[0]),
         )
 
-    def glance(self) -> Glance:
-        """How the run stands, by the last row."""
-        if not self.rows:
-            return Glance(0, 0, 0, 0, 0.0, 0, 0.0, 0, 1.0)
-        last = self.rows[-1]
-        before = self.rows[max(0, len(self.rows) - 11)]
-        elapsed_s = last.time_s - before.time_s
-        rate = (last.deliveries - before.deliveries) / elapsed_s if elapsed_s > 0.0 else 0.0
-        return Glance(
-            now_ns=round(last.time_s * 1e9),
-            energy_spent=int(self._tally.counts[_ENERGY]),
-            detected=len(self.finds),
-            targets=self._targets,
-            w_ub=last.w_ub_paper,
-            links=last.links,
-            messages_per_s=rate,
-            robots_done=int(self._tally.standing[:, 1].sum()),
-            mass_left=last.mass_left,
-        )
+    def _glimpse(self) -> dict[str, Any]:
+        return {"w_ub": self.rows[-1].w_ub_paper, "mass_left": self.rows[-1].mass_left}
 
-    def result(
-        self,
-        *,
-        exchange: str,
-        digest: str,
-        wall_s: float,
-        refused_at_door: int = 0,
-        record: str,
-        complaints: tuple[str, ...],
-    ) -> Result:
-        """The summary; call it after the last record. complaints: the checker's."""
-        scenario, last = self._scenario, self.rows[-1]
-        counts, robots = self._tally.counts.tolist(), scenario.robots.count
-        finished = self._tally.standing[:robots, 2].tolist()
-        steps = max(1, counts[_STEPS])
-        assert self._opening is not None
-        return Result(
-            scenario=scenario.name,
-            seed=self._opening.seed,
-            exchange=exchange,
-            clock=scenario.clock.order,
-            planner=scenario.planner.name,
-            merge=scenario.merge,
-            claims=scenario.claiming,
-            robots=robots,
-            ticks=self._tick,
-            finished_tick=None if _NEVER in finished else max(finished),
-            first_contact_tick=None if counts[_FIRST_CONTACT] == _NEVER else counts[_FIRST_CONTACT],
-            detected=len(self.finds),
-            targets=self._targets,
-            detection_rate=len(self.finds) / self._targets if self._targets else None,
-            w_ub_start=self.rows[0].w_ub_paper,
-            w_ub=Bounds(last.w_ub_paper, last.w_ub_tight, last.w_ub_instant),
-            w1_exact=last.w1_exact,
-            energy_spent=counts[_ENERGY],
-            energy_total=scenario.steps_per_robot * robots,
-            mass_left=last.mass_left,
-            mass_double_counted=last.mass_double_counted,
-            bytes_per_robot_tick=BytesPerRobotTick(
-                counts[_BYTES_WEIGHTS] / steps, counts[_BYTES_TOTAL] / steps
-            ),
-            deliveries=counts[_DELIVERIES],
-            drops=counts[_DROPS],
-            out_of_range_refused=self._out_of_range,
-            messages_refused=int(self._tally.standing[:, 0].sum()) + refused_at_door,
-            absences=self._absences,
-            ended=self._ending.reason,
-            record=record,
-            violations=counts[_VIOLATIONS] + len(complaints),
-            complaints=complaints[:10],
-            digest=digest,
-            wall_s=wall_s,
-        )
+    def _measured(self) -> dict[str, Any]:
+        last, scenario = self.rows[-1], self._scenario
+        return {
+            "w_ub_start": self.rows[0].w_ub_paper,
+            "w_ub": Bounds(last.w_ub_paper, last.w_ub_tight, last.w_ub_instant),
+            "w1_exact": last.w1_exact,
+            "energy_total": scenario.steps_per_robot * scenario.robots.count,
+            "mass_left": last.mass_left,
+            "mass_double_counted": last.mass_double_counted,
+        }

@@ -23,7 +23,7 @@ from kantor_protocol.messages import (
 )
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.loop import simulate
-from kantor_worldsim.metrics import Metrics, Result
+from kantor_worldsim.metrics import Following, Result
 from kantor_worldsim.recording import Recording
 from kantor_worldsim.stage import Stage, Step
 from kantor_worldsim.world import Site
@@ -87,7 +87,7 @@ class _Doorway:
         self,
         host: Host,
         plan: Plan,
-        metrics: Metrics,
+        metrics: Following,
         stopped: Callable[[], bool],
         show: Callable[[Progress], None],
     ) -> None:
@@ -355,16 +355,17 @@ class _Relay:
         self._doorway.host.send(name, encode(Turn(VERSION, inputs)), patiently=False)
 
 
-def progress(metrics: Metrics, scenario: Scenario, phase: str, detail: str) -> Progress:
+def progress(metrics: Following, scenario: Scenario, phase: str, detail: str) -> Progress:
     """How a mission goes, for observers."""
     glance = metrics.glance()
+    energy_total = 0 if scenario.mapping else scenario.steps_per_robot * scenario.robots.count
     return Progress(
         VERSION,
         now_ns=glance.now_ns,
         phase=phase,
         detail=detail,
         energy_spent=glance.energy_spent,
-        energy_total=scenario.steps_per_robot * scenario.robots.count,
+        energy_total=energy_total,
         detected=glance.detected,
         targets=glance.targets,
         w_ub=glance.w_ub,
@@ -373,4 +374,5 @@ def progress(metrics: Metrics, scenario: Scenario, phase: str, detail: str) -> P
         robots_done=glance.robots_done,
         robots=scenario.robots.count,
         mass_left=glance.mass_left,
+        distance_m=glance.distance_m,
     )

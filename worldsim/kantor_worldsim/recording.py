@@ -15,10 +15,12 @@ import msgspec
 
 from kantor_protocol.scenario import Scenario, to_toml
 from kantor_worldsim.checkers import Checker
+from kantor_worldsim.exploration import Exploration
 from kantor_worldsim.journal import Journal, file_digest
-from kantor_worldsim.metrics import Metrics, Result, Row
+from kantor_worldsim.metrics import Following, Metrics, Result
 from kantor_worldsim.reading import Reader
 from kantor_worldsim.records import Record
+from kantor_worldsim.survey import Survey
 
 JOURNAL = "run.mcap"
 MANIFEST = "manifest.json"
@@ -41,6 +43,21 @@ def folder_for(scenario: Scenario, seed: int, below: Path) -> Path:
     raise FileExistsError(f"{below / stem}: a thousand runs in one second")
 
 
+def metrics_of(
+    scenario: Scenario,
+    exact_every: int | None = None,
+    reader: Reader | None = None,
+    survey: Survey | None = None,
+) -> Following:
+    """What follows a run of a scenario: what a density needs, or a map. exact_every: see Metrics.
+
+    reader, survey: those that other referees of the same run follow it by.
+    """
+    if scenario.mapping:
+        return Exploration(reader, survey)
+    return Metrics(exact_every, reader)
+
+
 class Recording:
     """Follows a run: journal, metrics and checker; writes the run folder if there is one."""
 
@@ -55,8 +72,9 @@ class Recording:
     ) -> None:
         """folder: an existing folder for the run's files; None keeps nothing. exact_every: see Metrics."""
         self._reader = Reader()
-        self.metrics = Metrics(exact_every, self._reader)
-        self.checker = Checker(self._reader)
+        survey = Survey(self._reader) if scenario.mapping else None
+        self.metrics = metrics_of(scenario, exact_every, self._reader, survey)
+        self.checker = Checker(self._reader, survey)
         self.refused_at_door = 0
         """Messages to world-sim that it could not take in; whoever runs the bus counts them."""
         self._scenario = scenario
@@ -71,7 +89,7 @@ class Recording:
             _write_text(folder / SCENARIO, to_toml(scenario))
             self._manifest = _manifest(scenario, seed, exchange)
             _write_json(folder / MANIFEST, self._manifest)
-            self._table = _Table(folder / METRICS)
+            self._table = _Table(folder / METRICS, self.metrics.columns)
         self.journal = Journal(None if folder is None else folder / JOURNAL)
 
     def take(self, record: Record) -> None:
@@ -123,16 +141,16 @@ class Recording:
 class _Table:
     """metrics.csv, written as the run goes; a full disk ends it quietly, the journal says so."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, columns: tuple[str, ...]) -> None:
         self._file: IO[str] | None = None
         try:
             self._file = path.open("w", newline="", encoding="utf-8", buffering=1)
             self._writer = csv.writer(self._file)
-            self._writer.writerow(Row._fields)
+            self._writer.writerow(columns)
         except OSError:
             self.close()
 
-    def add(self, row: Row) -> None:
+    def add(self, row: tuple[Any, ...]) -> None:
         if self._file is None:
             return
         try:

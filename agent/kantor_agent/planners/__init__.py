@@ -7,6 +7,7 @@ from kantor_agent.planners.burgard import Burgard
 from kantor_agent.planners.frontier import Frontier
 from kantor_agent.planners.hungarian import Hungarian
 from kantor_agent.planners.kmeans import KMeans
+from kantor_agent.planners.market import Market
 from kantor_agent.planners.spectral import Spectral
 from kantor_agent.planners.team import Allocator
 from kantor_agent.planners.transport import Transport
@@ -23,6 +24,7 @@ ALLOCATORS: dict[str, Callable[[Scenario, int, int | None], Allocator]] = {
     "burgard": Burgard,
     "hungarian": Hungarian,
     "kmeans": KMeans,
+    "market": Market,
 }
 """Those that explore a map: targets for a group. Scenario, seed, and the robot that asks or None."""
 

@@ -17,13 +17,17 @@ class Frontier:
 
     negotiates = False
 
-    def __init__(self, _scenario: Scenario, _seed: int, _me: int | None) -> None:
-        """The strategy has no options."""
+    def __init__(self, _scenario: Scenario, _seed: int, me: int | None) -> None:
+        """me: the robot that asks, for itself alone, or None for the supervisor."""
+        self._me = me
         self._visited: dict[int, list[int]] = {}
 
     def assign(self, situation: Situation, /) -> list[Task]:
-        """Each member's cheapest frontier; of equal ones the lowest cell."""
-        return [self._nearest(member, situation) for member in situation.members]
+        """Each member's cheapest frontier; of equal ones the lowest cell. A robot leaves the others theirs."""
+        return [
+            self._nearest(member, situation) if self._me in (None, member.robot) else member.task
+            for member in situation.members
+        ]
 
     def _nearest(self, member: Member, situation: Situation) -> Task:
         visited = self._visited.setdefault(member.robot, [])

@@ -2,13 +2,13 @@
 
 An assignment
 
-1. K-means divides what is unknown, and the frontiers, into as many regions as there are robots;
+1. K-means divides what is unknown, and the frontiers, into as many regions as robots are in contact;
 2. robots get regions so that the sum of the distances is least (eq. 1-5);
-3. every robot gets a frontier that lies near, and on the way to its region (eq. 6-7).
+3. who needs a target gets a frontier that lies near, and on the way to its region (eq. 6-7).
 
-Everything is in cells. A centroid is in sixteenths of a cell, so that K-means is exact and ends alike in
-every process. The memo of a robot's task is (assignments so far, row, column) of its region's centroid:
-where K-means begins the next time.
+Everything is in cells. A centroid is in sixteenths of a cell, whole numbers, so that K-means ends alike
+in every process. The memo of a robot's task is the count of its assignments, up to two, and its region's
+centroid (row, column): where K-means begins the next time.
 """
 
 import math
@@ -17,7 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import linear_sum_assignment
 
+from kantor_agent.chart import Chart
 from kantor_agent.planners.team import Member, Situation, Task
+from kantor_agent.terrain import Terrain
 from kantor_protocol.grid import NOWHERE, OCCUPIED, UNKNOWN, Frame
 from kantor_protocol.kernels import kernel
 from kantor_protocol.keyed import Purpose, uniform
@@ -26,7 +28,7 @@ from kantor_protocol.scenario import Scenario
 PARTS = 16
 """Of a cell, in which centroids are told."""
 RANDOM_ASSIGNMENTS = 2
-"""So many times a robot's centroid is drawn; from then on its last one is taken."""
+"""So many times a robot's centroid is drawn; from then on its region's is taken."""
 ROUNDS = 20
 """Of K-means, at most; what is not settled by then is settled by the next assignment."""
 NO_REGION = -1
@@ -140,10 +142,12 @@ def _fill_empty(regions: int, label: np.ndarray, away: np.ndarray, sizes: np.nda
     for k in range(regions):
         if sizes[k] > 0:
             continue
-        farthest = -1
+        farthest = NOWHERE
         for i in range(label.shape[0]):
             if sizes[label[i]] > 1 and (farthest < 0 or away[i] > away[farthest]):
                 farthest = i
+        if farthest < 0:
+            return
         sizes[label[farthest]] -= 1
         label[farthest], away[farthest], sizes[k] = k, 0.0, 1
 
@@ -164,6 +168,8 @@ def _move_centroids(
         sums[label[i], 1] += int(at[1, i])
     moved = False
     for k in range(regions):
+        if sizes[k] == 0:
+            continue
         for axis in range(2):
             middle = (2 * sums[k, axis] + sizes[k]) // (2 * sizes[k])
             moved = moved or middle != centroids[k, axis]
@@ -205,8 +211,8 @@ def cluster(
 def find_contour(
     cells: np.ndarray,
     columns: int,
-    points: np.ndarray,
     region: np.ndarray,
+    points: np.ndarray,
     inside: np.ndarray,
     contour: np.ndarray,
 ) -> int:
@@ -330,6 +336,8 @@ def mark_taken(
     frontiers: np.ndarray, columns: int, target: int, range_cells: float, taken: np.ndarray
 ) -> None:
     """A target stands for all frontiers that are nearer to it than the sensor sees."""
+    if target == NOWHERE:
+        return
     for j in range(frontiers.shape[0]):
         near = squared(frontiers[j], target, columns) < range_cells * range_cells
         taken[j] = taken[j] or near or frontiers[j] == target
@@ -367,30 +375,30 @@ def choose(
 
 
 class KMeans:
-    """Regions for robots, and in each assignment targets on the way to them."""
+    """Regions for all robots in contact, and targets on the way to them."""
 
     negotiates = False
 
-    def __init__(self, scenario: Scenario, seed: int, me: int | None) -> None:
-        """me: the robot that asks, or None for the supervisor."""
+    def __init__(self, _scenario: Scenario, seed: int, _me: int | None) -> None:
+        """The rest is the same for everybody."""
         self._seed = seed
 
     def assign(self, situation: Situation, /) -> list[Task]:
-        """Every member's target and region. Without frontiers regions stay what they were."""
-        members, terrain = situation.members, situation.terrain
-        if not situation.frontiers.size:
+        """Every member's target, with its region as a memo. Without frontiers nothing is to be done."""
+        terrain, frontiers, members, others, _, _ = situation
+        if not (members and frontiers.size):
             return [Task(NOWHERE, member.task.memo) for member in members]
-        starts = np.array([self._start(member, terrain.frame) for member in members])
-        travel = np.stack([terrain.travel(m.cell)[situation.frontiers] for m in members])
-        regions = Regions(situation, starts, travel)
-        targets = _targets(situation, regions, travel)
-        return [
-            Task(target, (min(_assignments(member) + 1, RANDOM_ASSIGNMENTS), *place))
-            for member, target, place in zip(members, targets, regions.places, strict=True)
-        ]
+        group = sorted((*members, *others), key=lambda member: member.robot)
+        cells = np.array([member.cell for member in group])
+        starts = np.array([self._start(member, terrain.frame) for member in group])
+        travel = np.stack([terrain.travel(member.cell)[frontiers] for member in group])
+        regions = Regions(terrain, frontiers, cells, starts, travel)
+        mine = [group.index(member) for member in members]
+        targets = _targets(situation, regions, travel, mine)
+        return [Task(targets[i], (_assignments(group[i], 1), *regions.places[i])) for i in mine]
 
     def _start(self, member: Member, frame: Frame) -> tuple[int, int]:
-        """Where the centroid of a member begins: as it was told, or drawn from all places."""
+        """Where a robot's centroid begins: at its region's, or drawn from the whole map."""
         row, column = PARTS * (frame.rows - 1), PARTS * (frame.columns - 1)
         count = _assignments(member)
         if count == RANDOM_ASSIGNMENTS:
@@ -400,57 +408,54 @@ class KMeans:
         return round(uniform(*key, 0) * row), round(uniform(*key, 1) * column)
 
 
-def _assignments(member: Member) -> int:
-    """How many a member has had, as far as it matters."""
-    memo = member.task.memo
-    return min(max(memo[0], 0), RANDOM_ASSIGNMENTS) if memo else 0
+def _assignments(member: Member, more: int = 0) -> int:
+    """How many a robot has had, as far as it matters."""
+    before = max(0, member.task.memo[0]) if member.task.memo else 0
+    return min(before + more, RANDOM_ASSIGNMENTS)
 
 
 class Regions:
     """A partition of what is unknown, and whose each part is (sections IV.A and IV.B)."""
 
-    def __init__(self, situation: Situation, starts: Ints, travel: Floats) -> None:
-        """starts: (members, 2) centroids. travel: (members, frontiers)."""
-        frame, cells = situation.terrain.frame, situation.terrain.chart.cells
-        robots = np.array([member.cell for member in situation.members])
-        region, points = _points(situation)
-        count = min(starts.shape[0], points.shape[0])
+    def __init__(
+        self, terrain: Terrain, frontiers: Ints, robots: Ints, starts: Ints, travel: Floats
+    ) -> None:
+        """robots: (n,) their cells. starts: (n, 2) centroids. travel: (n, frontiers)."""
+        frame, cells = terrain.frame, terrain.chart.cells
+        region = np.full(frame.cells, NO_REGION)
+        points = _points(terrain.chart, frontiers, region)
+        count = min(robots.shape[0], points.shape[0])
         centroids = starts[:count].astype(np.float64)
         _cluster(points, frame.columns, centroids, region)
-        inside, contour = np.zeros(count, np.int64), np.empty_like(points)
-        edges = find_contour(cells, frame.columns, points, region, inside, contour)
         self.diagonal = math.sqrt(frame.rows**2 + frame.columns**2)
+        """l"""
         self.distance = np.full((robots.shape[0], count), np.inf)
-        """(members, regions) eq. 3."""
+        """(n, regions) eq. 3."""
         self.nearest = np.full((robots.shape[0], count), NOWHERE)
-        """(members, regions) the contour cell that is so far."""
-        measured = (self.distance, self.nearest)
-        grid = (cells, frame.columns, region)
-        measure_accessible(*grid, inside, situation.frontiers, travel, *measured)
+        """(n, regions) the contour cell that is so far."""
+        grid, measured = (cells, frame.columns, region), (self.distance, self.nearest)
+        inside, contour = np.zeros(count, np.int64), np.empty_like(points)
+        edges = find_contour(*grid, points, inside, contour)
+        measure_accessible(*grid, inside, frontiers, travel, *measured)
         self.accessible = np.isfinite(self.distance)
-        """(members, regions)"""
-        measure_inaccessible(
-            *grid, contour[:edges], robots, self.accessible, self.diagonal, *measured
-        )
-        self.owned = np.full(robots.shape[0], NO_REGION)
-        """(members,) eq. 4-5; NO_REGION where there are fewer regions than robots."""
+        """(n, regions)"""
+        rest = (robots, self.accessible, self.diagonal)
+        measure_inaccessible(*grid, contour[:edges], *rest, *measured)
         owners, theirs = linear_sum_assignment(self.distance)
+        self.owned = np.full(robots.shape[0], NO_REGION)
+        """(n,) eq. 4-5; NO_REGION for some if there are fewer regions than robots."""
         self.owned[owners] = theirs
-        mine = np.where(self.owned[:, None] == NO_REGION, starts, centroids[self.owned])
-        self.places: list[list[int]] = mine.astype(np.int64).tolist()
-        """(members, 2) the centroid of each one's region, or where it began."""
+        places = starts.copy()
+        places[owners] = centroids[theirs]
+        self.places: list[list[int]] = places.tolist()
+        """(n, 2) the centroid of each one's region, or where it began."""
 
 
-def _points(situation: Situation) -> tuple[Ints, Ints]:
-    """Of each cell NO_REGION or 0; the cells that are to be divided."""
-    chart = situation.terrain.chart
-    count = chart.cells.shape[0]
-    region = np.full(count, NO_REGION)
-    points = np.empty(count, np.int64)
-    room = np.empty(count, np.int64)
-    columns = chart.frame.columns
-    found = gather(chart.cells, columns, situation.frontiers, region, room, points)
-    return region, points[:found]
+def _points(chart: Chart, frontiers: Ints, region: Ints) -> Ints:
+    """The cells that are to be divided, rising."""
+    stack, points = np.empty_like(region), np.empty_like(region)
+    count = gather(chart.cells, chart.frame.columns, frontiers, region, stack, points)
+    return points[:count]
 
 
 def _cluster(points: Ints, columns: int, centroids: Floats, region: Ints) -> None:
@@ -460,25 +465,23 @@ def _cluster(points: Ints, columns: int, centroids: Floats, region: Ints) -> Non
     cluster(points, columns, centroids, *room, *sums, region)
 
 
-def _targets(situation: Situation, regions: Regions, travel: Floats) -> list[int]:
-    """Each member's (section IV.C): first of those whose region is inaccessible, then of the others."""
-    frontiers, terrain = situation.frontiers, situation.terrain
+def _targets(
+    situation: Situation, regions: Regions, travel: Floats, mine: list[int]
+) -> dict[int, int]:
+    """Of these robots of the group (section IV.C): first of those that cannot get to their region yet."""
+    terrain, frontiers = situation.terrain, situation.frontiers
     columns, range_cells = terrain.frame.columns, terrain.sensor_cells
-    costs = travel.min(axis=0)
-    spaced = np.zeros(frontiers.shape[0], np.bool_)
+    costs = travel[mine].min(axis=0)
+    spaced, taken = np.zeros((2, frontiers.shape[0]), np.bool_)
     order = np.argsort(costs, kind="stable")
     space(frontiers, columns, costs, order, range_cells, np.empty_like(frontiers), spaced)
-    taken = np.zeros(frontiers.shape[0], np.bool_)
-    kept = [other.task.target for other in situation.others]
-    for target in (*kept, *situation.absent):
-        if target != NOWHERE:
-            mark_taken(frontiers, columns, target, range_cells, taken)
-    targets = [NOWHERE] * travel.shape[0]
-    for i in _turns(regions):
-        k = regions.owned[i]
-        contour_cell = NOWHERE if k == NO_REGION else int(regions.nearest[i, k])
-        for eligible in (spaced, np.ones_like(spaced)):  # rather a near one than none
-            its = (eligible, taken, travel[i], contour_cell, regions.diagonal)
+    kept = (*(other.task.target for other in situation.others), *situation.absent)
+    for target in kept:
+        mark_taken(frontiers, columns, target, range_cells, taken)
+    targets = dict.fromkeys(mine, NOWHERE)
+    for i in sorted(mine, key=lambda i: _has_way(regions, i)):
+        for eligible in (spaced, np.ones_like(spaced)):  # rather one of the others than none
+            its = (eligible, taken, travel[i], _contour_cell(regions, i), regions.diagonal)
             j = choose(terrain.chart.cells, columns, frontiers, *its)
             if j >= 0:
                 targets[i] = int(frontiers[j])
@@ -487,11 +490,13 @@ def _targets(situation: Situation, regions: Regions, travel: Floats) -> list[int
     return targets
 
 
-def _turns(regions: Regions) -> list[int]:
-    """The members in the order in which they choose."""
+def _has_way(regions: Regions, i: int) -> bool:
+    """Whether a robot can get to its region, or has none."""
+    k = regions.owned[i]
+    return bool(k == NO_REGION or regions.accessible[i, k])
 
-    def waits(i: int) -> bool:
-        k = regions.owned[i]
-        return bool(k == NO_REGION or regions.accessible[i, k])
 
-    return sorted(range(regions.owned.shape[0]), key=waits)
+def _contour_cell(regions: Regions, i: int) -> int:
+    """The nearest of a robot's region, or NOWHERE."""
+    k = regions.owned[i]
+    return NOWHERE if k == NO_REGION else int(regions.nearest[i, k])

@@ -1,0 +1,111 @@
+"""What the referees hold against the record of a mapping run, beside the rules of every run.
+
+`Checker` asks for these rules when a mission has a map. What robots send is followed by the `Survey`,
+which notes faults as numbers; here they are put into words.
+"""
+
+from collections.abc import Callable
+
+from kantor_protocol.grid import FREE, free_way
+from kantor_protocol.machine import ParticipantId, State
+from kantor_worldsim import survey as found
+from kantor_worldsim.records import Act, Batch, Opening
+from kantor_worldsim.survey import NEVER, Survey
+
+Complain = Callable[[str, ParticipantId, str], None]
+"""Takes rule, who and what."""
+
+_WORDS = {
+    found.UNREADABLE: ("map", "sends what nobody can read"),
+    found.NOT_ITS_SCANS: ("map", "its log from {b} on is not what its scans say"),
+    found.FAR_VOID: ("map", "calls a frontier none where it never stood, in its log at {b}"),
+    found.GAP: ("map", "sends its log from {b} on and has not sent what comes before"),
+    found.SHORT: ("map", "its log has {a} entries, its scans gave {b}"),
+    found.FORGETS: ("map", "holds {a} entries of a log of which it held {b}"),
+    found.FOREIGN: ("union", "forwards an entry at {b} of {origin}'s log that {origin} never sent"),
+    found.MORE: ("union", "holds {a} entries of a log that has {b}"),
+    found.FALSE_CELL: ("truth", "sees cell {a} as {kind}, which it is not"),
+}
+"""Rule and text of each fault."""
+
+
+class MapRules:
+    """Follows the records of one mapping run and complains.
+
+    Rules
+    -----
+    wall        no robot is accepted in a cell that is not free, nor on a straight way through one
+    map         what a robot sends of its log is what its scans say, entry for entry, but for frontiers that
+                it calls none where it stood; a version vector never falls, so that no cell is forgotten
+    truth       no scan calls a cell free or occupied that is not (without noise)
+    union       what is forwarded of a log is what its robot sent, and nobody holds more of it than that;
+                so that what robots hold by their version vectors is the union of these prefixes
+    finish      who says that it has finished can reach no frontier by what it holds (without noise)
+    """
+
+    def __init__(self, survey: Survey, complain: Complain) -> None:
+        """survey: may be shared with other referees of the same run."""
+        self._survey = survey
+        self._complain = complain
+
+    def open(self, opening: Opening) -> None:
+        """Begin with the first record."""
+        self._survey.take(opening)
+        self._exact = opening.scenario.sensor.noise_m == 0.0
+        self._names = opening.scenario.roster
+        self._poses_m = dict(zip(self._names, self._survey.poses_m, strict=False))
+        self._finished: set[ParticipantId] = set()
+        for name in self._poses_m:
+            if not self._is_free(name):
+                self._complain("wall", name, "starts where it is not free")
+
+    def check(self, batch: Batch) -> int:
+        """Follow one batch; how many faults went without a complaint, since there are too many."""
+        self._survey.take(batch)
+        faults, count = self._survey.faults
+        for fault, row, _, a, b in faults.tolist():
+            self._put_into_words(batch, fault, row, a, b)
+        for act in batch.acts:
+            if act.ruling is not None and act.outputs is not None and act.name in self._poses_m:
+                self._check_way(act)
+                self._check_finish(act)
+        return count - faults.shape[0]
+
+    def _put_into_words(self, batch: Batch, fault: int, row: int, a: int, b: int) -> None:
+        rule, text = _WORDS[fault]
+        origin = self._names[a] if fault == found.FOREIGN else ""
+        kind = "occupied" if b else "free"
+        self._complain(rule, batch.acts[row].name, text.format(a=a, b=b, origin=origin, kind=kind))
+
+    def _check_way(self, act: Act) -> None:
+        assert act.ruling is not None
+        before, now = self._poses_m[act.name], (act.ruling.pose.x_m, act.ruling.pose.y_m)
+        if now == before:
+            return
+        self._poses_m[act.name] = now
+        if not self._is_free(act.name):
+            self._complain("wall", act.name, f"stands at {now[0]:.6g}, {now[1]:.6g} m in a wall")
+        elif free_way(self._survey.ground.cells, FREE, *self._uv(before), *self._uv(now)) < 1.0:
+            self._complain("wall", act.name, f"went to {now[0]:.6g}, {now[1]:.6g} m through a wall")
+
+    def _is_free(self, name: ParticipantId) -> bool:
+        frame, cells = self._survey.ground
+        cell = frame.cell_of(*self._poses_m[name])
+        return bool(cell >= 0 and cells[divmod(cell, frame.columns)] == FREE)
+
+    def _uv(self, xy_m: tuple[float, float]) -> tuple[float, float]:
+        """In cells, column axis first."""
+        frame = self._survey.frame
+        return (
+            (xy_m[0] - frame.origin_m[0]) / frame.resolution_m,
+            (xy_m[1] - frame.origin_m[1]) / frame.resolution_m,
+        )
+
+    def _check_finish(self, act: Act) -> None:
+        assert act.outputs is not None
+        if act.outputs.state is not State.FINISHED or act.name in self._finished:
+            return
+        self._finished.add(act.name)
+        cell = self._survey.reachable(act.name) if self._exact else NEVER
+        if cell != NEVER:
+            self._complain("finish", act.name, f"could go to the frontier in cell {cell}")
