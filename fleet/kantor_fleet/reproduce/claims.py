@@ -303,7 +303,7 @@ class Lowest(NamedTuple):
         }
         first = means[self.named[0][0]]
         ours = ", ".join(
-            f"{name} {mean:.4g}" for name, mean in sorted(means.items(), key=lambda item: item[1])
+            f"{name} {mean:,.0f}" for name, mean in sorted(means.items(), key=lambda item: item[1])
         )
         reading = f"below {' and '.join(self.above)}" if self.above else "either"
         lowest = first == min(means.values())
@@ -353,11 +353,11 @@ class GeometricRatio(NamedTuple):
 
 
 class Lower(NamedTuple):
-    """Of several pairs of groups the first lies below the second, in geometric means."""
+    """Of several pairs of groups the first lies below the second, setting by setting."""
 
     text: str
     named: tuple[tuple[str, Group, Group], ...]
-    """Name, lower, upper."""
+    """Name, lower, upper; in both groups the same place stands for the same thing."""
     published: str
     measure: Measure
 
@@ -367,20 +367,27 @@ class Lower(NamedTuple):
         return tuple(s for _, lower, upper in self.named for s in (*lower, *upper))
 
     def judge(self, figure: str, flights: Flights) -> Verdict:
-        """Lower over upper."""
+        """Lower over upper; missed if one lies above, beyond its interval if it has one."""
         ratios = {
-            name: self._mean(flights, lower) / self._mean(flights, upper)
+            name: geometric(found)
             for name, lower, upper in self.named
+            if (found := list(self._ratios(flights, lower, upper)))
         }
-        ours = ", ".join(f"{name} {ratio:.2f}" for name, ratio in ratios.items())
-        known = [ratio for ratio in ratios.values() if not math.isnan(ratio)]
-        verdict = OK if all(ratio < 1.0 for ratio in known) else MISS
-        return Verdict(figure, self.text, self.published, "each < 1", ours, verdict)
+        ours = ", ".join(f"{name} {times(*ratio)}" for name, ratio in ratios.items())
+        missed = any(
+            mean > (factor if math.isfinite(factor) else 1.0) for mean, factor in ratios.values()
+        )
+        reading = "each below 1, or not clearly above"
+        return Verdict(figure, self.text, self.published, reading, ours, MISS if missed else OK)
 
-    def _mean(self, flights: Flights, group: Group) -> float:
-        """Not a number if a part of the runs has none of these."""
-        runs = [flight for setting in group for flight in flights.get(setting, ())]
-        return geometric([self.measure(flight) for flight in runs])[0] if runs else math.nan
+    def _ratios(self, flights: Flights, lower: Group, upper: Group) -> Iterator[float]:
+        """Of geometric means, of settings that have runs: their starts are not the same ones."""
+        for one, other in zip(lower, upper, strict=True):
+            if flights.get(one) and flights.get(other):
+                low, high = (
+                    geometric(map(self.measure, flights[each]))[0] for each in (one, other)
+                )
+                yield low / high
 
 
 def mean_ratio(

@@ -45,7 +45,7 @@ def bars(
 ) -> Figure:
     """The map, and for each reading means with 95 % intervals, uncoordinated beside coordinated."""
     figure = Figure(figsize=(13.2, 6.8), layout=new_layout())
-    left, right = figure.subfigures(1, 2, width_ratios=(0.72, 1.0))
+    left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(0.72, 1.0))[0]
     _draw_map(left.subplots(), scenario)
     places = right.subplots(2, 2, sharey=True)
     for axes, (title, sides) in zip(places.flat, panels.items(), strict=True):

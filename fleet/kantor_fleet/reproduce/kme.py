@@ -42,8 +42,8 @@ _PLANNERS = {
     YAMAUCHI: ("planner.name=frontier",),
     BURGARD: ("planner.name=burgard",),
     ZLOT: ("planner.name=market", "planner.goals=quadtree"),
-    "Zlot, greedy goals": ("planner.name=market", "planner.goals=greedy"),
-    "Zlot, random goals": ("planner.name=market", "planner.goals=random"),
+    "Zlot greedy": ("planner.name=market", "planner.goals=greedy"),
+    "Zlot random": ("planner.name=market", "planner.goals=random"),
 }
 PLANNERS = (KME, YAMAUCHI, BURGARD, ZLOT)
 OTHERS = PLANNERS[1:]

@@ -4,7 +4,7 @@ import msgspec
 
 from kantor_fleet.reproduce.flights import Flight
 from kantor_fleet.sweep.table import Row
-from kantor_worldsim.metrics import Result
+from kantor_worldsim.metrics import MapResult, Result
 
 
 def finished(flight: Flight) -> float:
@@ -14,7 +14,7 @@ def finished(flight: Flight) -> float:
     return float(flight.result.ticks if done is None else done)
 
 
-def surveyed(flight: Flight) -> "MapResult":
+def surveyed(flight: Flight) -> MapResult:
     """What a flight over a map came to."""
     assert flight.result is not None
     assert flight.result.map is not None
