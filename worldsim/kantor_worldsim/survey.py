@@ -560,7 +560,7 @@ class Survey:
     def _move(self, place: int, ruling: Ruling) -> None:
         x_m, y_m = self.poses_m[place]
         pose = ruling.pose
-        if ruling.bumps:
+        if ruling.bumped:
             self.bumps.append((pose.x_m, pose.y_m))
         if (pose.x_m, pose.y_m) != (x_m, y_m):
             self.ways_m[place] += math.hypot(pose.x_m - x_m, pose.y_m - y_m)
