@@ -33,6 +33,8 @@ from kantor_protocol.scenario import Scenario
 
 _SURE_STEPS = 3
 """So many steps in a row without a frontier end the mission of a robot."""
+_PROGRESS_CELLS = 0.25
+"""A robot gets on when its way gets shorter by as much."""
 _ON_TARGET_CELLS = 0.75
 """It has arrived when its target's middle is so near."""
 
@@ -72,7 +74,7 @@ class Mapper:
         self._scanned_step = -1
         self._scanned_pose: Pose | None = None
         self._task, self._since, self._arrived = Task(), 0, False
-        self._progressed, self._left = 0, 0
+        self._progressed, self._left_cells = 0, math.inf
         self._without = 0
         self._resting = False
 
@@ -144,7 +146,7 @@ class Mapper:
     def _take(self, task: Task) -> None:
         if task.target != self._task.target:
             self._arrived = False
-            self._progressed, self._left = self._step, 0
+            self._progressed, self._left_cells = self._step, math.inf
         self._task, self._since = task, self._tick
 
     def _may_go_on(self) -> bool:
@@ -183,8 +185,8 @@ class Mapper:
         place = self._navigator.head(self._pose, self._task.target)
         if place is None:
             return
-        if self._left == 0 or self._navigator.left < self._left:
-            self._progressed, self._left = self._step, self._navigator.left
+        if self._navigator.left_cells < self._left_cells - _PROGRESS_CELLS:
+            self._progressed, self._left_cells = self._step, self._navigator.left_cells
         self._pose = self._vehicle.drive(self._pose, *place, dt_s)
 
     def _queues(self) -> bool:

@@ -1,5 +1,7 @@
 """From a target cell to the next place to head for, round the walls that are known."""
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
@@ -34,11 +36,8 @@ class Navigator:
         self._target = NOWHERE
         self._way: npt.NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self._passed = 0
-
-    @property
-    def left(self) -> int:
-        """Cells of the way that are left; falls as the robot gets on."""
-        return int(self._way.shape[0]) - self._passed
+        self.left_cells = math.inf
+        """How far it still is, about; falls as the robot gets on."""
 
     def head(self, pose: Pose, target: int) -> tuple[float, float] | None:
         """Where to head for, world frame; None if no way is known."""
@@ -54,7 +53,10 @@ class Navigator:
             self._target = NOWHERE
             return None
         self._passed = ahead
-        return self._frame.centre_of(int(self._way[ahead]))
+        place_m = self._frame.centre_of(int(self._way[ahead]))
+        away_m = math.dist(place_m, (pose.x_m, pose.y_m))
+        self.left_cells = away_m / self._frame.resolution_m + self._way.shape[0] - 1 - ahead
+        return place_m
 
     def _look_ahead(self, pose: Pose) -> int:
         frame = self._frame

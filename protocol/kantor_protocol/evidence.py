@@ -32,7 +32,7 @@ CODES = 65534
 HIT, PASS, CERTAIN = 85, -40, 294
 """Evidence in 1/100 of log odds: +0.85, -0.40, and at most ln 19 in size (P within [0.05, 0.95])."""
 
-_LEARNT_BEAMS = 8
+_LEARNT_BEAMS = 4
 _NOISE_CELLS_MAX = 0.5
 """A wall is looked for this far around where a noisy beam ended, at most: further, and there are always
 several cells to choose from."""

@@ -8,9 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from grounds import drawn, exploration, grounds
 from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.scenario import Scenario
-from kantor_worldsim.channel import DROPPED, Channel, Sent, Verdict, links
+from kantor_worldsim.channel import DROPPED, OPEN, Channel, Sent, Verdict, Walls, links
+from kantor_worldsim.maps import Ground
+from kantor_worldsim.sensors import walls_between
 from strategies import SEEDS, examples, mission
 
 MS = 1_000_000
@@ -126,6 +129,160 @@ def test_supervisor_has_a_range_of_its_own() -> None:
     assert (receivers(spoken), too_far) == (["r1", "r2"], 1)
     assert [verdict.source for verdict in answered] == ["r1", "r2"]
     assert robots == []
+
+
+# Walls.
+
+TWO_WALLS = drawn(
+    "..#..#..",
+    "..#..#..",
+    "..#.....",
+    resolution_m=2.0,
+    origin_m=(100.0, -50.0),
+)
+ROW_M = -45.0
+"""The y of places in the highest row."""
+
+
+def among_walls(*overrides: str, places_m: Sequence[tuple[float, float]]) -> Channel:
+    """A channel on the map of two walls, with robots, and the supervisor if there is one, at places."""
+    scenario = exploration(f"robots.count={len(places_m)}", *overrides)
+    made = Channel(scenario, 1, TWO_WALLS)
+    for name, place_m in zip(scenario.robot_ids, places_m, strict=True):
+        made.place(name, Pose(*place_m))
+    if scenario.centralized:
+        made.place(SUPERVISOR, Pose(*scenario.supervisor_m))
+    return made
+
+
+IN_A_ROW = [(101.0, ROW_M), (103.0, ROW_M), (107.0, ROW_M), (115.0, ROW_M)]
+"""r1 and r2 before both walls, r3 between them, r4 behind."""
+
+
+@pytest.mark.parametrize(
+    ("radio", "heard_by"),
+    [
+        ((), ["r2", "r3", "r4"]),
+        (("radio.line_of_sight=true",), ["r2"]),
+        (("radio.range_m=14.0",), ["r2", "r3", "r4"]),
+        (("radio.range_m=14.0", "radio.wall_loss_m=0.1"), ["r2", "r3"]),
+        (("radio.range_m=16.0", "radio.wall_loss_m=1.0"), ["r2", "r3", "r4"]),
+        (("radio.range_m=16.0", "radio.wall_loss_m=1.01"), ["r2", "r3"]),
+        (("radio.range_m=16.0", "radio.wall_loss_m=10.01"), ["r2"]),
+        (("radio.range_m=3.0", "radio.wall_loss_m=40.0"), ["r2"]),
+        (("radio.wall_loss_m=1e9",), ["r2", "r3", "r4"]),
+        (("radio.wall_loss_m=1e9", "radio.line_of_sight=true"), ["r2"]),
+    ],
+)
+def test_walls_shorten_the_range(radio: tuple[str, ...], heard_by: list[ParticipantId]) -> None:
+    """Each by its loss, the bound included; with line of sight they end it. Who hears nothing is counted."""
+    channel_there = among_walls(*radio, places_m=IN_A_ROW)
+    verdicts, out_of_range = channel_there.transmit([said("r1", 1)])
+
+    assert (receivers(verdicts), out_of_range) == (heard_by, 3 - len(heard_by))
+
+
+def test_way_around_a_wall_is_in_sight() -> None:
+    """What stands beside the line does not matter."""
+    radio = among_walls("radio.line_of_sight=true", places_m=[(107.0, -49.0), (115.0, -49.0)])
+
+    assert receivers(radio.transmit([said("r1", 1)])[0]) == ["r2"]
+
+
+@pytest.mark.parametrize(
+    ("place_m", "speaks", "hear"),
+    [
+        ("[107.0, -45.0]", ["r3"], ["r3"]),
+        ("[107.0, -47.0]", ["r3"], ["r3"]),
+        ("[101.0, -40.0]", [], []),  # outside is a wall
+    ],
+)
+def test_walls_stand_before_a_supervisor_with_a_place(
+    place_m: str, speaks: list[ParticipantId], hear: list[ParticipantId]
+) -> None:
+    """Both ways, whatever its range."""
+    overrides = (CENTRALIZED, f"supervisor.pose_m={place_m}", "radio.line_of_sight=true")
+    radio = among_walls(*overrides, places_m=IN_A_ROW)
+    spoken, _ = radio.transmit([said(SUPERVISOR, 1)])
+    heard, _ = radio.transmit([said(f"r{i}", 1, SUPERVISOR) for i in range(1, 5)])
+
+    assert receivers(spoken) == hear
+    assert [verdict.source for verdict in heard] == speaks
+
+
+def test_supervisor_has_its_own_range_less_the_walls() -> None:
+    """The loss is the radio's, the range its own."""
+    overrides = (CENTRALIZED, "supervisor.pose_m=[101.0, -45.0]", "supervisor.range_m=15.0")
+    radio = among_walls(*overrides, "radio.wall_loss_m=2.0", "radio.range_m=1.0", places_m=IN_A_ROW)
+
+    assert receivers(radio.transmit([said(SUPERVISOR, 1)])[0]) == ["r1", "r2", "r3"]
+
+
+def test_supervisor_without_a_place_is_heard_everywhere() -> None:
+    """It is nowhere on the map, so nothing stands between."""
+    overrides = (CENTRALIZED, "radio.line_of_sight=true", "radio.wall_loss_m=1.0")
+    radio = among_walls(*overrides, places_m=IN_A_ROW)
+
+    assert receivers(radio.transmit([said(SUPERVISOR, 1)])[0]) == ["r1", "r2", "r3", "r4"]
+    assert receivers(radio.transmit([said("r1", 1)])[0]) == ["r2", SUPERVISOR]
+
+
+@examples(200)
+@given(
+    ground=grounds(),
+    places=st.lists(st.tuples(*2 * [st.floats(0.0, 1.0)]), min_size=3, max_size=3),
+    range_cells=st.floats(0.0, 15.0) | st.just(math.inf),
+    loss_cells=st.sampled_from([0.0, 1.0]) | st.floats(0.0, 8.0),
+    line_of_sight=st.booleans(),
+)
+def test_hearing_through_walls_is_mutual(
+    ground: Ground,
+    places: list[tuple[float, float]],
+    range_cells: float,
+    loss_cells: float,
+    line_of_sight: bool,  # noqa: FBT001
+) -> None:
+    """Of two robots both hear each other or none, as the plain rule says; links are counted alike."""
+    frame, cells = ground
+    side_m, (left_m, bottom_m) = frame.resolution_m, frame.origin_m
+    xy_m = np.array(
+        [
+            (left_m + u * frame.columns * side_m, bottom_m + v * frame.rows * side_m)
+            for u, v in places
+        ]
+    )
+    range_m, loss_m = range_cells * side_m, loss_cells * side_m
+    scenario = exploration(
+        "robots.count=3",
+        f"radio.range_m={range_m!r}",
+        f"radio.wall_loss_m={loss_m!r}",
+        f"radio.line_of_sight={str(line_of_sight).lower()}",
+    )
+    radio = Channel(scenario, 1, ground)
+    for name, (x_m, y_m) in zip(scenario.robot_ids, xy_m.tolist(), strict=True):
+        radio.place(name, Pose(x_m, y_m))
+    verdicts, out_of_range = radio.transmit([said(name, 1) for name in scenario.robot_ids])
+    expected = set()
+    uv = ((xy_m - (left_m, bottom_m)) / side_m).tolist()
+    for i, one in enumerate(scenario.robot_ids):
+        for j, other in enumerate(scenario.robot_ids):
+            walls = walls_between(cells, *uv[i], *uv[j])
+            dx, dy = (xy_m[i] - xy_m[j]).tolist()
+            reach_m = range_m - walls * loss_m
+            hindered = line_of_sight and walls > 0
+            within = reach_m >= 0.0 and dx * dx + dy * dy <= reach_m * reach_m
+            if i != j and within and not hindered:
+                expected.add((one, other))
+
+    assert {(verdict.source, verdict.target) for verdict in verdicts} == expected
+    assert len(expected) + out_of_range == 6
+    assert links(xy_m, range_m, Walls.of(scenario.radio, ground)) == len(expected) / 2
+
+
+def test_walls_that_do_not_matter_are_not_looked_at() -> None:
+    """Without loss and line of sight a map is as good as none."""
+    assert Walls.of(exploration().radio, TWO_WALLS) is OPEN
+    assert Walls.of(exploration("radio.line_of_sight=true").radio, None) is OPEN
 
 
 # Targets.

@@ -127,7 +127,7 @@ ODD = Batch(
                 weights=bytes(70_000),
                 outbox=(Envelope("r01", 1, SUPERVISOR, bytes(300)), Envelope("r3", 2, "", b"")),
             ),
-            Ruling(Pose(7, -300), ((1, 2.0, 3.0),), ("speed", "units", "s" * 300)),
+            Ruling(Pose(7, -300), ((1, 2.0, 3.0),), ("speed", "units", "s" * 300), bumped=True),
         ),
         Act("r1", 0, Observation(0, Pose(0.0, 0.0)), (), Outputs(1, Pose(0.0, 0.0)), None),
     ),

@@ -2,16 +2,25 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from grounds import HEADINGS, drawn, exploration, places
+from grounds import Place as Stand
+from kantor_protocol.grid import FREE, Frame, free_way
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import SUPERVISOR, Outputs, Pose
+from kantor_protocol.messages import RefusedError
 from kantor_protocol.packing import Pairs
+from kantor_protocol.scenario import ScenarioError
 from kantor_protocol.walk import Walk
-from kantor_worldsim.world import Ruling, Site, World
+from kantor_worldsim.maps import Ground
+from kantor_worldsim.records import Opening, decode_record, encode_record, opening_of
+from kantor_worldsim.sensors import RangeFinder
+from kantor_worldsim.world import STANDOFF_CELLS, Ruling, Site, World, stopped
 from strategies import SEEDS, examples, mission
 
 PERIOD_NS = 100_000_000
@@ -271,3 +280,241 @@ def test_no_robot_gets_around_the_rules(
     assert shipped <= 3
     assert len(set(found)) == len(found)
     assert there.found.sum() == len(found)
+
+
+# On a map.
+
+ROOM = drawn(
+    "........",
+    ".####...",
+    ".#..#...",
+    ".#......",
+    ".####...",
+    "........",
+)
+"""A room of two by two cells with a door to the right, in the middle of free space."""
+
+
+def on(
+    ground: Ground,
+    start: Place,
+    *targets: Place,
+    overrides: tuple[str, ...] = ("sensor.range_m=8",),
+) -> World:
+    """A world with this map, r1 at a start, and these targets."""
+    where = Site(np.zeros((0, 2)), np.array(targets).reshape(-1, 2), np.array([start]), ground)
+    return World(exploration("vehicle.speed_m_s=100", *overrides), 1, where)
+
+
+@examples(1000)
+@given(stand=places(), data=st.data())
+def test_nobody_ends_in_a_wall(stand: Stand, data: st.DataObject) -> None:
+    """Wherever robots want to go: they end in free cells, on their way, and are told if it was cut."""
+    ground, pose = stand
+    side_m, (x_m, y_m) = ground.frame.resolution_m, ground.frame.origin_m
+    lattice = st.integers(-4, 40).map(lambda k: k / 2)
+    for _ in range(data.draw(st.integers(1, 5))):
+        u, v = data.draw(st.tuples(lattice, lattice) | st.tuples(*2 * [st.floats(-3.0, 12.0)]))
+        wanted = Pose(x_m + u * side_m, y_m + v * side_m, 1.0, 2.0)
+        end, bumped = stopped(ground, pose, wanted)
+        cell = ground.frame.cell_of(end.x_m, end.y_m)
+
+        assert cell >= 0
+        assert ground.cells.flat[cell] == FREE
+        assert (end == wanted) == (not bumped)
+        if bumped:
+            way_m = math.hypot(wanted.x_m - pose.x_m, wanted.y_m - pose.y_m)
+            gone_m = math.hypot(end.x_m - pose.x_m, end.y_m - pose.y_m)
+            left_m = math.hypot(wanted.x_m - end.x_m, wanted.y_m - end.y_m)
+            assert gone_m + left_m == pytest.approx(way_m, rel=1e-9, abs=1e-9)
+            assert (end.heading_rad, end.speed_m_s) == (1.0, 0.0)
+        pose = end
+
+
+@examples(300)
+@given(stand=places(), share=st.floats(0.0, 1.0), heading=HEADINGS)
+def test_what_is_free_is_not_cut(stand: Stand, share: float, heading: float) -> None:
+    """A move that ends well before the next wall happens as it was wanted."""
+    ground, pose = stand
+    side_m, (x_m, y_m) = ground.frame.resolution_m, ground.frame.origin_m
+    u, v = (pose.x_m - x_m) / side_m, (pose.y_m - y_m) / side_m
+    far = 20.0
+    to_u, to_v = u + far * math.cos(heading), v + far * math.sin(heading)
+    open_cells = far * free_way(ground.cells, FREE, u, v, to_u, to_v)
+    way_m = share * max(0.0, open_cells - 1e-3) * side_m
+    wanted = Pose(pose.x_m + way_m * math.cos(heading), pose.y_m + way_m * math.sin(heading))
+    end, bumped = stopped(ground, pose, wanted)
+
+    assert (end, bumped) == (wanted, False)
+
+
+@pytest.mark.parametrize(
+    ("start", "wanted", "end"),
+    [
+        ((0.5, 0.5), (7.5, 0.5), None),
+        ((0.5, 2.5), (2.5, 2.5), (1.0 - STANDOFF_CELLS, 2.5)),
+        ((2.5, 2.5), (6.5, 2.5), None),
+        ((2.5, 2.5), (2.5, -3.0), (2.5, 2.0 + STANDOFF_CELLS)),
+        ((0.5, 0.5), (-9.0, 0.5), (STANDOFF_CELLS, 0.5)),
+        ((0.5, 2.5), (1.0, 2.5), (1.0 - STANDOFF_CELLS, 2.5)),  # a border belongs to the wall
+        ((2.0, 2.5), (1.5, 2.5), (2.0, 2.5)),
+        ((0.995, 2.5), (1.5, 2.5), (0.995, 2.5)),
+    ],
+)
+def test_wall_stops_a_move(start: Place, wanted: Place, end: Place | None) -> None:
+    """Just before the wall, or where it was; it is counted, told, and breaks no rule."""
+    there = on(ROOM, start)
+    ruling = there.accept("r1", PERIOD_NS, Outputs(1, Pose(*wanted, 0.5, 9.0)))
+    truth = Pose(*wanted, 0.5, 9.0) if end is None else Pose(*end, 0.5, 0.0)
+
+    assert ruling == Ruling(truth, bumped=end is not None)
+    assert there.pose("r1") == truth
+    look = there.observe("r1")
+    assert (look.pose, look.bumped) == (truth, end is not None)
+
+
+def test_corners_are_not_cut() -> None:
+    """Between two walls that meet at a corner there is no way through."""
+    there = on(drawn("#.", ".#"), (0.5, 0.5))
+    ruling = there.accept("r1", PERIOD_NS, Outputs(1, Pose(1.5, 1.5)))
+
+    assert ruling.bumped
+    assert max(ruling.pose.x_m, ruling.pose.y_m) < 1.0
+
+
+def test_bump_is_told_of_the_last_step_alone() -> None:
+    """A step that is refused for its speed has met nothing; a stale one changes nothing."""
+    there = on(ROOM, (0.5, 2.5))
+    told = []
+    for step, place in [
+        (1, (2.0, 2.5)),
+        (1, (0.5, 2.5)),
+        (2, (99.0, 2.5)),
+        (3, (9.0, 2.5)),
+        (4, (0.5, 2.5)),
+    ]:
+        ruling = there.accept("r1", step * PERIOD_NS, Outputs(step, Pose(*place)))
+        told.append((ruling.violations, ruling.bumped, there.observe("r1").bumped))
+
+    assert told == [
+        ((), True, True),
+        (("step",), False, True),
+        (("speed",), False, False),
+        ((), True, True),
+        ((), False, False),
+    ]
+
+
+def test_scan_is_told_until_the_next() -> None:
+    """At time 0 and after every accepted step, from the true pose."""
+    there = on(ROOM, (0.5, 2.5))
+    finder = RangeFinder(exploration("sensor.range_m=8").sensor, ROOM, 1)
+    first = there.observe("r1").scan
+    there.accept("r1", PERIOD_NS, Outputs(1, Pose(3.0, 2.5, 1.0)))
+    second = there.observe("r1")
+
+    assert first == finder.scan(0, 0, Pose(0.5, 2.5))
+    assert second.scan == finder.scan(0, 1, second.pose)
+    assert (second.pose.x_m, second.bumped) == (1.0 - STANDOFF_CELLS, True)
+    there.accept("r1", PERIOD_NS, Outputs(1, Pose(0.5, 0.5)))  # stale
+    assert there.observe("r1").scan == there.observe("r1").scan == second.scan
+
+
+def test_each_scan_has_noise_of_its_own() -> None:
+    """A robot that stands still measures anew in every step, and seeds differ."""
+    noisy = ("sensor.range_m=8", "sensor.noise_m=0.1")
+    there = on(ROOM, (0.5, 2.5), overrides=noisy)
+    scans = [there.observe("r1").scan]
+    for step in (1, 2):
+        there.accept("r1", step * PERIOD_NS, Outputs(step, Pose(0.5, 2.5)))
+        scans.append(there.observe("r1").scan)
+
+    assert len(set(scans)) == 3
+    assert on(ROOM, (0.5, 2.5), overrides=noisy).observe("r1").scan == scans[0]
+
+
+def test_supervisor_is_in_no_cell() -> None:
+    """It has no scanner, and may stand in a wall."""
+    there = on(
+        ROOM, (0.5, 0.5), overrides=("coordination=centralized", "supervisor.pose_m=[1.5, 1.5]")
+    )
+    ruling = there.accept(SUPERVISOR, PERIOD_NS, Outputs(1, Pose(1.5, 1.5)))
+
+    assert ruling == Ruling(Pose(1.5, 1.5))
+    assert there.observe(SUPERVISOR).scan == b""
+
+
+@pytest.mark.parametrize("start", [(1.5, 2.5), (1.0, 1.5), (-0.1, 0.5), (8.0, 0.5)])
+def test_start_in_a_wall_is_refused(start: Place) -> None:
+    """Also on the lower borders of one, and outside."""
+    with pytest.raises(ScenarioError, match=r"r1 at .* is in no free cell"):
+        on(ROOM, start)
+
+
+@pytest.mark.parametrize(
+    ("target", "seen"),
+    [
+        ((0.5, 5.5), 1),
+        ((0.5, 0.5), 1),
+        ((2.5, 2.5), 0),  # behind a wall
+        ((1.5, 2.5), 0),  # in it
+        ((6.5, 2.5), 0),
+        ((0.5, 7.5), 0),  # outside
+        ((7.5, 5.5), 0),
+    ],
+)
+def test_targets_are_seen_within_range_and_in_sight(target: Place, seen: int) -> None:
+    """On a map nothing is found through walls."""
+    there = on(ROOM, (0.5, 2.5), target, overrides=("sensor.range_m=6.5",))
+
+    assert there.first_look() == {"r1": ((0, *target),) * seen}
+
+
+def test_nothing_can_be_shipped_on_a_map() -> None:
+    """There is no mass, so there is no energy to spend on it."""
+    there = on(ROOM, (0.5, 0.5))
+
+    assert there.accept("r1", PERIOD_NS, Outputs(1, Pose(0.5, 0.5), spent=SPENT)).violations == (
+        "units",
+    )
+
+
+def test_site_of_a_map() -> None:
+    """The layout, starts in its free cells, no samples; targets only from a file."""
+    scenario = exploration("robots.count=4", "map.size_m=[20.0, 10.0]")
+    site_of_map = Site.of(scenario, 3)
+    ground = site_of_map.ground
+    assert ground is not None
+    cells = [ground.frame.cell_of(x_m, y_m) for x_m, y_m in site_of_map.starts_m]
+
+    assert (ground.cells.shape, site_of_map.starts_m.shape) == ((10, 20), (4, 2))
+    assert (site_of_map.samples_m.shape, site_of_map.targets_m.shape) == ((0, 2), (0, 2))
+    assert (ground.cells.flat[cells] == FREE).all()
+    World(scenario, 3, site_of_map)
+
+
+def test_opening_holds_the_map() -> None:
+    """What was recorded is what a replay stands on; without a map nothing is added."""
+    scenario = exploration()
+    there = Site(np.zeros((0, 2)), np.zeros((0, 2)), np.array([[0.5, 0.5]]), ROOM)
+    opening = decode_record(encode_record(opening_of(scenario, 1, there, {"r1": ()})))
+    assert isinstance(opening, Opening)
+    ground = opening.site.ground
+    assert ground is not None
+
+    assert ground.frame == ROOM.frame
+    assert (ground.cells == ROOM.cells).all()
+    assert ground.cells.flags.writeable
+    assert opening.units.whole == 0
+    plain = opening_of(mission(), 1, site(), {})
+    assert (plain.ground, plain.frame, plain.site.ground) == (None, None, None)
+
+
+def test_map_that_does_not_fit_its_frame_is_refused() -> None:
+    """A forged opening is no use, and crashes nothing."""
+    there = Site(np.zeros((0, 2)), np.zeros((0, 2)), np.array([[0.5, 0.5]]), ROOM)
+    opening = opening_of(exploration(), 1, there, {"r1": ()})
+    frame = Frame(1.0, (0.0, 0.0), 8, 6)
+
+    with pytest.raises(RefusedError):
+        _ = msgspec.structs.replace(opening, frame=frame).site

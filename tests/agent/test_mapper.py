@@ -1,0 +1,279 @@
+"""Robots on unknown maps, with or without a supervisor, in the real world-sim (in process)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from grounds import drawn
+from kantor_agent import dispatch
+from kantor_agent.mapper import Mapper
+from kantor_agent.planners.team import Member, Task
+from kantor_fleet.team import play, team
+from kantor_protocol.evidence import entries
+from kantor_protocol.grid import FREE, UNKNOWN
+from kantor_protocol.machine import SUPERVISOR, Inputs, Observation, Pose, State, StateMachine
+from kantor_protocol.scenario import MAP_PLANNERS, Scenario, parse
+from kantor_supervisor.allocation import Allocation
+from kantor_worldsim.maps import Ground
+from kantor_worldsim.records import Batch, Ending, Record
+from kantor_worldsim.starts import observable, starts_on
+from kantor_worldsim.world import Site
+
+ROOMS = drawn(
+    "####################",
+    "#......#.....#.....#",
+    "#......#.....#.....#",
+    "#............#.....#",
+    "#......#...........#",
+    "####.######.####.###",
+    "#..................#",
+    "#..................#",
+    "###.#####.######.###",
+    "#......#.....#.....#",
+    "#......#.....#.....#",
+    "#......#.....#.....#",
+    "####################",
+)
+MISSION = """
+name = "rooms"
+limit_s = 600
+robots = { count = 3 }
+starts = { random = true }
+map = { layout = "blank" }
+vehicle = { speed_m_s = 1 }
+clock = { period_s = 1 }
+sensor = { range_m = 4, beams = 120 }
+planner = { name = "burgard", remember_s = 30 }
+"""
+
+
+def mission(*overrides: str) -> Scenario:
+    """Three robots in seven rooms."""
+    return parse(MISSION, "rooms", overrides)
+
+
+class Played:
+    """A mission to its end, with what everybody then held."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        ground: Ground = ROOMS,
+        seed: int = 1,
+        disturb: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        starts_m = starts_on(
+            ground,
+            poses_m=scenario.starts.poses_m,
+            random=scenario.starts.random,
+            spread=scenario.starts.spread,
+            spots=0,
+            count=scenario.robots.count,
+            seed=seed,
+        )
+        site = Site(np.zeros((0, 2)), np.zeros((0, 2)), starts_m, ground)
+        self.machines: dict[str, Any] = dict(team(scenario, seed, site))
+        self.records: list[Record] = []
+        machines: dict[str, StateMachine] = dict(self.machines)
+        if disturb is not None:
+            disturb(machines)
+        self.reason = play(scenario, seed, site, [self.records.append], machines=machines)
+        self.ground = ground
+        self.observable = observable(ground, starts_m).ravel()
+
+    @property
+    def batches(self) -> list[Batch]:
+        """In order."""
+        return [record for record in self.records if isinstance(record, Batch)]
+
+    @property
+    def ticks(self) -> int:
+        """Until everybody rested."""
+        ending = self.records[-1]
+        assert isinstance(ending, Ending)
+        return ending.now_ns // 1_000_000_000
+
+    def cells(self, name: str = "r1") -> np.ndarray:
+        """What a robot knows at the end."""
+        return np.asarray(self.machines[name]._chart.cells)
+
+    def assert_explored(self) -> None:
+        """Everybody rests and knows everything that can be seen, as it is."""
+        truth = self.ground.cells.ravel()
+        assert self.reason == "done"
+        for name in ("r1", "r2", "r3"):
+            known = self.cells(name) != UNKNOWN
+            assert (self.cells(name)[known] == truth[known]).all()
+            assert known[(truth == FREE) & self.observable].all()
+
+
+@pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
+@pytest.mark.parametrize("planner", sorted(MAP_PLANNERS))
+def test_every_planner_explores_it_all_and_rests(planner: str, coordination: str) -> None:
+    """Each robot by itself, when no frontier can be reached any more."""
+    played = Played(mission(f"planner={planner}", f"coordination={coordination}"))
+
+    played.assert_explored()
+    assert not any(
+        act.ruling.violations or act.ruling.bumped
+        for batch in played.batches
+        for act in batch.acts
+        if act.ruling
+    )
+
+
+def test_who_knows_the_same_comes_to_the_same_assignment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In contact with everybody and without loss, all robots decide the same at the same time."""
+    decided: dict[int, list[dict[int, Task]]] = {}
+    decide = dispatch.Dispatch.decide
+
+    def noted(
+        self: dispatch.Dispatch, group: list[Member], absent: list[int], tick: int
+    ) -> dict[int, Task]:
+        tasks = decide(self, group, absent, tick)
+        decided.setdefault(tick, []).append(tasks)
+        return tasks
+
+    monkeypatch.setattr(dispatch.Dispatch, "decide", noted)
+    for planner in ("burgard", "kmeans", "hungarian"):
+        decided.clear()
+        Played(mission(f"planner={planner}")).assert_explored()
+        full = {tick: tasks for tick, tasks in decided.items() if len(tasks) == 3}
+
+        assert sum(bool(tasks[0]) for tasks in full.values()) > 5
+        assert all(tasks[0] == tasks[1] == tasks[2] for tasks in full.values())
+
+
+def test_a_robot_that_hears_nobody_explores_alone() -> None:
+    """Range 0: everybody does everything, and none rests before."""
+    alone = Played(mission("radio.range_m=0"))
+    together = Played(mission())
+
+    alone.assert_explored()
+    assert alone.ticks > together.ticks
+
+
+@pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
+def test_loss_delay_and_repetition_cost_time_alone(coordination: str) -> None:
+    """What was lost comes again; what comes twice counts once."""
+    bad = ("drop=0.3", "duplicate=0.3", "delay_s=0.5", "jitter_s=1.5", "reorder=0.2")
+    overrides = [f"radio.{fault}" for fault in bad]
+
+    Played(mission(f"coordination={coordination}", *overrides)).assert_explored()
+
+
+def test_without_their_supervisor_robots_go_on_by_themselves() -> None:
+    """One that is out of range of everybody gives no orders."""
+    out_of_range = ("supervisor.range_m=0", "supervisor.pose_m=[500.0, 500.0]")
+
+    Played(mission("coordination=centralized", *out_of_range)).assert_explored()
+
+
+def test_a_supervisor_that_falls_silent_is_done_without() -> None:
+    """Its last orders hold until they are out of date."""
+
+    class Falling:
+        def __init__(self, machine: StateMachine) -> None:
+            self.machine, self.steps = machine, 0
+
+        def step(self, inputs: Inputs, /) -> Any:
+            self.steps += 1
+            outputs = self.machine.step(inputs)
+            return outputs if self.steps < 12 else type(outputs)(outputs.step, outputs.pose)
+
+    def disturb(machines: dict[str, Any]) -> None:
+        machines[SUPERVISOR] = Falling(machines[SUPERVISOR])
+
+    Played(mission("coordination=centralized"), disturb=disturb).assert_explored()
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("sensor.field_of_view_deg=40", "sensor.beams=9"),
+        ("sensor.beams=7",),
+        ("sensor.noise_m=0.2",),
+        ("vehicle=unicycle", "vehicle.acceleration_m_s2=1", "vehicle.turn_rate_rad_s=1"),
+        ("vehicle=second-order", "vehicle.acceleration_m_s2=1"),
+        ("clock.spread=0.3", "clock.drift_ppm=1000"),
+        ("clock.order=turn", "coordination=centralized"),
+    ],
+    ids=["narrow", "few beams", "noise", "unicycle", "second order", "clocks", "in turn"],
+)
+def test_every_mission_ends(overrides: tuple[str, ...]) -> None:
+    """A frontier that shows nothing, or is not reached, is given up; nobody circles for ever."""
+    assert Played(mission(*overrides)).reason == "done"
+
+
+def test_bodies_keep_apart_on_the_way_to_the_same_target() -> None:
+    """Without coordination, robots that start side by side would else become one."""
+    uncoordinated = ("planner.coordinated=false", "starts.spread=together")
+
+    def merged(played: Played) -> int:
+        poses = [
+            {(act.ruling.pose.x_m, act.ruling.pose.y_m) for act in batch.acts if act.ruling}
+            for batch in played.batches
+        ]
+        return sum(len(places) < 3 for places in poses)
+
+    assert merged(Played(mission(*uncoordinated))) > 10
+    assert merged(Played(mission(*uncoordinated, "vehicle.radius_m=0.5"))) <= 3
+
+
+def test_one_robot_needs_no_coordination() -> None:
+    """Burgard et al., section 4: alone, coordinated and uncoordinated are the same, to the bit."""
+    one = ("robots.count=1", "coordination=decentralized")
+    records = [
+        [
+            (act.outputs.pose, act.outputs.goal)
+            for batch in Played(mission(*one, f"planner.coordinated={flag}")).batches
+            for act in batch.acts
+            if act.outputs
+        ]
+        for flag in ("true", "false")
+    ]
+
+    assert records[0] == records[1]
+
+
+def test_rest_is_final() -> None:
+    """A robot that rests stands, heads nowhere and keeps talking."""
+    played = Played(mission("radio.range_m=6"))
+    resting: dict[str, Pose] = {}
+    for batch in played.batches:
+        for act in batch.acts:
+            assert act.outputs is not None
+            if act.name in resting:
+                assert act.outputs.pose == resting[act.name]
+                assert act.outputs.state is State.FINISHED
+            if act.outputs.state is State.FINISHED:
+                resting[act.name] = act.outputs.pose
+                assert act.outputs.goal is None
+                assert len(act.outputs.outbox) == 1
+
+
+def test_a_late_word_moves_nobody() -> None:
+    """An observation of an older step is no news, neither of the place nor of the walls."""
+    scenario = mission("robots.count=1")
+    robot = Mapper("r1", scenario, 0, (2.5, 2.5), ROOMS.frame)
+    scan = np.full(scenario.sensor.beams, 65535, dtype="<u2").tobytes()
+    robot.step(Inputs(1, Observation(0, Pose(2.5, 2.5), (), scan)))
+    held = robot._replica.store.length[0]
+    outputs = robot.step(Inputs(2, Observation(0, Pose(9.5, 9.5), (), scan)))
+
+    assert outputs.pose.x_m == 2.5
+    assert held > 0
+    assert robot._replica.store.length[0] == held
+
+
+def test_a_supervisor_is_light_on_what_it_does_not_know() -> None:
+    """Before anybody has spoken it has nobody to send anywhere."""
+    scenario = mission("coordination=centralized")
+    supervisor = Allocation(SUPERVISOR, scenario, 0, ROOMS.frame)
+    outputs = supervisor.step(Inputs(1, Observation(0, Pose(0.0, 0.0))))
+
+    assert outputs.state is State.EXPLORING
+    assert len(outputs.outbox) == 1
+    assert entries(ROOMS.frame) > 3 * ROOMS.frame.cells
