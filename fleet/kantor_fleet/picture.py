@@ -11,21 +11,30 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib import colormaps
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import EllipseCollection, LineCollection, PathCollection
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.patches import Rectangle
 
 from kantor_fleet.style import EMPTY, FAINT, FOUND, INK, MISSED, TEAM, TEXT_PT, team_colours
+from kantor_protocol.grid import FREE
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
 from kantor_protocol.packing import Pairs
 from kantor_protocol.walk import Walk
-from kantor_worldsim.metrics import Metrics
+from kantor_worldsim.recording import metrics_of
 from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
+from kantor_worldsim.survey import Survey
 
 _WEIGHT = ListedColormap(colormaps["YlOrBr"](np.linspace(0.2, 0.65, 256)))
 """The weight left in a sample, from hardly any to all."""
 
+_TIME = ListedColormap(0.5 + 0.5 * colormaps["viridis"](np.linspace(0.0, 1.0, 256))[:, :3])
+"""When a cell was first seen: pale, since the robots' ways lie over it."""
+_WALL, _UNSEEN_WALL = 0.5, 0.88
+"""How much darker a known wall is than the floor of that time; the grey of an unknown one."""
+
+_CELLS_SHOWN, _EDGES_SHOWN = 2_000, 100_000
 _POINTS_SHOWN = 200_000
 _STROKE_POINTS = 4_096
 """The rasterizer gives up on very long lines, so a trail is drawn in strokes."""
@@ -60,12 +69,11 @@ class Run:
 
     def __init__(self, opening: Opening) -> None:
         self.scenario, self.seed, self.site = opening.scenario, opening.seed, opening.site
-        self.metrics = Metrics()
+        self.metrics = metrics_of(self.scenario)
         self.end_ns = 0
         self.contact_s: float | None = None
         """When a robot first took in a message."""
-        domain = self.scenario.domain
-        grain_m = _GRAIN * float(np.hypot(*np.subtract(domain.max_m, domain.min_m)))
+        grain_m = _GRAIN * self._diagonal_m
         starts_m = zip(self.scenario.robot_ids, self.site.starts_m.tolist(), strict=True)
         self.trails = {name: Trail(x_m, y_m, grain_m) for name, (x_m, y_m) in starts_m}
         self._units = opening.units
@@ -87,8 +95,16 @@ class Run:
         return run
 
     @property
+    def _diagonal_m(self) -> float:
+        """Of what the picture shows."""
+        if self.site.ground is not None:
+            return self.site.ground.frame.diagonal_m
+        domain = self.scenario.domain
+        return float(np.hypot(*np.subtract(domain.max_m, domain.min_m)))
+
+    @property
     def finish_s(self) -> float | None:
-        """When the last robot saw no weight left, if all came to see that."""
+        """When the last robot saw no weight left, or no frontier to go to, if all came to see that."""
         if len(self._finished_ns) < self.scenario.robots.count:
             return None
         return max(self._finished_ns.values()) * 1e-9
@@ -150,6 +166,51 @@ def draw_domain(axes: Axes, run: Run) -> None:
     axes.add_patch(outline)
 
 
+def draw_known(axes: Axes, survey: Survey, period_s: float) -> None:
+    """The true walls as outlines; what is known by the time at which somebody first saw it."""
+    frame, cells = survey.frame, survey.ground.cells
+    step = max(1, -(-max(frame.rows, frame.columns) // _CELLS_SHOWN))
+    first_tick = survey.books.first_tick.reshape(cells.shape)[::step, ::step]
+    free, known = cells[::step, ::step] == FREE, first_tick >= 0
+    last_s = max(1, survey.tick) * period_s
+    paint = ScalarMappable(Normalize(0.0, last_s), _TIME)
+    colours = paint.to_rgba(first_tick * period_s)[..., :3]
+    colours = np.where(free[..., None], colours, _WALL * colours)
+    colours = np.where(known[..., None], colours, np.where(free[..., None], 1.0, _UNSEEN_WALL))
+    left, right, bottom, top = frame.extent_m
+    right += (-frame.columns % step) * frame.resolution_m
+    top += (-frame.rows % step) * frame.resolution_m
+    axes.imshow(
+        colours, origin="lower", extent=(left, right, bottom, top), interpolation="none", zorder=0.2
+    )
+    edges_m = _edges(survey)
+    if edges_m.shape[0] <= _EDGES_SHOWN:
+        outlines = LineCollection(list(edges_m), colors=FAINT, linewidths=0.5, zorder=0.6)
+        axes.add_collection(outlines)
+    add_scale(axes, paint, "first seen at  0 s", f"{last_s:.4g} s")
+
+
+def _edges(survey: Survey) -> Points:
+    """(E, 2, 2) borders between free cells and others, world frame."""
+    frame = survey.frame
+    free = np.pad(survey.ground.cells == FREE, 1)
+    row, column = np.nonzero(free[1:, 1:-1] != free[:-1, 1:-1])
+    level = np.stack((column, row, column + 1, row), axis=1)
+    row, column = np.nonzero(free[1:-1, 1:] != free[1:-1, :-1])
+    upright = np.stack((column, row, column, row + 1), axis=1)
+    cells = np.concatenate((level, upright)).reshape(-1, 2, 2)
+    return np.asarray(cells * frame.resolution_m + np.array(frame.origin_m))
+
+
+def draw_bumps(axes: Axes, survey: Survey) -> None:
+    """Where robots ended a move at a wall."""
+    if survey.bumps:
+        xy_m = np.array(survey.bumps)
+        xy_m = xy_m[thinned(xy_m.shape[0], _POINTS_SHOWN)]
+        size = _mark_size(xy_m.shape[0], 30.0)
+        _add_marks(axes, xy_m, s=size, c=MISSED, marker="1", lw=1.1, zorder=4.5, label="bump")
+
+
 def draw_trails(axes: Axes, run: Run) -> None:
     """Every robot's way, its start a cross, its end a dot."""
     few = len(run.trails) <= len(TEAM)
@@ -195,16 +256,16 @@ def draw_samples(axes: Axes, run: Run, *, scale: bool = True) -> None:
             zorder=1.5,
         )
         if scale:
-            _add_scale(axes, marks)
+            add_scale(axes, marks, "weight left  0 %", "100 %")
         else:
             label = "sample with weight left"
             axes.plot([], [], "o", ms=4.0, mew=0.0, color=_WEIGHT(1.0), label=label)
 
 
-def _add_scale(axes: Axes, marks: PathCollection) -> None:
-    """What the samples' colours mean, in the map's upper right corner, outside."""
+def add_scale(axes: Axes, marks: ScalarMappable, low: str, high: str) -> None:
+    """What colours mean, in the map's upper right corner, outside. low, high: the words at its ends."""
     place = axes.inset_axes((0.86, 1.009, 0.14, 0.014))
-    bar = axes.figure.colorbar(marks, cax=place, orientation="horizontal", ticks=[0.0, 1.0])
+    bar = axes.figure.colorbar(marks, cax=place, orientation="horizontal", ticks=[])
     bar.ax.set_xticks([])
     bar.outline.set_visible(False)
     words: dict[str, Any] = {
@@ -213,8 +274,8 @@ def _add_scale(axes: Axes, marks: PathCollection) -> None:
         "size": TEXT_PT,
         "color": INK,
     }
-    place.text(-0.04, 0.5, "weight left  0 %", ha="right", **words)
-    place.text(1.04, 0.5, "100 %", ha="left", **words)
+    place.text(-0.04, 0.5, low, ha="right", **words)
+    place.text(1.04, 0.5, high, ha="left", **words)
 
 
 def draw_targets(axes: Axes, run: Run) -> None:
@@ -235,7 +296,8 @@ def draw_targets(axes: Axes, run: Run) -> None:
 
 def draw_supervisor(axes: Axes, run: Run) -> None:
     """Where the supervisor stands, if there is one."""
-    if run.scenario.centralized:
+    placed = not run.scenario.mapping or run.scenario.supervisor.pose_m is not None
+    if run.scenario.centralized and placed:
         x_m, y_m = run.scenario.supervisor_m
         axes.plot([x_m], [y_m], "*", ms=15.0, mfc="white", mec=INK, zorder=6.0, label="supervisor")
 

@@ -130,18 +130,21 @@ _STYLES = {"waiting": "yellow", "running": "green", "over": "cyan"}
 
 
 def _explored(progress: Progress) -> str:
-    """Share of the mass that is used up."""
+    """Share of the mass that is used up, or of the map that somebody has seen."""
     return f"{100.0 * (1.0 - progress.mass_left):.0f} %"
 
 
 def _figures(progress: Progress) -> list[tuple[str, str]]:
     """Names and values, in the order in which they are shown."""
-    bound = progress.w_ub
     detected = [("detected", f"{progress.detected}/{progress.targets}")] if progress.targets else []
+    if progress.distance_m is not None:  # a mission on a map has neither energy nor bound
+        figures = [("distance", f"{progress.distance_m:.0f} m"), *detected]
+    else:
+        energy = f"{progress.energy_spent}/{progress.energy_total}"
+        bound = f"{progress.w_ub:.1f}" if progress.w_ub >= 100.0 else f"{progress.w_ub:.4g}"
+        figures = [("energy", energy), *detected, ("W_UB", bound)]
     return [
-        ("energy", f"{progress.energy_spent}/{progress.energy_total}"),
-        *detected,
-        ("W_UB", f"{bound:.1f}" if bound >= 100.0 else f"{bound:.4g}"),
+        *figures,
         ("links", f"{progress.links}"),
         ("msg/s", f"{progress.messages_per_s:.0f}"),
         ("done", f"{progress.robots_done}/{progress.robots}"),

@@ -5,6 +5,7 @@ Left the map as the run left it, right how it got there. Times are simulated sec
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,7 +16,9 @@ from matplotlib.lines import Line2D
 
 from kantor_fleet.picture import (
     Run,
+    draw_bumps,
     draw_domain,
+    draw_known,
     draw_radio,
     draw_samples,
     draw_supervisor,
@@ -29,12 +32,15 @@ from kantor_fleet.style import (
     FOUND,
     INK,
     SECOND,
+    TEXT_PT,
     THIRD,
     TITLE_PT,
     add_caption,
     add_legend,
+    team_colours,
     tidy,
 )
+from kantor_worldsim.exploration import Exploration, MapRow
 from kantor_worldsim.metrics import Row
 from kantor_worldsim.records import Record
 
@@ -62,7 +68,10 @@ def draw(records: Iterable[Record], path: Path, exact: Sequence[tuple[float, flo
     grid = figure.add_gridspec(2, 2, height_ratios=(0.08, 0.92), width_ratios=(1.65, 1.0))
     _write_title(figure.add_subfigure(grid[0, :]), run)
     _draw_map(figure.add_subfigure(grid[1, 0]), run)
-    _draw_curves(figure.add_subfigure(grid[1, 1]), run, exact)
+    if isinstance(run.metrics, Exploration):
+        _draw_exploration(figure.add_subfigure(grid[1, 1]), run, run.metrics)
+    else:
+        _draw_curves(figure.add_subfigure(grid[1, 1]), run, exact)
     figure.savefig(path, format="png", dpi=DPI)
 
 
@@ -76,12 +85,13 @@ def _write_title(place: SubFigure, run: Run) -> None:
 
 def _what(run: Run) -> str:
     scenario, robots = run.scenario, run.scenario.robots.count
+    merge = f"{scenario.merge} merge {'with' if scenario.claiming else 'without'} claims"
     parts = (
         scenario.name,
         f"seed {run.seed}",
         "1 robot" if robots == 1 else f"{robots} robots",
         scenario.coordination,
-        f"{scenario.merge} merge {'with' if scenario.claiming else 'without'} claims",
+        *(() if scenario.mapping else (merge,)),
         f"{scenario.planner.name} planner",
     )
     return _GAP.join(parts)
@@ -97,6 +107,10 @@ def _outcome(run: Run) -> str:
         parts.append(f"finished at tick {result.finished_tick:,}")
     else:
         parts.append(f"{_ENDED.get(result.ended, result.ended)} at tick {result.ticks:,}")
+    if result.map is not None:
+        parts.append(f"{100.0 * result.map.explored:.1f} % explored")
+        parts.append(f"{result.map.distance_m:,.0f} m driven")
+        return _GAP.join(parts)
     parts.append(f"mass left {100.0 * result.mass_left:.1f} %")
     bound_m = result.w_ub.paper
     digits = f"{bound_m:,.0f}" if bound_m >= 1000.0 else f"{bound_m:.4g}"
@@ -107,9 +121,13 @@ def _outcome(run: Run) -> str:
 def _draw_map(place: SubFigure, run: Run) -> None:
     """The map as the run left it. Every mark names itself for the legend."""
     axes = place.subplots()
-    draw_domain(axes, run)
+    if isinstance(run.metrics, Exploration):
+        draw_known(axes, run.metrics.survey, run.scenario.period_ns * 1e-9)
+        draw_bumps(axes, run.metrics.survey)
+    else:
+        draw_domain(axes, run)
+        draw_samples(axes, run)
     draw_trails(axes, run)
-    draw_samples(axes, run)
     draw_targets(axes, run)
     draw_supervisor(axes, run)
     draw_radio(axes, run)
@@ -132,12 +150,59 @@ def _draw_curves(place: SubFigure, run: Run, exact: Sequence[tuple[float, float]
     _draw_bounds(bounds, run, rows, exact)
     _draw_progress(progress, run, rows)
     _draw_mass(mass, rows)
-    tidy(mass, "simulated time, s", "mass, %")
+    tidy(mass, "", "mass, %")
+    _finish_curves(place, (bounds, progress, mass), run)
+
+
+def _finish_curves(place: SubFigure, diagrams: Sequence[Axes], run: Run) -> None:
+    """What all diagrams of a run share: the axis of time, and moments on it."""
+    diagrams[-1].set_xlabel("simulated time, s", size=TEXT_PT, color=INK)
     end_s = max(run.end_ns, run.scenario.period_ns) * 1e-9
-    mass.set_xlim(0.0, 1.02 * end_s)  # so that what happens at the very end is seen
-    moments = _mark_moments((bounds, progress, mass), run)
+    diagrams[-1].set_xlim(0.0, 1.02 * end_s)  # so that what happens at the very end is seen
+    moments = _mark_moments(diagrams, run)
     if moments:
         add_legend(place, moments)
+
+
+def _draw_exploration(place: SubFigure, run: Run, exploration: Exploration) -> None:
+    """How a map became known, over simulated time."""
+    explored, wtv, epv = place.subplots(3, 1, sharex=True, height_ratios=(1.7, 1.0, 1.0))
+    rows = exploration.rows
+    thin = thinned(len(rows), _ROWS_SHOWN)
+    _draw_explored(explored, run, exploration, thin)
+    for axes, values, label, colour in (
+        (wtv, [row.wtv for row in rows], "WTV, ticks²", SECOND),
+        (epv, [row.epv for row in rows], "EPV, %²", THIRD),
+    ):
+        _add_line(axes, rows[thin], values[thin], f"{label.partition(',')[0]} of 8 regions", colour)
+        axes.set_ylim(bottom=0.0)
+        tidy(axes, "", label)
+        add_caption(axes, axes.lines)
+    _finish_curves(place, (explored, wtv, epv), run)
+
+
+def _draw_explored(axes: Axes, run: Run, exploration: Exploration, thin: slice) -> None:
+    """What somebody has seen, tick by tick, and what each robot knows, row by row."""
+    survey, period_s = exploration.survey, run.scenario.period_ns * 1e-9
+    times_s = [row.time_s for row in exploration.rows[thin]]
+    colours = team_colours(run.scenario.robots.count)
+    known = np.array(exploration.shares[thin]).T
+    for share, colour in zip(known, colours, strict=True):
+        axes.plot(times_s, 100.0 * share, color=colour, lw=1.0, alpha=0.9, clip_on=False)
+    axes.lines[0].set_label("a robot")
+    seen = 100.0 * np.cumsum(np.bincount(survey.stamps, minlength=1)) / max(1, survey.total)
+    end = run.end_ns * 1e-9
+    ticks_s = np.append(np.arange(seen.shape[0]) * period_s, max(end, 0.0))
+    (union,) = axes.plot(ticks_s, np.append(seen, seen[-1]), color=FIRST, lw=2.0, label="anybody")
+    handles = [union, axes.lines[0]]
+    for share, tick, mark in ((95.0, survey.t95_tick, "o"), (99.0, survey.t99_tick, "s")):
+        if tick is not None:
+            label = f"{share:.0f} %: {tick * period_s:.1f} s"
+            style: dict[str, Any] = {"ms": 6.0, "mfc": "white", "mec": FIRST, "label": label}
+            handles += axes.plot([tick * period_s], [share], mark, zorder=4.0, **style)
+    axes.set_ylim(0.0, 102.0)
+    tidy(axes, "", "explored, %")
+    add_caption(axes, handles, columns=2)
 
 
 def _draw_bounds(
@@ -195,7 +260,7 @@ def _mark_moments(diagrams: Sequence[Axes], run: Run) -> list[Line2D]:
 
 def _add_line(
     axes: Axes,
-    rows: Sequence[Row],
+    rows: Sequence[Row | MapRow],
     values: Sequence[float | None],
     label: str,
     colour: str,

@@ -16,7 +16,7 @@ from kantor_fleet.team import play
 from kantor_protocol.bus import BusError
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.journal import read
-from kantor_worldsim.metrics import Result
+from kantor_worldsim.metrics import MapResult, Result
 from kantor_worldsim.process import progress
 from kantor_worldsim.recording import (
     JOURNAL,
@@ -89,13 +89,43 @@ def verdict(result: Result) -> Exit:
 
 def summary(result: Result) -> str:
     """A few lines for a person."""
+    finished = "-" if result.finished_tick is None else f"tick {result.finished_tick}"
+    wire = result.bytes_per_robot_tick
+    rules = "all rules held" if not result.violations else f"{result.violations} VIOLATIONS"
+    own_part = f"{wire.weights:.1f} B weights"
+    if result.map is not None:
+        own_part = f"{result.map.log_bytes_per_robot_tick:.1f} B of maps"
+    radio = (
+        f"{result.deliveries} deliveries, {result.drops} dropped, "
+        f"{result.out_of_range_refused} out of range; "
+        f"{own_part}, {wire.total:.1f} B in all a robot and tick"
+    )
+    lines = [
+        f"{result.scenario} (seed {result.seed}, {result.exchange}): {result.ended}",
+        *(_of_density(result) if result.map is None else _of_map(result, result.map)),
+        f"  finished  {finished}; {result.ticks} ticks, {result.wall_s:.1f} s",
+        *(_of_mass(result) if result.map is None else ()),
+        f"  radio     {radio}",
+        f"  checker   {rules}; record {result.record}",
+        *(f"            {complaint}" for complaint in result.complaints),
+        f"  digest    {result.digest}",
+    ]
+    return "\n".join(lines)
+
+
+def _found(result: Result) -> str:
     found = f"{result.detected}/{result.targets} targets"
     if result.detection_rate is not None:
         found += f" ({100.0 * result.detection_rate:.1f} %)"
-    finished = "-" if result.finished_tick is None else f"tick {result.finished_tick}"
-    wire = result.bytes_per_robot_tick
+    return f"  detected  {found}"
+
+
+def _of_density(result: Result) -> list[str]:
+    return [_found(result)]
+
+
+def _of_mass(result: Result) -> list[str]:
     tight = "-" if result.w_ub.tight is None else f"{result.w_ub.tight:.4g}"
-    rules = "all rules held" if not result.violations else f"{result.violations} VIOLATIONS"
     energy = (
         f"{result.energy_spent}/{result.energy_total} points, "
         f"{100.0 * result.mass_left:.2f} % of the mass left, "
@@ -106,23 +136,26 @@ def summary(result: Result) -> str:
         f"{result.w_ub_start:.4g} -> {result.w_ub.paper:.4g} "
         f"(tight {tight}{exact}, last tick's {result.w_ub.final_instant:.4g})"
     )
-    radio = (
-        f"{result.deliveries} deliveries, {result.drops} dropped, "
-        f"{result.out_of_range_refused} out of range; "
-        f"{wire.weights:.1f} B weights, {wire.total:.1f} B in all a robot and tick"
+    return [f"  energy    {energy}", f"  W_UB      {bound}"]
+
+
+def _of_map(result: Result, map_: MapResult) -> list[str]:
+    def tick(value: int | None) -> str:
+        return "-" if value is None else f"{value}"
+
+    explored = (
+        f"{100.0 * map_.explored:.1f} %; 95 % at tick {tick(map_.t95_tick)}, "
+        f"99 % at {tick(map_.t99_tick)}, known to all at {tick(map_.all_t99_tick)}, "
+        f"complete at {tick(map_.completed_tick)}"
     )
-    lines = [
-        f"{result.scenario} (seed {result.seed}, {result.exchange}): {result.ended}",
-        f"  detected  {found}",
-        f"  finished  {finished}; {result.ticks} ticks, {result.wall_s:.1f} s",
-        f"  energy    {energy}",
-        f"  W_UB      {bound}",
-        f"  radio     {radio}",
-        f"  checker   {rules}; record {result.record}",
-        *(f"            {complaint}" for complaint in result.complaints),
-        f"  digest    {result.digest}",
-    ]
-    return "\n".join(lines)
+    distance = (
+        f"{map_.distance_m:.0f} m, {map_.longest_m:.0f} m by one; "
+        f"overlap {100.0 * map_.overlap:.0f} %, {map_.bumps} bumps, {map_.switches} switches"
+    )
+    even = f"WTV {map_.wtv_mean.r8:.4g} (final {map_.wtv_final.r8:.4g}), EPV {map_.epv_mean.r8:.4g}"
+    found = [_found(result)] if result.targets else []
+    lines = [f"  explored  {explored}", f"  distance  {distance}", f"  8 regions {even}"]
+    return [*lines, *found]
 
 
 def _run_in_process(

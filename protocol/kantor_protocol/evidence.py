@@ -1,9 +1,10 @@
 """What range scans say about the cells of a map (Burgard et al., eq. 1-3, in log odds), and how it travels.
 
 A scan gives every cell that a beam passes or ends in one piece of evidence: against or for a wall,
-whichever its beams say in sum. Sums are clamped, so that no cell is ever certain. What a robot tells others is the sign of its sum: an entry
-in its log whenever a cell becomes free or occupied to it. The log is append-only and its robot alone
-writes it, so that it is replicated as every other log (`replica.py`), and nobody merges merged maps.
+whichever its beams say in sum. Sums are clamped, so that no cell is ever certain. What a robot tells
+others is the sign of its sum: an entry in its log whenever a cell becomes free or occupied to it. The
+log is append-only and its robot alone writes it, so that it is replicated as every other log
+(`replica.py`), and nobody merges merged maps.
 
 Entries of a log, for a map of n cells
     2 cell          the cell is free        2 cell + 1     the cell is occupied

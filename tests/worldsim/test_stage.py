@@ -6,6 +6,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from grounds import drawn, exploration
+from kantor_fleet.team import play
 from kantor_protocol.machine import (
     EVERYBODY,
     Envelope,
@@ -16,7 +18,8 @@ from kantor_protocol.machine import (
     State,
 )
 from kantor_protocol.messages import BODY_BYTES_MAX
-from kantor_worldsim.records import Act, Batch, Ending, Mailbag, Opening, Record
+from kantor_worldsim.maps import Ground
+from kantor_worldsim.records import Act, Batch, Ending, Mailbag, Opening, Record, encode_record
 from kantor_worldsim.stage import Stage, Step
 from kantor_worldsim.world import Site
 from strategies import mission
@@ -243,3 +246,60 @@ def test_time_of_the_stage_never_runs_back() -> None:
     theatre.stage.settle(PERIOD_NS // 2, [Step("r2", late, outputs(1, (24.0, 0.0), source="r2"))])
 
     assert theatre.stage.now_ns == PERIOD_NS
+
+
+# On a map.
+
+
+def explored(ground: Ground, *overrides: str) -> list[Record]:
+    """The record of two robots that explore a map from its lower left."""
+    scenario = exploration("robots.count=2", "sensor.range_m=3", "vehicle.speed_m_s=10", *overrides)
+    starts_m = np.array([[1.5, 1.5], [2.5, 1.5]])
+    records: list[Record] = []
+    stopped = iter(range(200))
+    site = Site(np.zeros((0, 2)), np.zeros((0, 2)), starts_m, ground)
+    play(scenario, 1, site, [records.append], stopped=lambda: next(stopped, None) is None)
+    return records
+
+
+FLAT = drawn(
+    "############",
+    "#....#.....#",
+    "#....#.....#",
+    "#..........#",
+    "#....#.....#",
+    "#....#.....#",
+    "############",
+)
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        (),
+        ("coordination=centralized",),
+        ("sensor.noise_m=0.1", "radio.wall_loss_m=3.0", "radio.range_m=8"),
+    ],
+    ids=["decentralized", "centralized", "noisy"],
+)
+def test_mission_on_a_map_is_the_same_from_its_opening(overrides: tuple[str, ...]) -> None:
+    """The opening holds all that a run starts from: played from there, every record is the same."""
+    records = explored(FLAT, *overrides)
+    opening = records[0]
+    assert isinstance(opening, Opening)
+    ground = opening.site.ground
+    assert ground is not None
+    again = explored(ground, *overrides)
+
+    assert [encode_record(record) for record in again] == [encode_record(r) for r in records]
+
+
+def test_robots_on_a_map_explore_it() -> None:
+    """They see its walls and no others, hit none, and are done."""
+    records = explored(FLAT)
+    rulings = [act.ruling for record in records if isinstance(record, Batch) for act in record.acts]
+    ending = records[-1]
+
+    assert isinstance(ending, Ending)
+    assert ending.reason == "done"
+    assert not any(ruling.violations or ruling.bumped for ruling in rulings if ruling)

@@ -537,6 +537,8 @@ def _check(
 class Checker:
     """Follows the records of one run and collects complaints.
 
+    A mission with a map has no weights, energy or ledger; it has rules of its own, see `MapRules`.
+
     Rules
     -----
     range       no envelope is delivered to anybody beyond the range at the time of sending
@@ -554,8 +556,6 @@ class Checker:
                 (spectral; not once an output is missing from the record)
     order       steps count up by one, time never runs back, an opening first, nothing after the end
     ruling      the world found no fault of its own
-
-    A mission with a map has no weights, energy or ledger; its own rules stand in `MapRules`.
     """
 
     def __init__(self, reader: Reader | None = None, survey: Survey | None = None) -> None:

@@ -22,10 +22,10 @@ import numpy.typing as npt
 
 from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import State
-from kantor_worldsim.channel import links
+from kantor_worldsim.channel import Walls, links
 from kantor_worldsim.metrics import Bounds, ByRegions, Following, MapResult
 from kantor_worldsim.reading import Reader
-from kantor_worldsim.records import Act, Batch, Opening, Record
+from kantor_worldsim.records import Act, Batch, Opening
 from kantor_worldsim.survey import Survey
 
 EVERY = 10
@@ -116,7 +116,7 @@ class Exploration(Following):
     rows: list[MapRow]
 
     def __init__(self, reader: Reader | None = None, survey: Survey | None = None) -> None:
-        """reader, survey: those that another referee of the same run follows it by."""
+        """reader, survey: those that other referees of the same run follow it by, after this one."""
         super().__init__(reader)
         self.survey = survey or Survey(self._reader)
         self.shares: list[list[float]] = []
@@ -125,12 +125,8 @@ class Exploration(Following):
         """The longest that a robot stood still that had not finished."""
         self.switches = 0
 
-    def take(self, record: Record) -> None:
-        """Follow one record."""
-        self.survey.take(record)
-        super().take(record)
-
     def _begin(self, opening: Opening) -> None:
+        self.survey.take(opening)
         scenario, frame = opening.scenario, self.survey.frame
         self._every = scenario.metrics.every or EVERY
         self._robots = scenario.robots.count
@@ -150,9 +146,11 @@ class Exploration(Following):
             name: _Pace((x, y)) for name, (x, y) in zip(scenario.robot_ids, starts_m, strict=True)
         }
         self._range_m = scenario.sensor.range_m
+        self._walls = Walls.of(scenario.radio, self.survey.ground)
         self._resolution_m = frame.resolution_m
 
     def _attend(self, batch: Batch, _reading: tuple[Any, ...]) -> None:
+        self.survey.take(batch)  # not before: a row tells how things stood at the end of its tick
         for act in batch.acts:
             pace = self._paces.get(act.name)
             if pace is not None:
@@ -190,7 +188,7 @@ class Exploration(Following):
                 wtv=self._now.item(0, _SHOWN),
                 epv=self._now.item(1, _SHOWN),
                 detected=len(self.finds),
-                links=links(self._tally.xy_m, self._scenario.radio.range_m),
+                links=links(self._tally.xy_m, self._scenario.radio.range_m, self._walls),
                 deliveries=self.deliveries,
                 drops=self.drops,
             )

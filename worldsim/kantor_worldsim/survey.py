@@ -20,7 +20,6 @@ from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import Observation, ParticipantId, Pose
 from kantor_protocol.packing import take_int, take_uint
 from kantor_protocol.replica import LENGTH_MAX
-from kantor_protocol.scenario import Scenario
 from kantor_worldsim import reading as of
 from kantor_worldsim.reading import Reader, Reading
 from kantor_worldsim.records import Batch, Opening, Record
@@ -399,13 +398,11 @@ def _find_way(held: np.ndarray, start: int, columns: int, queue: np.ndarray) -> 
     return found
 
 
-def learns_ranges(scenario: Scenario) -> bool:
-    """Whether robots log measured ranges: their planner learns from them (Burgard et al., 2000)."""
-    return scenario.planner.name == "burgard" and scenario.planner.coverage == "histogram"
-
-
 class Survey:
-    """Follows the records of a mapping run. Several referees may share one; each record counts once."""
+    """Follows the records of a mapping run. Several referees may share one; each record counts once.
+
+    Whoever wants to know how things stood before a record asks before anybody hands it on.
+    """
 
     def __init__(self, reader: Reader | None = None) -> None:
         """reader: the one that another referee of the same run reads by."""
@@ -466,9 +463,9 @@ class Survey:
         self._period_ns = scenario.period_ns
         self._places = {name: i for i, name in enumerate(scenario.robot_ids)}
         self._queue = np.zeros(cells, dtype=np.int32)
-        ranges = learns_ranges(scenario)
         self._evidence = [
-            Evidence(self.frame, scenario.sensor, ranges=ranges) for _ in range(robots)
+            Evidence(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
+            for _ in range(robots)
         ]
         self._looked: list[tuple[int, Pose | None]] = [(NEVER, None)] * robots
         for place in range(robots):
@@ -478,6 +475,12 @@ class Survey:
     def seen(self) -> int:
         """Cells that anybody has seen."""
         return self.books.union.item(SEEN)
+
+    @property
+    def stamps(self) -> npt.NDArray[np.int32]:
+        """(seen,) the ticks at which the cells that count were first seen."""
+        ticks = self.books.first_tick[self._land.counting]
+        return np.asarray(ticks[ticks >= 0])
 
     @property
     def own_cells(self) -> npt.NDArray[np.int64]:

@@ -14,9 +14,12 @@ from rich.table import Table
 from scipy.stats import bootstrap
 
 from kantor_fleet.sweep.plan import Plan, Variant
-from kantor_fleet.sweep.table import MEASURES, Row, Run, measures
+from kantor_fleet.sweep.table import MEASURES, Row, Run, applies, measures
 
-MAIN = ("detection_rate", "finished_tick", "w_ub_paper", "w1_exact", "mass_left")
+MAIN = (
+    *("detection_rate", "finished_tick", "w_ub_paper", "w1_exact", "mass_left"),
+    *("map_completed_tick", "map_distance_m", "map_wtv_final_r8", "map_epv_mean_r8"),
+)
 """What is printed, and the first of them drawn, where it varies."""
 
 _RESAMPLES = 2_000
@@ -67,6 +70,7 @@ def summarize(plan: Plan, runs: Iterable[Run]) -> list[Line]:
         _line(variant, name, by_variant[variant.digest], first)
         for variant in plan.variants
         for name in MEASURES
+        if applies(plan, name)
     ]
 
 

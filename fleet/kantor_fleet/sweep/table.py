@@ -41,10 +41,10 @@ def finished(plan: Plan, outcomes: Mapping[Key, Outcome]) -> list[Run]:
 def _leaves(kind: type[msgspec.Struct], before: str = "") -> Iterator[tuple[str, type]]:
     """Names and types of a result, those of what is in it with its name before theirs."""
     for name, hint in get_type_hints(kind).items():
-        if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
-            yield from _leaves(hint, f"{before}{name}_")
+        (plain,) = set(get_args(hint) or (hint,)) - {NoneType, ...}
+        if issubclass(plain, msgspec.Struct):
+            yield from _leaves(plain, f"{before}{name}_")
         else:
-            (plain,) = set(get_args(hint) or (hint,)) - {NoneType, ...}
             yield before + name, plain if plain in {bool, int, float} else str
 
 
@@ -52,13 +52,21 @@ RESULT = {name: kind for name, kind in _leaves(Result) if name not in {"seed", "
 """Columns of a result, and what is in them."""
 MEASURES = tuple(name for name, kind in RESULT.items() if kind in {int, float})
 """Those that are numbers."""
+_OF_MAPS = "map_"
+
+
+def applies(plan: Plan, name: str) -> bool:
+    """Whether a column of a result says anything in a plan: those of maps need a mission with one."""
+    return not name.startswith(_OF_MAPS) or any(v.scenario.mapping for v in plan.variants)
 
 
 def columns(plan: Plan) -> dict[str, type]:
     """The table's, and what is in them. A varied key that the result has too stands once, in front."""
     axes = zip(*(variant.values for variant in plan.variants), strict=True)
     varied = {key: _kind(values) for key, values in zip(plan.keys, axes, strict=True)}
-    found = {name: kind for name, kind in RESULT.items() if name not in varied}
+    found = {
+        name: kind for name, kind in RESULT.items() if name not in varied and applies(plan, name)
+    }
     return {**varied, "seed": int, **found, "failed": str}
 
 
@@ -79,7 +87,7 @@ def measures(result: Result | None) -> Row:
     if result is None:
         return {}
     flat = dict(_flat(msgspec.to_builtins(result)))
-    return {name: flat[name] for name in RESULT}
+    return {name: flat.get(name) for name in RESULT}
 
 
 def timings(plan: Plan, runs: Iterable[Run]) -> list[Row]:

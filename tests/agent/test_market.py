@@ -1,0 +1,965 @@
+"""A market of goals: how goals are proposed, what they cost, who gets them, and that none is ever lost."""
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kantor_agent.chart import Chart
+from kantor_agent.planners.market import (
+    NOBODY,
+    Costs,
+    Market,
+    Memo,
+    _Holding,
+    _Rules,
+    clear_disc,
+    greedy_goals,
+    packed,
+    price_of,
+    quadtree_goals,
+    random_goals,
+    separate,
+    unpacked,
+)
+from kantor_agent.planners.team import Member, Situation, Task
+from kantor_agent.terrain import Terrain
+from kantor_protocol.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.keyed import Purpose, uniform
+from kantor_protocol.registers import NUMBER_MAX
+from kantor_protocol.scenario import Scenario, parse
+from strategies import examples
+
+MISSION = """
+name = "market"
+robots = { count = 3 }
+starts = { random = true }
+map = { layout = "blank" }
+clock = { period_s = 1.0 }
+sensor = { range_m = 4.0 }
+planner = { name = "market", cost = "length" }
+"""
+KINDS = {"?": UNKNOWN, ".": FREE, "#": OCCUPIED}
+
+
+def mission(*overrides: str) -> Scenario:
+    """Three robots that see 4 cells far; a step takes a second, a lease five."""
+    return parse(MISSION, "market", overrides)
+
+
+def terrain_of(*rows: str, range_m: float = 4.0) -> Terrain:
+    """A chart as it is drawn, row 0 first: `?` unknown, `.` free, `#` wall."""
+    chart = Chart(Frame(1.0, (0.0, 0.0), len(rows), len(rows[0])), 4)
+    chart.cells[:] = [KINDS[kind] for row in rows for kind in row]
+    chart.revision = 1
+    return Terrain(mission(f"sensor.range_m={range_m}"), chart)
+
+
+CORRIDOR = "????............????"
+"""Goals lie at 2 and 17."""
+
+
+IDLE = Task()
+
+
+def member(robot: int, cell: int, task: Task = IDLE) -> Member:
+    """A robot under way."""
+    return Member(robot, cell, task, 0, arrived=False)
+
+
+def situation(
+    terrain: Terrain, members: Sequence[Member], others: Sequence[Member] = (), tick: int = 10
+) -> Situation:
+    """What is known."""
+    return Situation(terrain, terrain.chart.frontiers, tuple(members), tuple(others), (), tick)
+
+
+# Goals.
+
+
+def test_quadtree_splits_until_leaves_are_two_ranges_long() -> None:
+    """8 x 8 cells, range 1: sixteen leaves of 2 x 2, and a goal in the middle of each."""
+    terrain = terrain_of(*["?" * 8] * 8, range_m=1.0)
+
+    assert quadtree_goals(terrain) == [
+        8 * row + column for row in (1, 3, 5, 7) for column in (1, 3, 5, 7)
+    ]
+
+
+def test_quadtree_leaf_of_two_ranges_is_not_split() -> None:
+    """8 x 8 cells, range 4: the whole map is one leaf."""
+    assert quadtree_goals(terrain_of(*["?" * 8] * 8)) == [8 * 4 + 4]
+
+
+def test_quadtree_passes_over_what_is_known_to_three_quarters() -> None:
+    """Range 1, two leaves: with 1 of 4 cells unknown the left has no goal, with 2 the right has one."""
+    assert quadtree_goals(terrain_of("...?", ".?.?", range_m=1.0)) == [4 + 3]
+    assert quadtree_goals(terrain_of("....", ".?.?", range_m=1.0)) == []
+
+
+def test_quadtree_centre_that_is_known_is_no_goal() -> None:
+    """A goal is given up when its cell is known, so that this one would not live."""
+    assert quadtree_goals(terrain_of("??", "?.", range_m=1.0)) == []
+
+
+def test_quadtree_ends_when_ranges_are_tiny() -> None:
+    """With a range below half a cell every unknown cell is a goal."""
+    assert quadtree_goals(terrain_of("?.?", range_m=0.01)) == [0, 2]
+
+
+def test_greedy_takes_the_cheapest_a_range_apart() -> None:
+    """From cell 2, range 4: cell 3 costs 1, then 7 and 11 are the next at least 4 away."""
+    terrain = terrain_of("...????????????")
+    field = terrain.optimistic(2)
+
+    assert greedy_goals(terrain, field, [], 5) == [3, 7, 11]
+    assert greedy_goals(terrain, field, [], 2) == [3, 7]
+
+
+def test_greedy_leaves_out_what_is_within_half_a_range_of_a_held_goal() -> None:
+    """Goal 4 is held: 3 and up to 6 are as good as taken; 7 is not."""
+    terrain = terrain_of("...????????????")
+
+    assert greedy_goals(terrain, terrain.optimistic(2), [4], 5) == [7, 11]
+
+
+def test_greedy_of_equals_takes_the_lowest_cell() -> None:
+    """Both sides of the robot are as near."""
+    terrain = terrain_of("??.??")
+
+    assert greedy_goals(terrain, terrain.optimistic(2), [], 1) == [1]
+
+
+def test_greedy_does_not_propose_what_walls_enclose() -> None:
+    """Behind the wall everything is unknown, and stays so."""
+    terrain = terrain_of("..#???")
+
+    assert greedy_goals(terrain, terrain.optimistic(0), [], 5) == []
+
+
+def test_random_goals_are_keyed_draws_without_known_cells() -> None:
+    """Cells anywhere, by seed, robot and tick; the known and repeated ones are left out."""
+    terrain = terrain_of("????????........")
+    drawn = [int(uniform(3, Purpose.MARKET, 1, 20, i) * 16) for i in range(64)]
+    left = [cell for cell in dict.fromkeys(drawn) if cell < 8]
+
+    assert random_goals(terrain, 3, 1, 20, 64) == left
+    assert random_goals(terrain, 3, 1, 21, 64) != left
+
+
+@pytest.mark.parametrize("rule", ["random", "greedy", "quadtree"])
+@given(seed=st.integers(0, 99))
+@examples(20)
+def test_proposed_goals_are_unknown_reachable_apart_and_not_too_many(rule: str, seed: int) -> None:
+    """Every rule: at most goal_count, none within half a range of another or of a held goal."""
+    rng = np.random.default_rng(seed)
+    rows = ["".join(rng.choice(list("??.#"), 20)) for _ in range(20)]
+    terrain = terrain_of(*rows)
+    here = int(np.flatnonzero(terrain.chart.cells == FREE)[0])
+    held = [int(cell) for cell in np.flatnonzero(terrain.chart.cells == UNKNOWN)[::50]]
+    field = terrain.optimistic(here)
+    rules = _Rules(mission(f"planner.goals={rule}"), seed)
+
+    goals = rules.propose(terrain, field, 0, 7, held)
+
+    assert len(goals) <= 5
+    assert [field[goal] for goal in goals] == sorted(field[goal] for goal in goals)
+    for goal in goals:
+        assert terrain.chart.cells[goal] == UNKNOWN
+        assert field[goal] < math.inf
+        assert all(terrain.cells_between(goal, h) > 2.0 for h in {*held, *goals} - {goal})
+
+
+@given(st.integers(0, 99), st.floats(0.1, 30.0), st.integers(1, 10))
+@examples(50)
+def test_cleared_disc_is_the_cells_nearer_than_its_radius(
+    cell: int, radius_cells: float, columns: int
+) -> None:
+    """The kernel against plain distances."""
+    cell %= 10 * columns
+    values = np.zeros(10 * columns)
+    clear_disc(values, columns, cell, radius_cells)
+
+    for other in range(10 * columns):
+        rows, across = other // columns - cell // columns, other % columns - cell % columns
+        inside = math.hypot(rows, across) < radius_cells or other == cell
+        assert (values[other] == math.inf) == inside
+
+
+# Costs.
+
+PLACES = st.lists(st.integers(0, 399), min_size=1, max_size=7, unique=True)
+
+
+def scattered_walls(seed: int) -> Terrain:
+    """20 x 20 cells, a quarter of them walls, half of them unknown."""
+    rng = np.random.default_rng(seed)
+    return terrain_of(*["".join(rng.choice(list("??.#"), 20)) for _ in range(20)])
+
+
+def length(costs: Costs, place: int, tour: Sequence[int]) -> float:
+    """Of a tour."""
+    before = [NOWHERE, *tour]
+    return sum(costs._leg(place, one, other) for one, other in itertools.pairwise(before))
+
+
+@given(st.integers(0, 30), PLACES, st.integers(0, 399))
+@examples(60)
+def test_insertion_is_the_cheapest_of_all_places(seed: int, tour: list[int], goal: int) -> None:
+    """Against tours written out; among equals the first; no insertion shortens a tour."""
+    terrain = scattered_walls(seed)
+    here = int(np.flatnonzero(terrain.chart.cells == FREE)[0])
+    field = terrain.optimistic(here)
+    tour = [cell for cell in tour if field[cell] < math.inf]
+    costs = Costs(terrain, [field], [*tour, goal])
+    tours = [[*tour[:i], goal, *tour[i:]] for i in range(len(tour) + 1)]
+    longer = [length(costs, 0, one) - length(costs, 0, tour) for one in tours]
+
+    cost, slot = costs.insertion(0, tour, goal)
+
+    if field[goal] == math.inf:
+        assert (cost, slot) == (math.inf, len(tour))
+    else:
+        assert cost == pytest.approx(min(longer), abs=1e-9)
+        assert longer[slot] == pytest.approx(cost, abs=1e-9)
+        assert cost >= -1e-9
+
+
+@given(st.integers(0, 30), PLACES, st.data())
+@examples(40)
+def test_saving_is_what_the_tour_gets_shorter(
+    seed: int, tour: list[int], data: st.DataObject
+) -> None:
+    """Against tours written out."""
+    terrain = scattered_walls(seed)
+    field = terrain.optimistic(int(np.flatnonzero(terrain.chart.cells == FREE)[0]))
+    tour = [cell for cell in tour if field[cell] < math.inf]
+    if not tour:
+        return
+    goal = data.draw(st.sampled_from(tour))
+    costs = Costs(terrain, [field], tour)
+    rest = [cell for cell in tour if cell != goal]
+
+    saved = length(costs, 0, tour) - length(costs, 0, rest)
+
+    assert costs.saving(0, tour, goal) == pytest.approx(saved, abs=1e-9)
+
+
+def test_saving_of_an_unreachable_goal_is_infinite() -> None:
+    """Whoever gets there may have it."""
+    terrain = terrain_of("..#???..")
+    costs = Costs(terrain, [terrain.optimistic(0)], [4, 5])
+
+    assert costs.saving(0, [4, 5], 4) == math.inf
+
+
+@given(st.integers(0, 30), PLACES, st.integers(1, 3))
+@examples(40)
+def test_distances_between_goals_are_a_metric_and_no_way_is_shorter(
+    seed: int, goals: list[int], places: int
+) -> None:
+    """The kernel against a plain reference; the triangle inequality; a bound on the true ways."""
+    terrain = scattered_walls(seed)
+    free = np.flatnonzero(terrain.chart.cells == FREE)[:places].tolist()
+    fields = [terrain.optimistic(cell) for cell in free]
+    cells = np.array(goals, dtype=np.int64)
+    between = np.zeros((cells.size, cells.size))
+    separate(np.array([field[cells] for field in fields]), cells, 20, between)
+
+    for (i, a), (j, b) in itertools.product(enumerate(goals), repeat=2):
+        reached = [(f[a], f[b]) for f in fields if min(f[a], f[b]) < math.inf]
+        plain = max([terrain.cells_between(a, b), *(abs(p - q) for p, q in reached)])
+        assert between[i, j] == plain
+        if terrain.chart.cells[a] != OCCUPIED:
+            assert plain <= terrain.optimistic(a)[b] + 1e-9
+        for k in range(cells.size):
+            assert between[i, j] <= between[i, k] + between[k, j] + 1e-9
+
+
+# Headings.
+
+
+def test_robot_drives_to_the_frontier_on_the_way_to_its_goal() -> None:
+    """The nearest frontier is at the left end, the goal at the right."""
+    terrain = terrain_of(CORRIDOR)
+    rules = _Rules(mission(), 0)
+    asked = situation(terrain, [member(0, 6)])
+
+    assert rules.heading(asked, asked.members[0], 17) == 15
+    assert rules.heading(asked, asked.members[0], NOWHERE) == 4
+
+
+def test_way_to_a_goal_leads_round_what_is_known_to_be_a_wall() -> None:
+    """As the crow flies the frontier at the wall is nearest to the goal, but it leads the long way."""
+    terrain = terrain_of(
+        "????????",
+        "########",
+        "........",
+        "......##",
+        "....##??",
+        "....##??",
+        "??....??",
+    )
+    rules = _Rules(mission(), 0)
+    asked = situation(terrain, [member(0, 8 * 2)])
+
+    assert rules.heading(asked, asked.members[0], 8 * 5 + 7) == 8 * 6 + 5
+
+
+def test_without_a_way_to_any_frontier_there_is_no_target() -> None:
+    """A goal changes nothing about it."""
+    terrain = terrain_of("..#...??")
+    rules = _Rules(mission(), 0)
+    asked = situation(terrain, [member(0, 0)])
+
+    assert rules.heading(asked, asked.members[0], 7) == NOWHERE
+    assert rules.heading(asked, asked.members[0], NOWHERE) == NOWHERE
+
+
+# The supervisor's market.
+
+
+def exchange(*overrides: str, **tours: list[int]) -> Market:
+    """A supervisor's market with tours, by `r0`, `r1`, …"""
+    market = Market(mission(*overrides), 0, None)
+    market._form._tours = {int(name[1:]): tour for name, tour in tours.items()}
+    return market
+
+
+def test_goals_go_to_who_reaches_them_cheapest() -> None:
+    """Robots at 5 and 14 hold the far ends. 17 costs r0 12, r1 bids 3 + 15 - 12 = 6; then 2 costs r1 15, r0 3."""
+    market = exchange(r0=[17], r1=[2])
+
+    tasks = market.assign(situation(terrain_of(CORRIDOR), [member(0, 5), member(1, 14)]))
+
+    assert market._form._tours == {0: [2], 1: [17]}
+    assert [task.target for task in tasks] == [4, 15]
+    assert not market.negotiates
+
+
+def test_without_a_better_bid_the_seller_keeps_its_goal() -> None:
+    """An equal bid is none: from 9 and 9 both ways are as long."""
+    market = exchange(r0=[17], r1=[2])
+
+    market.assign(situation(terrain_of(CORRIDOR), [member(0, 9), member(1, 9)]))
+
+    assert market._form._tours == {0: [17], 1: [2]}
+
+
+def test_of_equal_bids_the_lowest_place_wins() -> None:
+    """r0 is far; r1 and r2 stand side by side."""
+    market = exchange(r0=[17], r1=[2], r2=[2])
+
+    market.assign(situation(terrain_of(CORRIDOR), [member(0, 5), member(1, 14), member(2, 14)]))
+
+    assert 17 in market._form._tours[1]
+    assert 17 not in market._form._tours[2]
+
+
+def test_goals_are_auctioned_again_as_positions_change() -> None:
+    """The robots have changed sides; so do the goals."""
+    market = exchange(r0=[2], r1=[17])
+
+    market.assign(situation(terrain_of(CORRIDOR), [member(0, 14), member(1, 5)]))
+
+    assert market._form._tours == {0: [17], 1: [2]}
+
+
+def test_robots_together_divide_what_is_unknown() -> None:
+    """Nobody proposes what another holds; together they hold every leaf once."""
+    terrain = terrain_of(*["?" * 24] * 11, "?" * 10 + "...." + "?" * 10, *["?" * 24] * 12)
+    market = Market(mission("planner.goal_count=8"), 0, None)
+
+    market.assign(situation(terrain, [member(i, 24 * 11 + 11) for i in range(3)]))
+
+    tours = market._form._tours
+    assert sorted(goal for tour in tours.values() for goal in tour) == quadtree_goals(terrain)
+    assert all(tours.values())
+
+
+def test_goals_that_are_known_or_unreachable_are_given_up() -> None:
+    """Cell 8 is known; 18 lies behind a wall."""
+    market = exchange(r0=[2, 8, 18], r1=[])
+
+    market.assign(situation(terrain_of("????........#..????"), [member(0, 6), member(1, 7)]))
+
+    assert market._form._tours[0] == [2]
+
+
+def test_tour_of_a_robot_that_is_gone_is_free() -> None:
+    """Somebody who is left proposes its goals anew."""
+    market = exchange(r0=[2], r1=[17])
+
+    market.assign(situation(terrain_of(CORRIDOR), [member(0, 5)]))
+
+    assert market._form._tours == {0: [2]}
+
+
+def test_robots_that_keep_their_targets_trade_as_well() -> None:
+    """Only r0 is given a target, but the goals are everybody's."""
+    market = exchange(r0=[17], r1=[2])
+
+    tasks = market.assign(situation(terrain_of(CORRIDOR), [member(0, 5)], [member(1, 14)]))
+
+    assert market._form._tours == {0: [2], 1: [17]}
+    assert [task.target for task in tasks] == [4]
+
+
+def test_idle_robot_drives_to_the_nearest_frontier() -> None:
+    """What is unknown is too little for a goal; without this the mission would never end."""
+    terrain = terrain_of("..................?.")
+    [task] = Market(mission(), 0, None).assign(situation(terrain, [member(0, 3)]))
+
+    assert task == Task(17)
+
+
+@given(st.integers(0, 30), st.lists(PLACES, min_size=3, max_size=3))
+@examples(40)
+def test_every_sale_shortens_the_tours(seed: int, tours: list[list[int]]) -> None:
+    """A pass never makes the sum longer, and loses and doubles nothing."""
+    terrain = scattered_walls(seed)
+    free = np.flatnonzero(terrain.chart.cells == FREE)[:3].tolist()
+    fields = [terrain.optimistic(cell) for cell in free]
+    reached = [cell for cell in range(400) if all(field[cell] < math.inf for field in fields)]
+    taken: set[int] = set()
+    market = exchange(r0=[], r1=[], r2=[])
+    for robot, tour in enumerate(tours):
+        goals = [cell for cell in tour if cell in reached and cell not in taken]
+        market._form._tours[robot] = goals
+        taken.update(goals)
+    costs = Costs(terrain, fields, taken)
+    before = sum(length(costs, i, tour) for i, tour in market._form._tours.items())
+
+    market._form._sell(costs, [0, 1, 2])
+
+    after = sum(length(costs, i, tour) for i, tour in market._form._tours.items())
+    assert after <= before + 1e-9
+    assert sorted(g for tour in market._form._tours.values() for g in tour) == sorted(taken)
+
+
+# Memos.
+
+NUMBERS = st.integers(-NUMBER_MAX, NUMBER_MAX)
+
+
+@given(st.lists(NUMBERS | st.integers(-2, 30), max_size=88))
+@examples(200)
+def test_any_register_is_some_memo(numbers: list[int]) -> None:
+    """Whatever a robot says: cells are on the map, heirs in the team, and it is announced as it was."""
+    memo = unpacked(numbers, 3, 20)
+
+    assert memo.clock >= 0
+    assert -1 <= memo.offered < 20
+    assert len(memo.seen) == len(memo.bids) == 3
+    assert all(0 <= goal < 20 and -1 <= heir < 3 for goal, heir in memo.tour)
+    told = list(packed(memo))
+    while told and told[-1] == 0:
+        told.pop()
+    assert unpacked(told, 3, 20) == memo
+
+
+@pytest.mark.parametrize("robots", [1, 2, 8, 1000])
+def test_longest_memo_fits_into_a_register(robots: int) -> None:
+    """A full tour, everybody's offers answered, an offer of its own."""
+    scenario = mission(f"robots.count={robots}")
+    tour = tuple((cell, robots - 1) for cell in range(_Rules(scenario, 0).capacity))
+    memo = Memo(9, 7, 5, 3, (1,) * robots, (1,) * robots, tour)
+
+    assert len(tour) >= 28
+    assert len(packed(memo)) <= scenario.register_width - 4
+
+
+def test_prices_are_bounded() -> None:
+    """What cannot be reached costs a lot; parts of a cell count."""
+    assert price_of(math.inf) < NUMBER_MAX
+    assert price_of(2.5) == 40
+
+
+@given(st.lists(st.lists(NUMBERS | st.integers(-2, 30), max_size=88), min_size=3, max_size=3))
+@examples(50)
+def test_robot_stands_whatever_others_announce(told: list[list[int]]) -> None:
+    """It has a target, and its own memo fits."""
+    terrain, scenario = terrain_of(CORRIDOR), mission()
+    market, task = Market(scenario, 0, 1), Task()
+    for tick, memo in enumerate(told):
+        others = [member(robot, 5, Task(4, tuple(memo))) for robot in (0, 2)]
+        [task] = market.assign(situation(terrain, [member(1, 7 + tick, task)], others, tick))
+
+        assert task.target in (4, 15)
+        assert len(task.memo) <= scenario.register_width - 4
+        assert all(abs(number) <= NUMBER_MAX for number in task.memo)
+
+
+# Robots among themselves.
+
+Hears = Callable[[int, int, int], Sequence[int]]
+"""Speaker, listener and step to the delays, in steps, with which a word arrives; none: it is lost."""
+
+
+def everybody(_speaker: int, _listener: int, _step: int) -> Sequence[int]:
+    """A radio without faults."""
+    return (1,)
+
+
+def nobody(_speaker: int, _listener: int, _step: int) -> Sequence[int]:
+    """A radio that is off."""
+    return ()
+
+
+class Net:
+    """Robots that hear of one another's registers: late, twice or not at all, the newest wins."""
+
+    def __init__(self, terrain: Terrain, cells: Sequence[int], *overrides: str) -> None:
+        self.robots = len(cells)
+        scenario = mission(f"robots.count={self.robots}", *overrides)
+        self.terrains = [terrain] * self.robots
+        self.markets = [Market(scenario, 0, robot) for robot in range(self.robots)]
+        self.members = [member(robot, cell) for robot, cell in enumerate(cells)]
+        self.told: list[dict[int, tuple[int, int, Member]]] = [{} for _ in cells]
+        self.under_way: list[tuple[int, int, int, Member]] = []
+        self.step = 0
+
+    def play(self, steps: int, hears: Hears = everybody) -> None:
+        """Let everybody step; in between, words travel."""
+        for _ in range(steps):
+            self.step += 1
+            self._deliver()
+            self.members = [self._asked(robot) for robot in range(self.robots)]
+            for speaker, listener in itertools.permutations(range(self.robots), 2):
+                for delay in hears(speaker, listener, self.step):
+                    due = self.step + delay
+                    self.under_way.append((due, listener, self.step, self.members[speaker]))
+
+    def move(self, *cells: int) -> None:
+        """Put the robots somewhere else."""
+        self.members = [
+            one._replace(cell=cell) for one, cell in zip(self.members, cells, strict=True)
+        ]
+
+    def _deliver(self) -> None:
+        for due, listener, stamp, word in self.under_way:
+            told = self.told[listener]
+            if due <= self.step and stamp > told.get(word.robot, (0,))[0]:
+                told[word.robot] = (stamp, self.step, word)
+        self.under_way = [word for word in self.under_way if word[0] > self.step]
+
+    def _asked(self, robot: int) -> Member:
+        me = self.members[robot]
+        others = [
+            word
+            for _, (_, heard, word) in sorted(self.told[robot].items())
+            if heard + 8 >= self.step
+        ]
+        asked = situation(self.terrains[robot], [me], others, self.step)
+        [task] = self.markets[robot].assign(asked)
+        return me._replace(task=task)
+
+    def give(self, robot: int, *goals: int) -> None:
+        """Let a robot hold goals, and no others."""
+        self.markets[robot]._form._tour = [_Holding(goal) for goal in goals]
+
+    def memo(self, robot: int) -> Memo:
+        """What a robot announces."""
+        return unpacked(
+            self.members[robot].task.memo, self.robots, self.terrains[robot].frame.cells
+        )
+
+    def tour(self, robot: int) -> list[int]:
+        """The goals that a robot holds."""
+        return [goal for goal, _heir in self.memo(robot).tour]
+
+    def holders(self, goal: int) -> list[int]:
+        """Who holds a goal."""
+        return [robot for robot in range(self.robots) if goal in self.tour(robot)]
+
+    def until(self, rule: Callable[[], bool], hears: Hears = everybody, steps: int = 40) -> None:
+        """Play until a rule holds."""
+        for _ in range(steps):
+            if rule():
+                return
+            self.play(1, hears)
+        raise AssertionError("it never came to that")
+
+
+HALL = (
+    "????............................????",
+    *["#" * 23 + "." + "#" * 12] * 10,
+    *["#" * 23 + "?" + "#" * 12] * 2,
+)
+"""A long hall and a branch: goals are W, E, and N at the end of the branch."""
+W, E, N = 2, 33, 36 * 12 + 23
+
+
+def hall() -> Net:
+    """r0 in the west holds W and E; r1 in the branch holds N, and will buy E for half its price."""
+    net = Net(terrain_of(*HALL), [5, 36 * 8 + 23])
+    net.give(0, W, E)
+    net.give(1, N)
+    return net
+
+
+def sold(net: Net) -> bool:
+    """Whether r0 has named r1 as the winner of E."""
+    return (E, 1) in net.memo(0).tour
+
+
+def only(speaker: int) -> Hears:
+    """A radio that carries the words of one robot."""
+    return lambda one, _other, _step: (1,) if one == speaker else ()
+
+
+def step_aside(net: Net) -> None:
+    """Both robots move on by a cell, so that they offer their goals again."""
+    net.play(4)
+    net.move(*[one.cell ^ 1 if one.robot == 0 else one.cell - 36 for one in net.members])
+
+
+def test_best_bid_takes_the_goal() -> None:
+    """Offer, bid, award, confirmation: one word each."""
+    net = hall()
+    net.play(2)
+    assert net.memo(0).offered == W
+
+    net.until(lambda: sold(net))
+    assert net.holders(E) == [0]
+    net.play(1)
+    assert net.holders(E) == [0, 1]
+    net.play(1)
+    assert net.holders(E) == [1]
+    assert (net.tour(0), net.tour(1)) == ([W], [N, E])
+
+
+def test_without_a_better_bid_the_goal_stays() -> None:
+    """r0 offers W, N is offered by r1; nobody gets them cheaper."""
+    net = hall()
+    net.play(20)
+
+    assert net.holders(W) == [0]
+    assert net.holders(N) == [1]
+    assert [net.memo(robot).offered for robot in (0, 1)] == [NOWHERE, NOWHERE]
+
+
+def test_robots_that_stand_still_stop_trading() -> None:
+    """Nothing changes, so nothing is offered; memos differ in their clocks alone."""
+    net = hall()
+    net.play(20)
+    before = [net.memo(robot) for robot in (0, 1)]
+    net.play(10)
+
+    for robot in (0, 1):
+        memo = net.memo(robot)
+        assert memo._replace(clock=0, seen=()) == before[robot]._replace(clock=0, seen=())
+
+
+def test_lost_award_leaves_the_goal_with_its_seller() -> None:
+    """r1 never hears that it has won: the lease runs out, r0 takes E back, and sells it again."""
+    net = hall()
+    net.until(lambda: sold(net))
+    net.under_way = []
+
+    net.play(4, only(1))
+    assert sold(net)
+    net.play(1, only(1))
+    assert (E, NOBODY) in net.memo(0).tour
+    assert net.holders(E) == [0]
+
+    step_aside(net)
+    net.until(lambda: net.holders(E) == [1])
+
+
+def test_lost_confirmation_is_settled_when_words_get_through() -> None:
+    """r1 holds E, r0 does not hear it and takes E back. Both hold it, then the lower place alone."""
+    net = hall()
+    net.until(lambda: sold(net))
+    net.play(10, only(0))
+    assert net.holders(E) == [0, 1]
+    assert (E, NOBODY) in net.memo(0).tour
+
+    net.until(lambda: net.holders(E) == [0])
+    step_aside(net)
+    net.until(lambda: net.holders(E) == [1])
+
+
+def test_winner_that_disappears_leaves_the_goal_with_its_seller() -> None:
+    """Nobody hears anybody after the award."""
+    net = hall()
+    net.until(lambda: sold(net))
+    net.under_way = []
+    net.play(7, nobody)
+
+    assert (E, NOBODY) in net.memo(0).tour
+    assert net.holders(E) == [0]
+
+
+def test_seller_that_disappears_after_the_award_leaves_the_goal_with_the_winner() -> None:
+    """r1 hears the award and nothing more; it holds E and may offer it once r0 is out of contact."""
+    net = hall()
+    net.until(lambda: sold(net))
+    net.play(12, nobody)
+
+    assert E in net.tour(1)
+    assert net.memo(1).firm == net.tour(1)
+
+
+def test_seller_that_disappears_before_the_award_keeps_the_goal() -> None:
+    """r1 has bid; an offer is no award."""
+    net = hall()
+    net.until(lambda: net.memo(0).offered == E)
+    net.play(12, nobody)
+
+    assert net.holders(E) == [0]
+    assert net.memo(0).offered == NOWHERE
+
+
+def test_award_that_comes_when_it_was_taken_back_is_settled() -> None:
+    """The award arrives 12 steps late, and no word after it for a while: both hold E, then one."""
+    net = hall()
+    net.until(lambda: sold(net))
+    net.under_way = [(due + 12, *rest) for due, *rest in net.under_way if rest[0] == 1]
+    net.play(14, nobody)
+    assert net.holders(E) == [0, 1]
+
+    net.until(lambda: len(net.holders(E)) == 1)
+    net.play(10)
+    assert len(net.holders(E)) == 1
+
+
+def test_offer_waits_for_all_in_contact_but_not_for_ever() -> None:
+    """r1 is heard and hears nothing: bidding ends with the lease, and the next goal is offered."""
+    net = hall()
+    net.until(lambda: net.memo(0).offered == W)
+    net.play(4, only(1))
+    assert net.memo(0).offered == W
+    net.play(1, only(1))
+    assert net.memo(0).offered == E
+
+
+def test_silent_robot_out_of_contact_does_not_hold_up_an_offer() -> None:
+    """Whoever is not in contact is not waited for, and alone there is nothing to sell."""
+    net = hall()
+    net.play(9, nobody)
+
+    assert net.memo(0).offered == NOWHERE
+    assert net.tour(0) == [W, E]
+
+
+def answer(seen: int, *tour: tuple[int, int]) -> Member:
+    """r1 with what it has seen of r0."""
+    return member(1, 311, Task(23, packed(Memo(9, NOWHERE, 0, 0, (seen, 0), (0, 0), tour))))
+
+
+@pytest.mark.parametrize(
+    ("what", "word", "after"),
+    [
+        ("confirmed", answer(60, (E, NOBODY)), []),
+        ("holds one near it", answer(60, (E - 1, NOBODY)), []),
+        ("holds one too far off", answer(60, (E - 3, NOBODY)), [NOBODY]),
+        ("confirmed an earlier award", answer(59, (E, NOBODY)), [1]),
+        ("has not answered yet", answer(59), [1]),
+        ("declined", answer(60), [NOBODY]),
+        ("has named an heir itself", answer(60, (E, 0)), [NOBODY]),
+    ],
+)
+def test_seller_lets_go_only_of_what_the_heir_holds_for_good(
+    what: str, word: Member, after: list[int]
+) -> None:
+    """r0 has named r1 in its memo 60."""
+    net = hall()
+    trader = net.markets[0]._form
+    trader._tour = [_Holding(W), _Holding(E, heir=1, named=60, until=70)]
+    terrain = net.terrains[0]
+
+    net.markets[0].assign(situation(terrain, [net.members[0]], [word], 61))
+
+    assert [held.heir for held in trader._tour if held.goal == E] == after, what
+
+
+def test_goal_held_twice_is_kept_by_the_lower_place() -> None:
+    """Also if it is only as good as the same: within half a range."""
+    net = hall()
+    net.give(0, W, E)
+    net.give(1, N, E - 2)
+    net.until(lambda: net.tour(1) == [N])
+
+    assert E in net.tour(0)
+
+
+def test_goals_further_apart_are_two() -> None:
+    """Three cells are more than half a range."""
+    net = hall()
+    net.give(0, W)
+    net.give(1, E - 1, W + 1)
+    net.give(0, W - 2)
+    net.play(10)
+
+    assert sorted([*net.tour(0), *net.tour(1)]) == [W - 2, W + 1, E - 1]
+
+
+def test_winner_does_not_take_what_it_knows() -> None:
+    """r1 has seen E before it hears the award: it declines at once, and r0 keeps E till it learns."""
+    net = hall()
+    net.terrains[1] = terrain_of(*HALL)
+    net.until(lambda: sold(net))
+    net.terrains[1].chart.cells[E] = FREE
+    net.terrains[1].chart.revision += 1
+    net.play(3)
+
+    assert net.holders(E) == [0]
+    assert (E, NOBODY) in net.memo(0).tour
+
+
+def test_robots_that_start_at_once_end_up_with_every_goal_once() -> None:
+    """All propose the same before they hear of one another."""
+    terrain = terrain_of(*["?" * 24] * 11, "." * 24, *["?" * 24] * 12)
+    net = Net(terrain, [24 * 11 + 11] * 3)
+    net.play(1)
+    assert net.tour(0) == net.tour(1) == net.tour(2)
+
+    net.play(20)
+    goals = [goal for robot in range(3) for goal in net.tour(robot)]
+    assert len(goals) == len(set(goals)) == 15
+
+
+def test_idle_robot_in_contact_drives_to_the_nearest_frontier() -> None:
+    """r0 holds all there is; nobody waits."""
+    net = Net(terrain_of(CORRIDOR), [6, 7])
+    net.give(0, 2, 17)
+    net.play(1)
+    net.give(1)
+    net.members[1] = net.members[1]._replace(arrived=True)
+    net.play(3)
+
+    assert net.tour(1) == []
+    assert net.members[1].task.target == 4
+
+
+def test_target_stays_while_it_is_a_frontier_and_the_goal_is_the_same() -> None:
+    """However the robot moves."""
+    net = Net(terrain_of(CORRIDOR), [6])
+    net.play(1)
+    first = net.members[0].task.target
+    for cell in (7, 8, 9, 10, 11, 12, 13):
+        net.move(cell)
+        net.play(1)
+        assert net.members[0].task.target == first
+
+
+# The same under any radio.
+
+FIELD = terrain_of(*["?" * 24] * 11, *["." * 24] * 2, *["?" * 24] * 11)
+
+
+def faulty(seed: int, robots: int) -> Hears:
+    """Words are lost, late, repeated and overtaken; for a while the team is cut in two."""
+    rng = np.random.default_rng(seed)
+    side = rng.integers(0, 2, (8, robots))
+    loss = rng.random()
+
+    def hears(speaker: int, listener: int, step: int) -> Sequence[int]:
+        part = side[step // 10 % 8]
+        copies = [int(rng.integers(1, 12)) if rng.random() < 0.3 else 1 for _ in range(2)]
+        heard = part[speaker] == part[listener] and rng.random() > loss * 0.8
+        return copies[: 1 + (rng.random() < 0.2)] if heard else ()
+
+    return hears
+
+
+def fresh(terrain: Terrain) -> Terrain:
+    """A chart of its own."""
+    chart = Chart(terrain.frame, 4)
+    chart.cells[:] = terrain.chart.cells
+    chart.revision = 1
+    return Terrain(mission(), chart)
+
+
+def strolling(net: Net, rng: np.random.Generator) -> None:
+    """Everybody somewhere on the known floor, not far from before."""
+    net.move(
+        *[
+            24 * int(rng.integers(11, 13))
+            + min(23, max(0, one.cell % 24 + int(rng.integers(-2, 3))))
+            for one in net.members
+        ]
+    )
+
+
+@given(seed=st.integers(0, 10**6), robots=st.integers(2, 4))
+@examples(25)
+def test_no_goal_is_ever_lost(seed: int, robots: int) -> None:
+    """Whatever the radio does, a goal that nobody knows is held by somebody, in the end by one alone."""
+    rng = np.random.default_rng(seed)
+    net = Net(FIELD, [24 * 11 + int(cell) for cell in rng.integers(0, 24, robots)])
+    radio, goals = faulty(seed, robots), set[int]()
+    for step in range(180):
+        net.play(1, radio if step < 80 else everybody)
+        held = {goal for robot in range(robots) for goal in net.tour(robot)}
+        goals |= held
+        assert held == goals
+        if step < 110:
+            strolling(net, rng)
+
+    told = [goal for robot in range(robots) for goal in net.tour(robot)]
+    assert len(told) == len(goals)
+    assert all(net.memo(robot).firm == net.tour(robot) for robot in range(robots))
+    assert all(net.memo(robot).offered == NOWHERE for robot in range(robots))
+
+
+@given(seed=st.integers(0, 10**6), robots=st.integers(2, 4))
+@examples(25)
+def test_no_goal_is_lost_while_robots_explore(seed: int, robots: int) -> None:
+    """Everybody has a chart of its own and learns of cells at other times than the others."""
+    rng = np.random.default_rng(seed)
+    net = Net(FIELD, [24 * 11 + int(cell) for cell in rng.integers(0, 24, robots)])
+    net.terrains = [fresh(FIELD) for _ in range(robots)]
+    radio, goals = faulty(seed, robots), set[int]()
+    for _ in range(80):
+        net.play(1, radio)
+        unknown_to_all = np.all([t.chart.cells == UNKNOWN for t in net.terrains], axis=0)
+        held = {goal for robot in range(robots) for goal in net.tour(robot)}
+        goals = {goal for goal in goals | held if unknown_to_all[goal]}
+        assert goals <= held
+        strolling(net, rng)
+        if held and rng.random() < 0.2:
+            seen = sorted(held)[int(rng.integers(len(held)))]
+            for terrain in net.terrains:
+                if rng.random() < 0.5:
+                    terrain.chart.cells[seen] = FREE
+                    terrain.chart.revision += 1
+
+
+@pytest.mark.parametrize("rule", ["random", "greedy"])
+@given(seed=st.integers(0, 10**6))
+@examples(15)
+def test_goals_vanish_only_for_one_that_is_as_good(rule: str, seed: int) -> None:
+    """Whoever lets go of an unknown goal has been told that its heir holds one within half a range."""
+    rng = np.random.default_rng(seed)
+    net = Net(
+        FIELD, [24 * 11 + int(cell) for cell in rng.integers(0, 24, 3)], f"planner.goals={rule}"
+    )
+    radio = faulty(seed, 3)
+    for _ in range(80):
+        before = [net.memo(robot).tour for robot in range(3)]
+        net.play(1, radio)
+        for robot in range(3):
+            for goal, heir in before[robot]:
+                if goal not in net.tour(robot):
+                    told = net.told[robot][heir][2].task.memo
+                    firm = unpacked(told, 3, 576).firm
+                    assert min(FIELD.cells_between(goal, other) for other in firm) <= 2.0
+        strolling(net, rng)
+
+
+@given(seed=st.integers(0, 10**6))
+@examples(10)
+def test_same_words_make_the_same_market(seed: int) -> None:
+    """No clock, no entropy: two teams that hear the same announce the same."""
+    nets = [Net(FIELD, [270, 275, 280], "planner.goals=random") for _ in range(2)]
+    radios = [faulty(seed, 3) for _ in nets]
+    for net, radio in zip(nets, radios, strict=True):
+        net.play(40, radio)
+
+    assert nets[0].members == nets[1].members
