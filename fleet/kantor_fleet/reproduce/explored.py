@@ -8,7 +8,7 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, MultipleLocator, NullLocator
 
 from kantor_fleet.reproduce.claims import Measure, interval
 from kantor_fleet.reproduce.drawing import legend_below, new_layout, write_title
@@ -125,6 +125,7 @@ def _draw_map(axes: Axes, scenario: Scenario) -> None:
     colours = ListedColormap([FAINT, "white", INK])
     extent_m = ground.frame.extent_m
     axes.imshow(ground.cells, cmap=colours, vmin=0, vmax=2, origin="lower", extent=extent_m)
+    axes.yaxis.set_major_locator(MultipleLocator(5.0))
     tidy(axes, "x, m", "y, m")
     write_title(
         axes, f"{extent_m[1] - extent_m[0]:g} x {extent_m[3] - extent_m[2]:g} m, own layout"
@@ -150,6 +151,7 @@ def _draw_bars(axes: Axes, sides: Mapping[bool, Runs], finished: Measure, period
             label="coordinated" if coordinated else "uncoordinated",
         )
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylim(bottom=0.0)  # two runs may have an interval beyond
     tidy(axes, "", "")
 
 
