@@ -51,18 +51,22 @@ def reproduce(
         if interrupts.code is not None:
             print(f"kantor: interrupted; {_left_off(orders, flown, journal)}", file=sys.stderr)
             return interrupts.code
-    failed = sum(flight.failed is not None for flight in flown.values())
+    broken = [flight for flight in flown.values() if flight.failed is not None]
+    failed = [flight for flight in broken if flight.result is None or journal is None]
     if failed:
         again = "; the same command runs these again" if journal else ""
-        print(f"kantor: {failed} runs failed; nothing was written{again}", file=sys.stderr)
+        print(f"kantor: {len(failed)} runs failed; nothing was written{again}", file=sys.stderr)
         return Exit.NOT_MET
     verdicts = [
         line for name, figure in figures.items() for line in _conclude(name, figure, flown, out)
     ]
     write_csv(out / "verdicts.csv", Verdict._fields, [line._asdict() for line in verdicts])
     _print(verdicts)
+    if broken:
+        print(f"  {len(broken)} runs broke a rule, and count all the same: {broken[0].failed}")
     print(f"  {out}/  (figures, numbers and verdicts; {time.monotonic() - started:.0f} s)")
-    return Exit.NOT_MET if any(verdict.verdict == MISS for verdict in verdicts) else Exit.DONE
+    missed = any(verdict.verdict == MISS for verdict in verdicts)
+    return Exit.NOT_MET if missed or broken else Exit.DONE
 
 
 def _left_off(orders: Orders, flown: Flown, journal: Journal | None) -> str:
@@ -125,7 +129,7 @@ def _fly_all(
     for setting, seeds in orders.items():
         for key, case in setting.cases(seeds):
             known = journal.outcomes.get(key) if journal is not None else None
-            if isinstance(known, Flight) and known.failed is None:
+            if isinstance(known, Flight) and known.result is not None:
                 flown[setting, case.seed] = known
             else:
                 left[case] = setting, key
