@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -17,8 +16,10 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure as Picture
 from PIL import Image
 
-from kantor_fleet.experiment import Outcome
-from kantor_fleet.reproduce import burgard, explored, kabir_lee, kme, papers
+from kantor_fleet.exits import Exit
+from kantor_fleet.experiment import Case, Outcome
+from kantor_fleet.pools import Pool
+from kantor_fleet.reproduce import burgard, explored, kabir_lee, kme, papers, reproduce
 from kantor_fleet.reproduce.claims import (
     MISS,
     OK,
@@ -34,12 +35,13 @@ from kantor_fleet.reproduce.claims import (
     paired_ratios,
     times,
 )
+from kantor_fleet.reproduce.figure import Figure
 from kantor_fleet.reproduce.flights import Flight, Flights, Moment, Setting
-from kantor_fleet.reproduce.measures import map_row, wtv_final
+from kantor_fleet.reproduce.measures import finished, map_row, wtv_final
 from kantor_fleet.sweep.journal import Journal
 from kantor_fleet.sweep.plan import Key
 from kantor_protocol.scenario import MAP_PLANNERS
-from kantor_worldsim.metrics import ByRegions, MapResult, Result
+from kantor_worldsim.metrics import Bounds, ByRegions, BytesPerRobotTick, MapResult, Result
 from strategies import examples
 
 if TYPE_CHECKING:
@@ -242,7 +244,7 @@ def test_readings_differ_in_what_the_paper_leaves_open() -> None:
 
 def map_result(**numbers: float) -> MapResult:
     """A map explored, with some numbers; the others are 0."""
-    zeros = {field.name: 0 for field in msgspec.structs.fields(MapResult)}
+    zeros = dict.fromkeys(MapResult.__struct_fields__, 0)
     by_regions = ByRegions(*[numbers.pop("regions", 1.0)] * 6)
     waits = dict.fromkeys(("wtv_final", "wtv_mean", "epv_final", "epv_mean"), by_regions)
     return MapResult(**zeros | waits | numbers)  # type: ignore[arg-type]
@@ -341,17 +343,51 @@ def test_the_table_tells_every_measure_by_number_of_robots(
     assert whole[0]["configurations"] == 5 * 6
 
 
-def test_the_numbers_of_a_run_stand_flat(result: Result) -> None:
-    row = map_row(result)
+def test_the_numbers_of_a_run_stand_flat() -> None:
+    row = map_row(finished_run())
 
     assert (row["finished_tick"], row["explored"]) == (7, 0.5)
     assert row["wtv_final_r8"] == 3.0
 
 
-@pytest.fixture
-def result() -> Result:
-    fields = {field.name: 0 for field in msgspec.structs.fields(Result)}
-    return Result(**fields | {"finished_tick": 7, "map": map_result(explored=0.5, regions=3.0)})  # type: ignore[arg-type]
+def finished_run(seed: int = 0, tick: int = 7, regions: float = 3.0) -> Result:
+    """A result of a map, as it would be read back."""
+    return Result(
+        scenario="made-up",
+        seed=seed,
+        exchange="in-process",
+        clock="concurrent",
+        planner="kmeans",
+        merge="ledger",
+        claims=True,
+        robots=2,
+        ticks=tick,
+        finished_tick=tick,
+        first_contact_tick=None,
+        detected=0,
+        targets=0,
+        detection_rate=None,
+        w_ub_start=0.0,
+        w_ub=Bounds(0.0, None, 0.0),
+        w1_exact=None,
+        energy_spent=0,
+        energy_total=0,
+        mass_left=0.5,
+        mass_double_counted=0.0,
+        bytes_per_robot_tick=BytesPerRobotTick(0.0, 0.0),
+        deliveries=0,
+        drops=0,
+        out_of_range_refused=0,
+        messages_refused=0,
+        absences=0,
+        ended="done",
+        record="whole",
+        violations=0,
+        complaints=(),
+        digest="",
+        wall_s=0.0,
+        map=map_result(explored=0.5, regions=regions),
+    )
 
 
 # The command
@@ -379,6 +415,52 @@ def test_kept_flights_read_back_as_they_were(tmp_path: Path) -> None:
         assert journal.outcomes == {key: flight}
     with Journal(tmp_path / "runs.jsonl") as journal:  # a sweep reads what it knows
         assert journal.outcomes == {key: Outcome()}
+
+
+def simple_figure() -> Figure:
+    """Two runs of one setting."""
+    setting = kme.setting(kme.KME, "blank", "together", 2)
+    claim = MeanRatio("it", setting, setting, "", "", finished)
+    return Figure("a figure", 2, (claim,), lambda _flights: Picture(), map_row, kept=True)
+
+
+def pool_of(*flights_by_seed: Flight) -> Callable[[Iterable[Case]], Pool]:
+    """Flies nothing, and has the answers."""
+
+    def start(cases: Iterable[Case]) -> Pool:
+        for case in cases:
+            yield None
+            yield case, flights_by_seed[case.seed]
+
+    return start
+
+
+def test_a_run_that_broke_a_rule_counts_and_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, bad = Flight(result=finished_run(0)), Flight(result=finished_run(1), failed="too fast")
+
+    code = reproduce({"a": simple_figure()}, None, pool_of(good, bad), tmp_path)
+
+    assert code == Exit.NOT_MET
+    assert "1 runs broke a rule, and count all the same: too fast" in capsys.readouterr().out
+    assert len(rows_of(tmp_path / "a.csv")) == 2
+    nothing = pool_of()  # both are kept
+    assert reproduce({"a": simple_figure()}, None, nothing, tmp_path) == Exit.NOT_MET
+
+
+def test_a_run_without_a_result_is_run_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, none = Flight(result=finished_run(0)), Flight(failed="its worker died: SIGKILL")
+
+    code = reproduce({"a": simple_figure()}, None, pool_of(good, none), tmp_path)
+
+    assert code == Exit.NOT_MET
+    assert "1 runs failed; nothing was written; the same command runs" in capsys.readouterr().err
+    assert not (tmp_path / "a.csv").exists()
+    again = pool_of(none, Flight(result=finished_run(1)))  # seed 0 is kept
+    assert reproduce({"a": simple_figure()}, None, again, tmp_path) == Exit.DONE
 
 
 def test_interrupted_it_goes_on_where_it_was_stopped(kantor: "Kantor") -> None:
