@@ -2,11 +2,11 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 
-from rich.table import Table
+from rich.table import Table as Printed
 
 from kantor_fleet.counting import RunsView, table_console
 from kantor_fleet.exits import Exit
@@ -15,47 +15,83 @@ from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.pools import Pool
 from kantor_fleet.preload import warm_up
 from kantor_fleet.reproduce.claims import MISS, UNMATCHED, Verdict
+from kantor_fleet.reproduce.figure import Figure, Orders, Table
 from kantor_fleet.reproduce.flights import Flight, Flights, Setting
-from kantor_fleet.reproduce.kabir_lee import FIGURES, Figure
-from kantor_fleet.sweep.table import Row, write_csv
+from kantor_fleet.sweep.journal import Journal
+from kantor_fleet.sweep.plan import Key
+from kantor_fleet.sweep.table import write_csv
 from kantor_worldsim.exact import available
-from kantor_worldsim.metrics import Result
+
+RUNS = "runs.jsonl"
+"""Where the runs of figures that take long are kept, whichever figure asked for them."""
+
+_OURS = "  ours: median [quartiles], mean ± 95 %, ratio of means [95 %] or geometric mean x÷ 95 % over the runs"
+
+Flown = Mapping[tuple[Setting, int], Flight]
+"""By setting and seed."""
 
 
 def reproduce(
-    names: Sequence[str], runs: int | None, start: Callable[[Iterable[Case]], Pool], out: Path
+    figures: Mapping[str, Figure],
+    runs: int | None,
+    start: Callable[[Iterable[Case]], Pool],
+    out: Path,
 ) -> Exit:
-    """Fly, judge, draw and tell. start: a pool that flies. Raises OSError."""
+    """Fly, judge, draw and tell. start: a pool that flies. Raises SweepError, OSError."""
     started = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
-    figures = {name: _affordable(FIGURES[name], runs) for name in names}
-    with Interrupts() as interrupts:
+    figures = {name: _affordable(figure, runs) for name, figure in figures.items()}
+    orders = _orders(figures.values())
+    with ExitStack() as stack:
+        interrupts = stack.enter_context(Interrupts())
+        kept = any(figure.kept for figure in figures.values())
+        journal = stack.enter_context(Journal(out / RUNS, Flight)) if kept else None
         warm_up()
-        flights = _fly_all(_orders(figures.values()), start, interrupts)
+        flown = _fly_all(orders, start, interrupts, journal)
         if interrupts.code is not None:
-            print("kantor: interrupted; nothing was written", file=sys.stderr)
+            print(f"kantor: interrupted; {_left_off(orders, flown, journal)}", file=sys.stderr)
             return interrupts.code
-    failed = sum(flight.failed is not None for runs in flights.values() for flight in runs)
+    broken = [flight for flight in flown.values() if flight.failed is not None]
+    failed = [flight for flight in broken if flight.result is None or journal is None]
     if failed:
-        print(f"kantor: {failed} runs failed; nothing was written", file=sys.stderr)
+        again = "; the same command runs these again" if journal else ""
+        print(f"kantor: {len(failed)} runs failed; nothing was written{again}", file=sys.stderr)
         return Exit.NOT_MET
     verdicts = [
-        line for name, figure in figures.items() for line in _conclude(name, figure, flights, out)
+        line for name, figure in figures.items() for line in _conclude(name, figure, flown, out)
     ]
     write_csv(out / "verdicts.csv", Verdict._fields, [line._asdict() for line in verdicts])
     _print(verdicts)
+    if broken:
+        print(f"  {len(broken)} runs broke a rule, and count all the same: {broken[0].failed}")
     print(f"  {out}/  (figures, numbers and verdicts; {time.monotonic() - started:.0f} s)")
-    return Exit.NOT_MET if any(verdict.verdict == MISS for verdict in verdicts) else Exit.DONE
+    missed = any(verdict.verdict == MISS for verdict in verdicts)
+    return Exit.NOT_MET if missed or broken else Exit.DONE
 
 
-def _conclude(name: str, figure: Figure, flights: Flights, out: Path) -> list[Verdict]:
+def _left_off(orders: Orders, flown: Flown, journal: Journal | None) -> str:
+    """What there is of an interrupted figure."""
+    if journal is None:
+        return "nothing was written"
+    total = sum(map(len, orders.values()))
+    return f"{len(flown)} of {total} runs are done; the same command goes on from there"
+
+
+def _conclude(name: str, figure: Figure, flown: Flown, out: Path) -> list[Verdict]:
     """Write the numbers and the picture of a figure, and judge its claims."""
-    seen = _first(flights, figure)
-    _write_runs(out / f"{name}.csv", seen)
-    picture = figure.draw(seen)
+    flights = {
+        setting: [flown[setting, seed] for seed in seeds]
+        for setting, seeds in figure.orders().items()
+    }
+    _write_runs(out / f"{name}.csv", figure, flights)
+    picture = figure.draw(flights)
     picture.savefig(out / f"{name}.png", dpi=120)
     picture.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})
-    return [claim.judge(name, seen) for claim in figure.claims]
+    if figure.table is not None:
+        table = figure.table(flights)
+        write_csv(out / f"{name}-table.csv", list(table.rows[0]), table.rows)
+        _print_table(table)
+    return [claim.judge(name, flights) for claim in figure.claims]
 
 
 def _affordable(figure: Figure, runs: int | None) -> Figure:
@@ -69,38 +105,48 @@ def _affordable(figure: Figure, runs: int | None) -> Figure:
     return figure._replace(claims=claims, runs=runs or figure.runs)
 
 
-def _settings(figure: Figure) -> dict[Setting, int]:
-    """What a figure needs flown, how often."""
+def _orders(figures: Iterable[Figure]) -> Orders:
+    """All seeds that some figure wants of a setting; the long settings first."""
+    wanted: dict[Setting, set[int]] = {}
+    for figure in figures:
+        for setting, seeds in figure.orders().items():
+            wanted.setdefault(setting, set()).update(seeds)
     return {
-        setting: min(figure.runs, setting.most)
-        for claim in figure.claims
-        for setting in claim.settings
+        setting: sorted(seeds)
+        for setting, seeds in sorted(wanted.items(), key=lambda item: not item[0].exact)
     }
 
 
-def _orders(figures: Iterable[Figure]) -> dict[Setting, int]:
-    """Settings by the most runs that a figure wants of them; the long ones first."""
-    most: dict[Setting, int] = {}
-    for figure in figures:
-        for setting, count in _settings(figure).items():
-            most[setting] = max(count, most.get(setting, 0))
-    return dict(sorted(most.items(), key=lambda item: not item[0].exact))
-
-
 def _fly_all(
-    orders: dict[Setting, int], start: Callable[[Iterable[Case]], Pool], interrupts: Interrupts
-) -> Flights:
-    cases = {case: setting for setting, count in orders.items() for case in setting.cases(count)}
-    flights: dict[Setting, list[Flight]] = {s: [Flight()] * count for s, count in orders.items()}
-    with RunsView(len(cases)) as view, closing(start(cases)) as pool:
+    orders: Orders,
+    start: Callable[[Iterable[Case]], Pool],
+    interrupts: Interrupts,
+    journal: Journal | None,
+) -> Flown:
+    """What is not kept yet is flown, and kept if there is a journal."""
+    flown: dict[tuple[Setting, int], Flight] = {}
+    left: dict[Case, tuple[Setting, Key]] = {}
+    for setting, seeds in orders.items():
+        for key, case in setting.cases(seeds):
+            known = journal.outcomes.get(key) if journal is not None else None
+            if isinstance(known, Flight) and known.result is not None:
+                flown[setting, case.seed] = known
+            else:
+                left[case] = setting, key
+    if not left:
+        return flown
+    with RunsView(len(left)) as view, closing(start(left)) as pool:
         for done in pool:
-            if interrupts():
-                break
             if done is not None:
                 case, outcome = done
-                flights[cases[case]][case.seed] = _flight(outcome)
+                (setting, key), flight = left[case], _flight(outcome)
+                flown[setting, case.seed] = flight
+                if journal is not None:
+                    journal.add(key, flight)
                 view.count(outcome.failed)
-    return flights
+            if interrupts():
+                break
+    return flown
 
 
 def _flight(outcome: Outcome) -> Flight:
@@ -108,40 +154,31 @@ def _flight(outcome: Outcome) -> Flight:
     return outcome if isinstance(outcome, Flight) else Flight(failed=outcome.failed)
 
 
-def _first(flights: Flights, figure: Figure) -> Flights:
-    """The flights of a figure; another one may have wanted more."""
-    return {setting: flights[setting][:count] for setting, count in _settings(figure).items()}
-
-
-def _write_runs(path: Path, flights: Flights) -> None:
+def _write_runs(path: Path, figure: Figure, flights: Flights) -> None:
     """Every run behind a figure."""
     rows = [
-        _row(setting, seed, flight.result)
+        {"setting": setting.text, "seed": flight.result.seed, **figure.row(flight.result)}
         for setting, runs in flights.items()
-        for seed, flight in enumerate(runs)
+        for flight in runs
         if flight.result is not None
     ]
     write_csv(path, list(rows[0]), rows)
 
 
-def _row(setting: Setting, seed: int, result: Result) -> Row:
-    return {
-        "setting": setting.text,
-        "seed": seed,
-        "detected": result.detected,
-        "targets": result.targets,
-        "finished_tick": result.finished_tick,
-        "first_contact_tick": result.first_contact_tick,
-        "w_ub_start": result.w_ub_start,
-        "w_ub_end": result.w_ub.paper,
-        "w_ub_instant_end": result.w_ub.final_instant,
-        "w1_exact": result.w1_exact,
-    }
+def _print_table(table: Table) -> None:
+    printed = Printed(box=None, pad_edge=False, header_style="bold")
+    for name in table.shown[0]:
+        printed.add_column(name)
+    for row in table.shown:
+        printed.add_row(*row.values())
+    console = table_console()
+    console.print(f"  {table.title}", markup=False, highlight=False)
+    console.print(printed)
 
 
 def _print(verdicts: Sequence[Verdict]) -> None:
     console = table_console()
-    table = Table(box=None, pad_edge=False, header_style="bold")
+    table = Printed(box=None, pad_edge=False, header_style="bold")
     for name in ("figure", "claim", "published", "faithful reading", "ours", "verdict"):
         table.add_column(name)
     figure = ""
@@ -151,7 +188,7 @@ def _print(verdicts: Sequence[Verdict]) -> None:
         table.add_row(shown, *line[1:5], f"[{style}]{line.verdict}[/]" if style else line.verdict)
         figure = line.figure
     console.print(table)
-    print("  ours: median [quartiles] or mean ± 95 % over the runs")
+    print(_OURS)
     for line in verdicts:
         if line.why:
             console.print(f"  {line.figure}, {line.claim}: {line.why}", highlight=False)

@@ -2,9 +2,10 @@
 
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple, Protocol
 
+import numpy as np
 from scipy.stats import t as student
 
 from kantor_fleet.reproduce.flights import Flight, Flights, Setting
@@ -14,6 +15,8 @@ Measure = Callable[[Flight], float]
 OK, MISS = "ok", "MISS"
 UNMATCHED = "ok, not the paper's"
 """Ours agrees with the faithful reading, which cannot give what was published."""
+TOLD = "told"
+"""Neither the paper nor a reading of it says what it has to be."""
 
 
 class Verdict(NamedTuple):
@@ -211,6 +214,211 @@ class Share(NamedTuple):
         reading = f"≤ {100.0 * self.most:.0f} %"
         ours = f"{100.0 * count / len(runs):.0f} % ({count} of {len(runs)})"
         return Verdict(figure, self.text, self.published, reading, ours, verdict)
+
+
+class MeanRatio(NamedTuple):
+    """The ratio of two settings' means over the same starts lies in a band, if there is one."""
+
+    text: str
+    over: Setting
+    under: Setting
+    published: str
+    reading: str
+    measure: Measure
+    low: float = -math.inf
+    high: float = math.inf
+    why: str = ""
+
+    @property
+    def settings(self) -> tuple[Setting, ...]:
+        """Over, under."""
+        return (self.over, self.under)
+
+    def judge(self, figure: str, flights: Flights) -> Verdict:
+        """The ratio with its 95 % bootstrap interval, whole starts drawn again."""
+        over, under = (
+            [self.measure(flight) for flight in flights[setting]] for setting in self.settings
+        )
+        ratio, low, high = mean_ratio(over, under)
+        ours = f"{ratio:.2f} [{low:.2f}, {high:.2f}]"
+        return Verdict(
+            figure, self.text, self.published, self.reading, ours, self._verdict(ratio), self.why
+        )
+
+    def _verdict(self, ratio: float) -> str:
+        if not self.low <= ratio <= self.high:
+            return MISS
+        if self.why:
+            return UNMATCHED
+        return TOLD if math.isinf(self.low) and math.isinf(self.high) else OK
+
+
+class Same(NamedTuple):
+    """Two settings come to the same in every run."""
+
+    text: str
+    one: Setting
+    other: Setting
+    published: str
+    measures: tuple[Measure, ...]
+
+    @property
+    def settings(self) -> tuple[Setting, ...]:
+        """Both."""
+        return (self.one, self.other)
+
+    def judge(self, figure: str, flights: Flights) -> Verdict:
+        """Runs that agree in every measure, among all."""
+        pairs = list(zip(*(flights[setting] for setting in self.settings), strict=True))
+        same = sum(
+            all(measure(one) == measure(other) for measure in self.measures) for one, other in pairs
+        )
+        verdict = OK if same == len(pairs) else MISS
+        ours = f"{same} of {len(pairs)} runs the same"
+        return Verdict(figure, self.text, self.published, "every run the same", ours, verdict)
+
+
+class Lowest(NamedTuple):
+    """Among the means of several settings the first is the lowest."""
+
+    text: str
+    named: tuple[tuple[str, Setting], ...]
+    published: str
+    measure: Measure
+    above: tuple[str, ...] = ()
+    """Which ones a faithful reading has above the first; none: it is told, not judged."""
+    why: str = ""
+    """Why a faithful reading does not have it below the others too."""
+
+    @property
+    def settings(self) -> tuple[Setting, ...]:
+        """The first is the one in question."""
+        return tuple(setting for _, setting in self.named)
+
+    def judge(self, figure: str, flights: Flights) -> Verdict:
+        """The means in order."""
+        means = {
+            name: statistics.fmean(self.measure(flight) for flight in flights[setting])
+            for name, setting in self.named
+        }
+        first = means[self.named[0][0]]
+        ours = ", ".join(
+            f"{name} {mean:,.0f}" for name, mean in sorted(means.items(), key=lambda item: item[1])
+        )
+        reading = f"below {' and '.join(self.above)}" if self.above else "either"
+        lowest = first == min(means.values())
+        if not self.above:
+            verdict = TOLD
+        elif any(first >= means[name] for name in self.above):
+            verdict = MISS
+        else:
+            verdict = OK if lowest else UNMATCHED
+        why = "" if lowest else self.why
+        return Verdict(figure, self.text, self.published, reading, ours, verdict, why)
+
+
+Group = tuple[Setting, ...]
+"""Settings whose runs are taken together."""
+
+
+class GeometricRatio(NamedTuple):
+    """The geometric mean of ratios, run by run, over several settings stays below a bound."""
+
+    text: str
+    over: Group
+    under: Group
+    """Each beside the one of `over` that has the same place."""
+    published: str
+    reading: str
+    measure: Measure
+    most: float = math.inf
+    """Infinite: it is told, not judged."""
+    why: str = ""
+
+    @property
+    def settings(self) -> tuple[Setting, ...]:
+        """All of over, all of under."""
+        return (*self.over, *self.under)
+
+    def judge(self, figure: str, flights: Flights) -> Verdict:
+        """The mean with its 95 % factor by Student's t on logarithms."""
+        ratios = list(paired_ratios(flights, self.over, self.under, self.measure))
+        if not ratios:
+            ours = "no runs"
+            return Verdict(figure, self.text, self.published, self.reading, ours, TOLD, self.why)
+        mean, factor = geometric(ratios)
+        verdict = TOLD if math.isinf(self.most) else OK if mean <= self.most else MISS
+        ours = f"{times(mean, factor)} (n = {len(ratios)})"
+        return Verdict(figure, self.text, self.published, self.reading, ours, verdict, self.why)
+
+
+class Lower(NamedTuple):
+    """Of several pairs of groups the first lies below the second, setting by setting."""
+
+    text: str
+    named: tuple[tuple[str, Group, Group], ...]
+    """Name, lower, upper; in both groups the same place stands for the same thing."""
+    published: str
+    measure: Measure
+
+    @property
+    def settings(self) -> tuple[Setting, ...]:
+        """Of all pairs."""
+        return tuple(s for _, lower, upper in self.named for s in (*lower, *upper))
+
+    def judge(self, figure: str, flights: Flights) -> Verdict:
+        """Lower over upper; missed if one lies above, beyond its interval if it has one."""
+        ratios = {
+            name: geometric(found)
+            for name, lower, upper in self.named
+            if (found := list(self._ratios(flights, lower, upper)))
+        }
+        ours = ", ".join(f"{name} {times(*ratio)}" for name, ratio in ratios.items())
+        missed = any(
+            mean > (factor if math.isfinite(factor) else 1.0) for mean, factor in ratios.values()
+        )
+        reading = "each below 1, or not clearly above"
+        return Verdict(figure, self.text, self.published, reading, ours, MISS if missed else OK)
+
+    def _ratios(self, flights: Flights, lower: Group, upper: Group) -> Iterator[float]:
+        """Of geometric means, of settings that have runs: their starts are not the same ones."""
+        for one, other in zip(lower, upper, strict=True):
+            if flights.get(one) and flights.get(other):
+                low, high = (
+                    geometric(map(self.measure, flights[each]))[0] for each in (one, other)
+                )
+                yield low / high
+
+
+def mean_ratio(
+    over: Sequence[float], under: Sequence[float], resamples: int = 10_000
+) -> tuple[float, float, float]:
+    """Ratio of means and its 95 % percentile interval; pairs are drawn together, the same every time."""
+    pairs = np.array([over, under], dtype=np.float64)
+    drawn = np.random.default_rng(0).integers(0, pairs.shape[1], (resamples, pairs.shape[1]))
+    means = pairs[:, drawn].mean(axis=2)
+    low, high = np.quantile(means[0] / means[1], (0.025, 0.975)).tolist()
+    ratio = float(pairs[0].mean() / pairs[1].mean())
+    return ratio, low, high
+
+
+def paired_ratios(flights: Flights, over: Group, under: Group, measure: Measure) -> Iterator[float]:
+    """Of all runs that both of a pair of settings have, and whose measures are above 0."""
+    for one, other in zip(over, under, strict=True):
+        for upper, lower in zip(flights.get(one, ()), flights.get(other, ()), strict=True):
+            if measure(upper) > 0.0 and measure(lower) > 0.0:
+                yield measure(upper) / measure(lower)
+
+
+def geometric(values: Iterable[float]) -> tuple[float, float]:
+    """Geometric mean, and the factor by which its 95 % interval reaches up and down."""
+    mean, half = interval([math.log(value) for value in values])
+    return math.exp(mean), math.exp(half)
+
+
+def times(mean: float, factor: float) -> str:
+    """A geometric mean and its factor, for a person."""
+    return f"{mean:.2f} x÷ {factor:.2f}" if math.isfinite(factor) else f"{mean:.2f}"
 
 
 def quartiles(values: Sequence[float]) -> tuple[float, float, float]:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from kantor_fleet.picture import (
@@ -72,8 +72,8 @@ def trajectories(settings: Mapping[str, Setting]) -> Figure:
         *_, run = _runs_at(setting, (1000,))
         _map(place, run)
         found = f"{len(run.metrics.finds)} of {run.site.targets_m.shape[0]} targets"
-        _title(place, f"({letter}) {name}: {found}")
-    _legend(figure, axes[0])
+        write_title(place, f"({letter}) {name}: {found}")
+    legend_below(figure, axes[0])
     return figure
 
 
@@ -90,11 +90,11 @@ def comparison(
     methods: Mapping[str, Sequence[Flight]], detected: Measure, robots_s: Measure
 ) -> Figure:
     """Figure 6: box plots of detection and bars of execution time."""
-    figure = Figure(figsize=(10.5, 4.4), layout=_layout())
+    figure = Figure(figsize=(10.5, 4.4), layout=new_layout())
     boxes, bars = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
     _boxes(boxes, {name: [detected(f) for f in flights] for name, flights in methods.items()})
     tidy(boxes, "", "detected, %")
-    _title(boxes, f"(a) detection over {len(next(iter(methods.values())))} random starts")
+    write_title(boxes, f"(a) detection over {len(next(iter(methods.values())))} random starts")
     times_s = {name: [robots_s(f) for f in flights] for name, flights in methods.items()}
     medians_s = [float(np.median(values)) for values in times_s.values()]
     bars.bar(list(methods), medians_s, color=TEAM[: len(methods)], width=0.6)
@@ -109,7 +109,7 @@ def comparison(
             color=INK,
         )
     tidy(bars, "", "CPU time of five robots, s")
-    _title(bars, "(b) execution time, both methods compiled")
+    write_title(bars, "(b) execution time, both methods compiled")
     return figure
 
 
@@ -119,7 +119,7 @@ def diffusion(
     detected: Measure,
 ) -> Figure:
     """Figure 9: means with 95 % intervals against the diffusion rate v."""
-    figure = Figure(figsize=(6.6, 4.4), layout=_layout())
+    figure = Figure(figsize=(6.6, 4.4), layout=new_layout())
     axes = figure.subplots()
     for flights, label, colour in (
         (varying, "samples walk", SECOND),
@@ -143,11 +143,12 @@ def diffusion(
 
 
 def _panels(rows: int, columns: int) -> tuple[Figure, list[Axes]]:
-    figure = Figure(figsize=(_MAP_IN * columns, 4.2 * rows + 0.4), layout=_layout())
+    figure = Figure(figsize=(_MAP_IN * columns, 4.2 * rows + 0.4), layout=new_layout())
     return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 
-def _layout() -> ConstrainedLayoutEngine:
+def new_layout() -> ConstrainedLayoutEngine:
+    """Of a picture of several diagrams."""
     return ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
 
 
@@ -163,10 +164,10 @@ def _snapshots(
     for place, run, tick, letter in zip(places, runs, ticks, letters, strict=False):
         _map(place, run)
         found = f", {len(run.metrics.finds)} detected" if run.site.targets_m.size else ""
-        _title(place, f"({letter}) {prefix}t = {tick}{found}")
+        write_title(place, f"({letter}) {prefix}t = {tick}{found}")
     figure = places[0].figure
     assert isinstance(figure, Figure)
-    _legend(figure, places[min(1, len(places) - 1)])
+    legend_below(figure, places[min(1, len(places) - 1)])
 
 
 def _runs_at(setting: Setting, ticks: Sequence[int], seed: int = 0) -> Iterator[Run]:
@@ -194,12 +195,13 @@ def _map(axes: Axes, run: Run) -> None:
     tidy(axes, "x, m", "y, m")
 
 
-def _title(axes: Axes, text: str) -> None:
+def write_title(axes: Axes, text: str) -> None:
+    """Above a diagram."""
     axes.set_title(text, size=TEXT_PT + 0.5, color=INK, loc="left")
 
 
-def _legend(figure: Figure, axes: Axes) -> None:
-    """One legend for all maps, below them."""
+def legend_below(figure: FigureBase, axes: Axes) -> None:
+    """One legend for all diagrams, below them. axes: one that has all there is."""
     handles, labels = axes.get_legend_handles_labels()
     known = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
     if not set(labels) - known:
@@ -233,7 +235,7 @@ def _bounds(axes: Axes, flight: Flight) -> None:
         axes.plot(*zip(*exact, strict=True), "o", ms=4.0, color=FOUND, label=label)
     axes.set_ylim(0.0, 1.45 * axes.get_ylim()[1])  # room for the legend
     tidy(axes, "tick", "m")
-    _title(axes, "(f) upper bound of the Wasserstein distance")
+    write_title(axes, "(f) upper bound of the Wasserstein distance")
     axes.legend(loc="upper right", frameon=False, fontsize=SMALL_PT, labelcolor=INK)
 
 

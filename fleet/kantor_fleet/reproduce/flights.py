@@ -1,11 +1,12 @@
 """The runs behind a figure: settings in, measured flights out."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 from kantor_fleet.catalog import find
 from kantor_fleet.experiment import Case, Outcome, reason
+from kantor_fleet.sweep.plan import Key, plan
 from kantor_fleet.team import play, team
 from kantor_protocol.machine import SUPERVISOR, Inputs, Outputs, StateMachine
 from kantor_protocol.scenario import Scenario
@@ -36,16 +37,27 @@ class Setting(NamedTuple):
         """The scenario itself."""
         return find(self.scenario, self.overrides)
 
-    def cases(self, count: int) -> list[Case]:
-        """Runs of it with the seeds 0, 1, ..."""
-        scenario = self.find()
-        return [Case(scenario, seed, self.exact) for seed in range(count)]
+    def cases(self, seeds: Iterable[int]) -> list[tuple[Key, Case]]:
+        """Runs of it, each with what it is kept under."""
+        text = ",".join(map(str, seeds))
+        return list(plan(self.scenario, (), text, self.overrides, exact=self.exact).cases())
+
+
+class Moment(NamedTuple):
+    """A point of the curves over a map, of eight regions."""
+
+    tick: int
+    wtv: float
+    epv: float
 
 
 class Flight(Outcome, frozen=True, kw_only=True):
     """An outcome with the course of the run."""
 
     rows: tuple[Row, ...] = ()
+    """Over a density."""
+    course: tuple[Moment, ...] = ()
+    """Over a map."""
     robots_s: float = 0.0
     """CPU seconds inside the robots' steps: planning, weights and messages."""
 
@@ -86,10 +98,13 @@ def _fly(case: Case) -> Flight:
     play(scenario, seed, site, [recording.take], machines=machines)
     spent_ns = sum(timed.spent_ns for name, timed in machines.items() if name != SUPERVISOR)
     result = recording.finish()
+    rows = recording.metrics.rows
+    mapping = scenario.map is not None
     return Flight(
         result=result,
         failed=result.complaints[0] if result.complaints else None,
-        rows=tuple(recording.metrics.rows),
+        rows=() if mapping else tuple(rows),
+        course=tuple(Moment(row.tick, row.wtv, row.epv) for row in rows) if mapping else (),
         robots_s=spent_ns * 1e-9,
     )
 

@@ -5,22 +5,21 @@ robots one after another within a tick, a step of 10 m, three samples in a plan.
 """
 
 import math
-from collections.abc import Callable
-from typing import NamedTuple
-
-from matplotlib.figure import Figure as Picture
 
 from kantor_fleet.reproduce import drawing
 from kantor_fleet.reproduce.claims import (
     Ahead,
-    Claim,
     Median,
     Range,
     Ratio,
     Share,
     Spread,
 )
-from kantor_fleet.reproduce.flights import Flight, Flights, Setting
+from kantor_fleet.reproduce.figure import Figure
+from kantor_fleet.reproduce.flights import Flight, Setting
+from kantor_fleet.reproduce.measures import finished
+from kantor_fleet.sweep.table import Row
+from kantor_worldsim.metrics import Result
 
 _CONCURRENT = ("clock.order=concurrent",)
 _LEDGER = ("merge=ledger", "claims=true")
@@ -94,13 +93,6 @@ def detected(flight: Flight) -> float:
     return 100.0 * (flight.result.detection_rate or 0.0)
 
 
-def finished(flight: Flight) -> float:
-    """The tick at which the team finished; the last one for a run that was cut."""
-    assert flight.result is not None
-    done = flight.result.finished_tick
-    return float(flight.result.ticks if done is None else done)
-
-
 def first_contact(flight: Flight) -> float:
     """The tick in which a robot first heard another."""
     assert flight.result is not None
@@ -145,14 +137,17 @@ def _robots_s(flight: Flight) -> float:
     return flight.robots_s
 
 
-class Figure(NamedTuple):
-    """A figure of the paper."""
-
-    title: str
-    runs: int
-    """For each setting, as in the paper where it says so."""
-    claims: tuple[Claim, ...]
-    draw: Callable[[Flights], Picture]
+def _row(result: Result) -> Row:
+    return {
+        "detected": result.detected,
+        "targets": result.targets,
+        "finished_tick": result.finished_tick,
+        "first_contact_tick": result.first_contact_tick,
+        "w_ub_start": result.w_ub_start,
+        "w_ub_end": result.w_ub.paper,
+        "w_ub_instant_end": result.w_ub.final_instant,
+        "w1_exact": result.w1_exact,
+    }
 
 
 _NO_BOUND = (
@@ -194,6 +189,7 @@ FIG_4 = Figure(
         ),
     ),
     lambda flights: drawing.centralized(A, flights[A_EXACT if A_EXACT in flights else A][0]),
+    _row,
 )
 
 FIG_5 = Figure(
@@ -232,6 +228,7 @@ FIG_5 = Figure(
         ),
     ),
     lambda _flights: drawing.trajectories({"SMC, K = 15": A_SPECTRAL, "optimal transport": A}),
+    _row,
 )
 
 FIG_6 = Figure(
@@ -264,6 +261,7 @@ FIG_6 = Figure(
         detected,
         _robots_s,
     ),
+    _row,
 )
 
 FIG_7 = Figure(
@@ -318,6 +316,7 @@ FIG_7 = Figure(
         ),
     ),
     lambda flights: drawing.decentralized(C, flights[C], finished),
+    _row,
 )
 
 FIG_8 = Figure(
@@ -330,6 +329,7 @@ FIG_8 = Figure(
     lambda _flights: drawing.moving(
         {"samples stand": D_INVARIANT[7], "samples walk": D_VARYING[7]}
     ),
+    _row,
 )
 
 FIG_9 = Figure(
@@ -354,6 +354,7 @@ FIG_9 = Figure(
         {v: flights[D_INVARIANT[v]] for v in DIFFUSIONS_M},
         detected,
     ),
+    _row,
 )
 
 FIGURES = {

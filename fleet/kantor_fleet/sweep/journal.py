@@ -28,14 +28,15 @@ class _Line(msgspec.Struct, frozen=True):
     code: str
     seed: int
     exact: bool
-    outcome: Outcome
+    outcome: msgspec.Raw
 
 
 class Journal:
     """What is known of runs, in memory and on disk; one sweep writes at a time."""
 
-    def __init__(self, path: Path) -> None:
-        """Read what is there, or begin. Raises SweepError, OSError."""
+    def __init__(self, path: Path, kind: type[Outcome] = Outcome) -> None:
+        """Read what is there, or begin. kind: of the outcomes. Raises SweepError, OSError."""
+        self._kind = kind
         self.outcomes: dict[Key, Outcome] = {}
         """The last one that was added under each key."""
         self._path = path
@@ -62,7 +63,7 @@ class Journal:
 
     def add(self, key: Key, outcome: Outcome) -> None:
         """Keep a run. The operating system has it when this returns."""
-        self._write(_Line(*key, outcome))
+        self._write(_Line(*key, msgspec.Raw(msgspec.json.encode(outcome))))
         self.outcomes[key] = outcome
 
     def _lock(self) -> None:
@@ -103,11 +104,12 @@ class Journal:
     def _take(self, number: int, line: bytes) -> None:
         try:
             run = msgspec.json.decode(line, type=_Line)
+            outcome = msgspec.json.decode(run.outcome, type=self._kind)
         except msgspec.MsgspecError as error:
             raise SweepError(
                 f"{self._path}: line {number} is no run ({error}); remove it"
             ) from None
-        self.outcomes[Key(run.scenario, run.code, run.seed, run.exact)] = run.outcome
+        self.outcomes[Key(run.scenario, run.code, run.seed, run.exact)] = outcome
 
     def _write(self, line: _Header | _Line) -> None:
         self._file.write(msgspec.json.encode(line) + b"\n")

@@ -1,0 +1,53 @@
+"""What is read off a flight, and what the CSV says of one that explored a map."""
+
+import msgspec
+
+from kantor_fleet.reproduce.flights import Flight
+from kantor_fleet.sweep.table import Row
+from kantor_worldsim.metrics import MapResult, Result
+
+
+def finished(flight: Flight) -> float:
+    """The tick at which the team finished; the last one for a run that was cut."""
+    assert flight.result is not None
+    done = flight.result.finished_tick
+    return float(flight.result.ticks if done is None else done)
+
+
+def surveyed(flight: Flight) -> MapResult:
+    """What a flight over a map came to."""
+    assert flight.result is not None
+    assert flight.result.map is not None
+    return flight.result.map
+
+
+def distance_m(flight: Flight) -> float:
+    """Driven by all robots together."""
+    return surveyed(flight).distance_m
+
+
+def wtv_final(flight: Flight) -> float:
+    """Variance of the waiting times of eight regions at the end, squared ticks."""
+    return surveyed(flight).wtv_final.r8
+
+
+def wtv_mean(flight: Flight) -> float:
+    """The same over the run, with the waits that are expected of unknown cells."""
+    return surveyed(flight).wtv_mean.r8
+
+
+def epv_mean(flight: Flight) -> float:
+    """Variance of the explored share of eight regions over the run, squared per cent."""
+    return surveyed(flight).epv_mean.r8
+
+
+def map_row(result: Result) -> Row:
+    """A run over a map: ticks, and all that was measured of the map."""
+    assert result.map is not None
+    measured: Row = {}
+    for name, value in msgspec.to_builtins(result.map).items():
+        if isinstance(value, dict):
+            measured |= {f"{name}_{regions}": number for regions, number in value.items()}
+        else:
+            measured[name] = value
+    return {"ticks": result.ticks, "finished_tick": result.finished_tick, **measured}

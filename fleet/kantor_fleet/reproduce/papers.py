@@ -1,0 +1,11 @@
+"""The figures of all papers by name."""
+
+from kantor_fleet.reproduce import burgard, kabir_lee, kme
+from kantor_fleet.reproduce.figure import Figure
+
+FIGURES = kabir_lee.FIGURES | burgard.FIGURES | kme.FIGURES
+
+
+def figures(name: str) -> dict[str, Figure]:
+    """One, or `all` of the first paper: the others take long and are asked for by name."""
+    return kabir_lee.FIGURES if name == "all" else {name: FIGURES[name]}
