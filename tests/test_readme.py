@@ -6,32 +6,51 @@ from typing import Any
 
 import pytest
 
-from kantor_agent.planners import PLANNERS
+from kantor_agent.planners import ALLOCATORS, PLANNERS
 from kantor_fleet.catalog import find
-from kantor_fleet.team import team
-from kantor_worldsim.loop import in_process, simulate
+from kantor_fleet.team import play
+from kantor_protocol.scenario import Scenario
+from kantor_worldsim.metrics import Result
 from kantor_worldsim.recording import Recording
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
 
 
-def test_the_planner_in_the_readme_explores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The example as printed runs a mission to its end, with every rule held."""
-    (block,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+def example(name: str) -> Any:
+    """A class that the README prints."""
+    blocks = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    (block,) = (block for block in blocks if f"class {name}:" in block)
     names: dict[str, Any] = {}
     exec(block, names)
-    monkeypatch.setitem(PLANNERS, "transport", lambda _scenario: names["Nearest"]())
-    scenario = find("paper-decentralized", ["energy.points=400", "samples.count=200"])
-    site, recording = Site.of(scenario, 0), Recording(scenario, 0, "in-process")
-    stage = Stage(scenario, 0, site, [recording.take])
+    return names[name]
 
-    reason = simulate(stage, in_process(team(scenario, 0, site)), 0, lambda: False)
 
-    result = recording.finish()
-    assert (reason, result.complaints) == ("done", ())
+def played(scenario: Scenario) -> Result:
+    """A mission in process, with every referee."""
+    recording = Recording(scenario, 0, "in-process")
+    play(scenario, 0, Site.of(scenario, 0), [recording.take])
+    return recording.finish()
+
+
+def test_the_planner_in_the_readme_explores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The example as printed runs a mission to its end, with every rule held."""
+    monkeypatch.setitem(PLANNERS, "transport", lambda _scenario: example("Nearest")())
+    result = played(find("paper-decentralized", ["energy.points=400", "samples.count=200"]))
+
+    assert (result.ended, result.complaints) == ("done", ())
     assert result.mass_left == 0.0
+
+
+def test_the_planner_on_maps_in_the_readme_explores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In every robot and in the supervisor, as printed."""
+    monkeypatch.setitem(ALLOCATORS, "burgard", example("Polite"))
+    for coordination in ("centralized", "decentralized"):
+        result = played(find("office", [f"coordination={coordination}"]))
+
+        assert (result.ended, result.complaints) == ("done", ())
+        assert result.map is not None
+        assert result.map.explored == 1.0
 
 
 def test_every_file_that_the_readme_links_exists() -> None:
