@@ -28,14 +28,17 @@ def _fold(
     cells: np.ndarray,
     void: np.ndarray,
     ranges: np.ndarray,
-) -> None:
-    """Apply the entries log[first:length] of one origin. cells: (n,) fused kinds."""
+) -> bool:
+    """Apply the entries log[first:length] of one origin; whether any is about a cell. cells: (n,) fused."""
     count = cells.shape[0]
+    news = False
     for i in range(first, length):
         entry = log[i, 0]
         if entry >= 3 * count:
             ranges[min(entry - 3 * count, ranges.shape[0] - 1)] += 1
-        elif entry >= 2 * count:
+            continue
+        news = True
+        if entry >= 2 * count:
             void[entry - 2 * count] = True
         elif entry >= 0:
             cell, kind = entry // 2, OCCUPIED if entry & 1 else FREE
@@ -44,6 +47,7 @@ def _fold(
             )
             layer[cell] = kind
             cells[cell] = FREE if votes[cell] < 0 else OCCUPIED  # in doubt there is a wall
+    return news
 
 
 @kernel
@@ -78,7 +82,7 @@ class Chart:
         self.void = np.zeros(frame.cells, dtype=np.bool_)
         """(cells,) frontiers at which somebody stood and saw nothing new."""
         self.revision = 0
-        """Rises whenever anything changed."""
+        """Rises whenever a cell may have changed."""
         self._layers = np.zeros((origins, frame.cells), dtype=np.uint8)
         self._votes = np.zeros(frame.cells, dtype=np.int16)
         self._folded = np.zeros(origins, dtype=np.int64)
@@ -87,11 +91,11 @@ class Chart:
         self._frontiers_of = -1
 
     def fold(self, replica: Replica) -> bool:
-        """Take in what the logs hold by now; whether anything is new."""
+        """Take in what the logs hold by now; whether a cell may have changed."""
         lengths = replica.store.length
         before = self.revision
         for origin in np.flatnonzero(lengths > self._folded).tolist():
-            _fold(
+            news = _fold(
                 replica.store.logs[origin],
                 int(self._folded[origin]),
                 int(lengths[origin]),
@@ -102,7 +106,7 @@ class Chart:
                 self.ranges,
             )
             self._folded[origin] = lengths[origin]
-            self.revision = before + 1
+            self.revision = before + 1 if news else self.revision
         return self.revision > before
 
     @property

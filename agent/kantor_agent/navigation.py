@@ -35,9 +35,10 @@ class Navigator:
         self._frame = terrain.frame
         self._target = NOWHERE
         self._way: npt.NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self._beyond: npt.NDArray[np.float64] = np.zeros(0)
         self._passed = 0
         self.left_cells = math.inf
-        """How far it still is, about; falls as the robot gets on."""
+        """How far it still is; never rises while the robot keeps to a way."""
 
     def head(self, pose: Pose, target: int) -> tuple[float, float] | None:
         """Where to head for, world frame; None if no way is known."""
@@ -48,6 +49,7 @@ class Navigator:
         if ahead < 0:
             self._target, self._passed = target, 0
             self._way = self._terrain.way(cell, target)
+            self._beyond = self._to_the_end()
             ahead = self._look_ahead(pose)
         if ahead < 0:
             self._target = NOWHERE
@@ -55,8 +57,14 @@ class Navigator:
         self._passed = ahead
         place_m = self._frame.centre_of(int(self._way[ahead]))
         away_m = math.dist(place_m, (pose.x_m, pose.y_m))
-        self.left_cells = away_m / self._frame.resolution_m + self._way.shape[0] - 1 - ahead
+        self.left_cells = away_m / self._frame.resolution_m + float(self._beyond[ahead])
         return place_m
+
+    def _to_the_end(self) -> npt.NDArray[np.float64]:
+        """How far it is from every cell of the way to its last, in cells."""
+        rows, columns = np.divmod(self._way, self._frame.columns)
+        steps = np.hypot(np.diff(rows), np.diff(columns))
+        return np.append(steps[::-1].cumsum()[::-1], 0.0)
 
     def _look_ahead(self, pose: Pose) -> int:
         frame = self._frame

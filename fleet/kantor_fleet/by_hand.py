@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from kantor_fleet.exits import Exit, fail
+from kantor_fleet.exits import Exit, fail, warn
 from kantor_fleet.interrupts import Interrupts
 from kantor_protocol import bus, credentials
 from kantor_protocol.credentials import FLEET_PATTERN, Identity
@@ -37,7 +37,9 @@ def host_by_hand(
     if not FLEET_PATTERN.fullmatch(fleet):
         fail(Exit.USAGE, f"--fleet {fleet}: use lower-case letters, digits and dashes")
     bus.check_endpoint(listen)
-    plan = Plan(scenario, seed, Site.of(scenario, seed), exchange, speed, start_after_s)
+    site = Site.of(scenario, seed)
+    warn(site.warnings)
+    plan = Plan(scenario, seed, site, exchange, speed, start_after_s)
     identities = credentials.issue(secrets, fleet, scenario.roster)
     bus.init_log()
     with Interrupts() as interrupts, ProgressView(scenario.name) as view:

@@ -2,6 +2,7 @@
 
 import enum
 import sys
+from collections.abc import Iterable
 from typing import NoReturn
 
 
@@ -24,3 +25,9 @@ def fail(code: Exit, message: str) -> NoReturn:
     """One line to standard error, and out."""
     print(f"kantor: {message}", file=sys.stderr)
     sys.exit(code)
+
+
+def warn(messages: Iterable[str]) -> None:
+    """A line each to standard error, and on."""
+    for message in messages:
+        print(f"kantor: warning: {message}", file=sys.stderr)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from kantor_fleet.exits import Exit
+from kantor_fleet.exits import Exit, warn
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.local import Order, local_fleet, watch_progress
 from kantor_fleet.preload import warm_up
@@ -40,6 +40,7 @@ def run(
     exact_every: see Metrics.
     """
     site = Site.of(scenario, seed)
+    warn(site.warnings)
     folder = folder_for(scenario, seed, out)
     with Interrupts() as interrupts:
         if exchange == "in-process":

@@ -61,7 +61,7 @@ class Observation(msgspec.Struct, frozen=True, array_like=True, gc=False):
     detected: tuple[int, ...] = ()
     """Targets that its sensor found since the last observation."""
     scan: bytes = b""
-    """What its range finder measured from there, see `scans.py`; empty without a map."""
+    """What its range finder measured from there, see `evidence.py`; empty without a map."""
     bumped: bool = False
     """Whether the last step ended at a wall."""
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.grid import Frame
-from kantor_protocol.machine import Inputs, Outputs, ParticipantId, Pose
+from kantor_protocol.machine import Inputs, Observation, Outputs, ParticipantId, Pose
 from kantor_protocol.scenario import Scenario
 
 VERSION = 1
@@ -110,6 +110,8 @@ class Go(_Message, frozen=True, array_like=True, tag=4):
     now_ns: int
     speed: float
     """Simulated seconds in a real one."""
+    observation: Observation | None = None
+    """What the participant sees before its first step."""
 
 
 class Turn(_Message, frozen=True, array_like=True, tag=5):

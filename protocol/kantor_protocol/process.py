@@ -11,7 +11,7 @@ from collections.abc import Callable
 from kantor_protocol import bus
 from kantor_protocol.clock import clocks
 from kantor_protocol.credentials import Identity
-from kantor_protocol.machine import Envelope, Inputs, Observation, Outputs, Pose, StateMachine
+from kantor_protocol.machine import Envelope, Inputs, Outputs, StateMachine
 from kantor_protocol.messages import (
     VERSION,
     Go,
@@ -109,13 +109,13 @@ class _Participant:
     def _free_run(self, go: Go) -> str | None:
         """Step by the own clock until told to stop; the reason, or None for another mission."""
         mission, machine = self._mission, self._machine
-        if mission is None or machine is None:
+        if mission is None or machine is None or go.observation is None:
             return None
         scenario = mission.scenario
         clock = clocks(scenario, mission.seed)[self._me]
         origin = time.monotonic_ns() - round(go.now_ns / go.speed)
         arrived: list[Envelope] = []
-        observation = Observation(step=0, pose=_start(mission, self._me))
+        observation = go.observation
         ordinal = 1
         while clock.due_ns(ordinal) <= go.now_ns:
             ordinal += 1
@@ -146,12 +146,3 @@ class _Participant:
         return Report(
             VERSION, self._line.nonce, outputs, inputs.now_ns, heard, inputs.observation.step
         )
-
-
-def _start(mission: Mission, me: str) -> Pose:
-    """Where a participant stands at time 0."""
-    robots = mission.scenario.robot_ids
-    if me not in robots:
-        return Pose(*mission.scenario.supervisor_m)
-    x_m, y_m = mission.starts.open("<f8", 2)[robots.index(me)].tolist()
-    return Pose(x_m, y_m)

@@ -96,6 +96,10 @@ def test_to_an_accessible_region_it_is_as_far_as_the_way_to_a_frontier_beside_it
     assert regions.nearest.tolist() == [[7]]
 
 
+def test_of_contour_cells_equally_far_the_first_is_the_nearest() -> None:
+    assert regions_of(scene("##?", ".a.", "?##"), 1).nearest.tolist() == [[2]]
+
+
 def test_to_an_inaccessible_region_it_is_as_far_as_the_crow_flies() -> None:
     regions = regions_of(scene("ab??????"), 2, 6)
     # Columns 1 to 4, and 5 to 7; of the second only column 5 is on the edge.
@@ -177,6 +181,15 @@ def test_an_obstacle_between_frontier_and_region_costs_the_diagonal() -> None:
     assert chosen(travel=(13.0, 4.0)) == 1
     assert chosen(travel=(12.0, 4.0), wall=True) == 0  # 12 + 3.6 against 4 + 2 + 10
     assert chosen(travel=(13.0, 4.0), wall=True) == 1
+
+
+@pytest.mark.parametrize(("wall", "target"), [(2, 1), (3, 0)])
+def test_a_line_runs_from_the_frontier_to_the_region(wall: int, target: int) -> None:
+    # From (0, 0) to (2, 1) it crosses (1, 0); the other way round it would cross (1, 1).
+    cells = np.full(3 * 2, FREE, np.uint8)
+    cells[wall] = OCCUPIED
+    flags = np.ones(2, np.bool_), np.zeros(2, np.bool_)
+    assert choose(cells, 2, np.array([0, 5]), *flags, np.array([0.0, 5.0]), 5, 10.0) == target
 
 
 def test_a_taken_frontier_costs_two_diagonals() -> None:
@@ -371,6 +384,33 @@ def plain_line(one: tuple[int, int], other: tuple[int, int]) -> list[tuple[int, 
     return line
 
 
+def plain_cluster(
+    points: list[int], columns: int, centroids: list[tuple[int, ...]]
+) -> tuple[dict[int, int], list[tuple[int, ...]]]:
+    """Lloyd's rounds: the region of each point, and the centroids."""
+    places = {p: tuple(PARTS * x for x in divmod(p, columns)) for p in points}
+    ks = range(len(centroids))
+
+    def away(p: int, k: int) -> int:
+        return sum((x - c) ** 2 for x, c in zip(places[p], centroids[k], strict=True))
+
+    for _ in range(ROUNDS):
+        region = {p: min(ks, key=lambda k, p=p: away(p, k)) for p in points}
+        for k in ks:
+            sizes = [list(region.values()).count(its) for its in ks]
+            if not sizes[k]:
+                shared = [p for p in points if sizes[region[p]] > 1]
+                region[max(shared, key=lambda p: away(p, region[p]))] = k
+        before, centroids = centroids, []
+        for k in ks:
+            own = [places[p] for p in points if region[p] == k]
+            sums = [sum(axis) for axis in zip(*own, strict=True)]
+            centroids.append(tuple((2 * s + len(own)) // (2 * len(own)) for s in sums))
+        if centroids == before:
+            break
+    return region, centroids
+
+
 class Plain:
     """The assignment with lists and dicts."""
 
@@ -381,7 +421,7 @@ class Plain:
         self.kinds = situation.terrain.chart.cells.reshape(self.shape)
         self.diagonal = math.sqrt(frame.rows**2 + frame.columns**2)
         self.frontiers = situation.frontiers.tolist()
-        self.group = sorted((*situation.members, *situation.others), key=lambda m: m.robot)
+        self.group = plain_group(situation)
 
     def at(self, cell: int) -> tuple[int, int]:
         return divmod(cell, self.shape[1])
@@ -420,33 +460,6 @@ class Plain:
         key = (self.seed, Purpose.CENTROIDS, robot.robot, max(count, 0))
         return round(uniform(*key, 0) * edge[0]), round(uniform(*key, 1) * edge[1])
 
-    def cluster(self, points: list[int]) -> tuple[dict[int, int], list[tuple[int, int]]]:
-        centroids = [self.start(robot) for robot in self.group][: len(points)]
-        ks = range(len(centroids))
-        places = {p: tuple(PARTS * x for x in self.at(p)) for p in points}
-
-        def away(p: int, k: int) -> int:
-            return sum((x - c) ** 2 for x, c in zip(places[p], centroids[k], strict=True))
-
-        for _ in range(ROUNDS):
-            region = {p: min(ks, key=lambda k, p=p: away(p, k)) for p in points}
-            moved = set()
-            for k in ks:
-                if k not in region.values():
-                    sizes = {its: list(region.values()).count(its) for its in ks}
-                    shared = [p for p in points if sizes[region[p]] > 1]
-                    far = max(shared, key=lambda p: 0 if p in moved else away(p, region[p]))
-                    region[far] = k
-                    moved.add(far)
-            before = list(centroids)
-            for k in ks:
-                own = [places[p] for p in points if region[p] == k]
-                sums = [sum(axis) for axis in zip(*own, strict=True)]
-                centroids[k] = tuple((2 * s + len(own)) // (2 * len(own)) for s in sums)
-            if centroids == before:
-                break
-        return region, centroids
-
     def region_distance(self, robot: Member, k: int) -> tuple[float, int, bool]:
         """Eq. 1-3: how far, to which contour cell, and whether it is accessible."""
         own = [p for p in self.region if self.region[p] == k]
@@ -482,7 +495,9 @@ class Plain:
         members = self.situation.members
         if not self.frontiers:
             return [Task(NOWHERE, m.task.memo) for m in members]
-        self.region, centroids = self.cluster(self.points())
+        points = self.points()
+        starts = [self.start(robot) for robot in self.group][: len(points)]
+        self.region, centroids = plain_cluster(points, self.shape[1], starts)
         measured = [
             [self.region_distance(robot, k) for k in range(len(centroids))] for robot in self.group
         ]
@@ -526,6 +541,10 @@ class Plain:
         if any(f == t or self.squared(f, t) < far for t in taken):
             cost += 2.0 * self.diagonal
         return cost
+
+
+def plain_group(situation: Situation) -> list[Member]:
+    return sorted((*situation.members, *situation.others), key=lambda m: m.robot)
 
 
 MEMOS = st.one_of(
@@ -578,23 +597,75 @@ def test_nobody_who_can_reach_a_frontier_idles(situation: Situation, seed: int) 
 
 
 @examples(100)
+@given(situations(), st.data())
+def test_distances_and_contour_cells_are_those_of_the_equations(
+    situation: Situation, data: st.DataObject
+) -> None:
+    seed = data.draw(st.integers(0, 2**63 - 1))
+    plain = Plain(situation._replace(members=tuple(plain_group(situation)), others=()), seed)
+    if not plain.frontiers:
+        return
+    plain.assign()
+    starts = np.array([plain.start(m) for m in plain.group])
+    cells = np.array([m.cell for m in plain.group])
+    travel = np.array([[plain.travel(m, f) for f in plain.frontiers] for m in plain.group])
+    regions = Regions(situation.terrain, situation.frontiers, cells, starts, travel)
+    distance, nearest, accessible = zip(*itertools.chain(*plain.measured), strict=True)
+    assert regions.distance.ravel().tolist() == list(distance)
+    assert regions.nearest.ravel().tolist() == list(nearest)
+    assert regions.accessible.ravel().tolist() == list(accessible)
+
+
+@st.composite
+def partitions(draw: st.DrawFn) -> tuple[list[int], int, list[tuple[int, int]]]:
+    """Points, columns, and where as many centroids as points or fewer begin, some in one place."""
+    columns = draw(st.integers(1, 12))
+    points = sorted(draw(st.sets(st.integers(0, 12 * columns - 1), min_size=1, max_size=40)))
+    places = st.tuples(st.integers(0, 12 * PARTS), st.integers(0, 12 * PARTS))
+    few = draw(st.lists(places, min_size=1, max_size=8))
+    starts = draw(st.lists(st.sampled_from(few), min_size=1, max_size=min(8, len(points))))
+    return points, columns, starts
+
+
+@examples(300)
+@given(partitions())
+def test_k_means_is_exact_and_leaves_no_region_empty(
+    case: tuple[list[int], int, list[tuple[int, int]]],
+) -> None:
+    points, columns, starts = case
+    centroids = np.array(starts, dtype=np.float64)
+    region = np.full(12 * columns, NO_REGION)
+    kmeans._cluster(np.array(points), columns, centroids, region)
+    regions, places = plain_cluster(points, columns, starts)
+    assert {p: int(region[p]) for p in points} == regions
+    assert centroids.tolist() == [list(place) for place in places]
+    assert set(regions.values()) == set(range(len(starts)))
+    assert (region != NO_REGION).sum() == len(points)
+
+
+@examples(60)
 @given(
-    st.tuples(st.integers(1, 30), st.integers(1, 30)).flatmap(
+    st.tuples(st.integers(1, 12), st.integers(1, 12)).flatmap(
         lambda shape: st.tuples(
-            st.just(shape), *[st.integers(0, shape[0] * shape[1] - 1) for _ in range(3)]
+            st.just(shape[1]), *[st.integers(0, shape[0] * shape[1] - 1)] * 2, st.just(shape)
         )
     )
 )
-def test_a_line_is_blocked_by_the_cells_on_it(case: tuple[tuple[int, int], int, int, int]) -> None:
-    (rows, columns), one, other, wall = case
+def test_a_line_is_blocked_by_the_cells_on_it(
+    case: tuple[int, int, int, tuple[int, int]],
+) -> None:
+    columns, one, other, (rows, _) = case
     cells = np.full(rows * columns, UNKNOWN, np.uint8)
     assert not blocked(cells, columns, one, other)
-    cells[wall] = OCCUPIED
-    line = plain_line(divmod(one, columns), divmod(other, columns))
-    assert blocked(cells, columns, one, other) == (divmod(wall, columns) in line)
-    assert len(line) == 1 + max(
-        abs(a - b) for a, b in zip(divmod(one, columns), divmod(other, columns), strict=True)
-    )
+    blocking = []
+    for wall in range(rows * columns):
+        cells[wall] = OCCUPIED
+        if blocked(cells, columns, one, other):
+            blocking.append(divmod(wall, columns))
+        cells[wall] = UNKNOWN
+    ends = divmod(one, columns), divmod(other, columns)
+    assert blocking == sorted(plain_line(*ends))
+    assert len(blocking) == 1 + max(abs(a - b) for a, b in zip(*ends, strict=True))
 
 
 # Whole missions.

@@ -194,13 +194,23 @@ def test_a_supervisor_that_falls_silent_is_done_without() -> None:
     [
         ("sensor.field_of_view_deg=40", "sensor.beams=9"),
         ("sensor.beams=7",),
+        ("sensor.beams=4", "planner.replan_gap=1"),
         ("sensor.noise_m=0.2",),
         ("vehicle=unicycle", "vehicle.acceleration_m_s2=1", "vehicle.turn_rate_rad_s=1"),
         ("vehicle=second-order", "vehicle.acceleration_m_s2=1"),
         ("clock.spread=0.3", "clock.drift_ppm=1000"),
         ("clock.order=turn", "coordination=centralized"),
     ],
-    ids=["narrow", "few beams", "noise", "unicycle", "second order", "clocks", "in turn"],
+    ids=[
+        "narrow",
+        "few beams",
+        "four beams",
+        "noise",
+        "unicycle",
+        "second order",
+        "clocks",
+        "in turn",
+    ],
 )
 def test_every_mission_ends(overrides: tuple[str, ...]) -> None:
     """A frontier that shows nothing, or is not reached, is given up; nobody circles for ever."""

@@ -28,10 +28,13 @@ from kantor_agent.planners.market import (
 )
 from kantor_agent.planners.team import Member, Situation, Task
 from kantor_agent.terrain import Terrain
+from kantor_fleet.team import play
 from kantor_protocol.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
 from kantor_protocol.keyed import Purpose, uniform
 from kantor_protocol.registers import NUMBER_MAX
 from kantor_protocol.scenario import Scenario, parse
+from kantor_worldsim.records import Batch, Record
+from kantor_worldsim.world import Site
 from strategies import examples
 
 MISSION = """
@@ -96,9 +99,9 @@ def test_quadtree_leaf_of_two_ranges_is_not_split() -> None:
 
 
 def test_quadtree_passes_over_what_is_known_to_three_quarters() -> None:
-    """Range 1, two leaves: with 1 of 4 cells unknown the left has no goal, with 2 the right has one."""
-    assert quadtree_goals(terrain_of("...?", ".?.?", range_m=1.0)) == [4 + 3]
-    assert quadtree_goals(terrain_of("....", ".?.?", range_m=1.0)) == []
+    """Range 1, leaves of 2 x 2: one of four cells is too little, and so are 4 of 16."""
+    assert quadtree_goals(terrain_of("....", ".???", "??..", "??..", range_m=1.0)) == [7, 13]
+    assert quadtree_goals(terrain_of("....", ".?.?", "?...", "?...", range_m=1.0)) == []
 
 
 def test_quadtree_centre_that_is_known_is_no_goal() -> None:
@@ -732,6 +735,7 @@ def test_offer_waits_for_all_in_contact_but_not_for_ever() -> None:
     """r1 is heard and hears nothing: bidding ends with the lease, and the next goal is offered."""
     net = hall()
     net.until(lambda: net.memo(0).offered == W)
+    net.under_way = []
     net.play(4, only(1))
     assert net.memo(0).offered == W
     net.play(1, only(1))
@@ -749,7 +753,7 @@ def test_silent_robot_out_of_contact_does_not_hold_up_an_offer() -> None:
 
 def answer(seen: int, *tour: tuple[int, int]) -> Member:
     """r1 with what it has seen of r0."""
-    return member(1, 311, Task(23, packed(Memo(9, NOWHERE, 0, 0, (seen, 0), (0, 0), tour))))
+    return member(1, 311, Task(23, packed(Memo(9, NOWHERE, 0, 0, (seen, 0, 0), (0, 0, 0), tour))))
 
 
 @pytest.mark.parametrize(
@@ -761,21 +765,34 @@ def answer(seen: int, *tour: tuple[int, int]) -> Member:
         ("confirmed an earlier award", answer(59, (E, NOBODY)), [1]),
         ("has not answered yet", answer(59), [1]),
         ("declined", answer(60), [NOBODY]),
-        ("has named an heir itself", answer(60, (E, 0)), [NOBODY]),
+        ("has named an heir itself", answer(60, (E, 2)), [NOBODY]),
     ],
 )
 def test_seller_lets_go_only_of_what_the_heir_holds_for_good(
     what: str, word: Member, after: list[int]
 ) -> None:
     """r0 has named r1 in its memo 60."""
+    market = Market(mission(), 0, 0)
+    market._form._tour = [_Holding(W), _Holding(E, heir=1, named=60, until=70)]
+
+    market.assign(situation(terrain_of(*HALL), [member(0, 5)], [word], 61))
+
+    assert [held.heir for held in market._form._tour if held.goal == E] == after, what
+
+
+def test_two_that_name_each_other_do_not_both_let_go() -> None:
+    """Each holds E and has named the other: neither holds it for good, so neither lets go."""
     net = hall()
-    trader = net.markets[0]._form
-    trader._tour = [_Holding(W), _Holding(E, heir=1, named=60, until=70)]
-    terrain = net.terrains[0]
+    net.play(2)
+    net.give(0, W)
+    for robot in (0, 1):
+        holding = _Holding(E, heir=1 - robot, named=3, until=20)
+        net.markets[robot]._form._tour.append(holding)
+    for _ in range(10):
+        net.play(1)
+        assert net.holders(E)
 
-    net.markets[0].assign(situation(terrain, [net.members[0]], [word], 61))
-
-    assert [held.heir for held in trader._tour if held.goal == E] == after, what
+    assert net.holders(E) == [0]
 
 
 def test_goal_held_twice_is_kept_by_the_lower_place() -> None:
@@ -963,3 +980,54 @@ def test_same_words_make_the_same_market(seed: int) -> None:
         net.play(40, radio)
 
     assert nets[0].members == nets[1].members
+
+
+# Whole missions.
+
+FIELD_TRIP = (
+    "map.layout=unstructured",
+    "map.size_m=[48.0, 48.0]",
+    "starts.spread=together",
+    "sensor.range_m=6.0",
+    "sensor.beams=90",
+    "vehicle.speed_m_s=1.0",
+    "limit_s=2000.0",
+)
+BAD_RADIO = (
+    "radio.range_m=15.0",
+    "radio.drop=0.3",
+    "radio.duplicate=0.2",
+    "radio.delay_s=1.0",
+    "radio.jitter_s=2.0",
+)
+
+
+def targets_of(scenario: Scenario, seed: int) -> tuple[str, dict[str, list[tuple[float, float]]]]:
+    """Why a mission ended, and the targets of each robot, one after another."""
+    targets: dict[str, list[tuple[float, float]]] = {name: [] for name in scenario.robot_ids}
+
+    def note(record: Record) -> None:
+        for act in record.acts if isinstance(record, Batch) else ():
+            goal = act.outputs and act.outputs.goal
+            if goal and targets[act.name][-1:] != [goal]:
+                targets[act.name].append(goal)
+
+    return play(scenario, seed, Site.of(scenario, seed), [note]), targets
+
+
+@pytest.mark.parametrize("rule", ["random", "greedy", "quadtree"])
+@pytest.mark.parametrize(
+    "how",
+    [("coordination=centralized",), (), BAD_RADIO],
+    ids=["centralized", "decentralized", "bad-radio"],
+)
+def test_mission_ends_and_nobody_dithers(rule: str, how: tuple[str, ...]) -> None:
+    """All is explored; of a robot's targets hardly one in ten is one of the four before it."""
+    scenario = mission(*FIELD_TRIP, *how, f"planner.goals={rule}")
+    reason, targets = targets_of(scenario, 1)
+
+    assert reason == "done"
+    back = [
+        goal in ways[max(0, i - 4) : i] for ways in targets.values() for i, goal in enumerate(ways)
+    ]
+    assert sum(back) <= 0.1 * len(back)

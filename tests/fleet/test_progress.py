@@ -29,6 +29,17 @@ UNDER_WAY = Progress(
 LINE = "t=  12.3 s  explored 57 %  energy 615/5000  detected 47/300  W_UB 2311.4  links 3  msg/s 42  done 0/5"
 
 
+ON_A_MAP = msgspec.structs.replace(
+    UNDER_WAY,
+    energy_spent=0,
+    energy_total=0,
+    detected=0,
+    targets=0,
+    w_ub=0.0,
+    distance_m=321.4,
+)
+
+
 class Watch:
     """Real time as the test wants it."""
 
@@ -83,6 +94,18 @@ def test_mission_without_targets_says_nothing_of_them() -> None:
     line = line_of(msgspec.structs.replace(UNDER_WAY, detected=0, targets=0))
 
     assert line == LINE.replace("  detected 47/300", "")
+
+
+def test_mission_on_a_map_tells_of_the_way_and_not_of_bounds() -> None:
+    """There is neither energy nor W_UB where a map is explored."""
+    line = "t=  12.3 s  explored 57 %  distance 321 m  links 3  msg/s 42  done 0/5"
+    shown = screen(ON_A_MAP)
+
+    assert line_of(ON_A_MAP) == line
+    assert "distance 321 m" in shown
+    assert "57 %" in shown
+    assert "W_UB" not in shown
+    assert "energy" not in shown
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,24 @@ def test_a_run_leaves_its_folder(kantor: "Kantor") -> None:
     assert str(result["digest"]) in finished.out
 
 
+def test_a_run_on_a_map_leaves_its_folder(kantor: "Kantor") -> None:
+    """The same files; what was explored in place of the mass; and it verifies."""
+    small = ("--set", "map.size_m=[16, 16]", "robots.count=2", "starts.spots=0")
+    finished = in_process(kantor, "blank", *small)
+
+    (folder,) = kantor.runs()
+    result = result_of(folder)
+    assert finished.code == 0, finished.err
+    assert isinstance(result["map"], dict)
+    assert result["map"]["explored"] == 1.0
+    assert set(result["map"]["wtv_final"]) == {"r2", "r4", "r8", "r16", "r32", "r64"}
+    assert "explored  100.0 %" in finished.out
+    assert "distance " in finished.out
+    assert (folder / "metrics.csv").read_text().startswith("tick,time_s,explored,")
+    assert (folder / "report.png").read_bytes().startswith(b"\x89PNG")
+    assert kantor("verify", folder).code == 0
+
+
 def test_a_mission_that_is_not_met_exits_with_one(kantor: "Kantor") -> None:
     """The limit cut it."""
     finished = in_process(kantor, "fleet", *SHORT)

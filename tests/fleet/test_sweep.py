@@ -332,6 +332,22 @@ def same(one: Path, other: Path) -> bool:
     )
 
 
+def test_a_sweep_of_maps_has_their_columns(kantor: "Kantor") -> None:
+    """What is measured on maps stands in the tables of missions on maps, and in no other."""
+    small = ("--set", "map.size_m=[16, 16]", "starts.spots=0")
+    finished = kantor(
+        "sweep", "blank", *small, "--vary", "robots.count=1,2", "--seeds", "0:2", "--jobs", 1
+    )
+    table = rows_of(kantor.folder / "sweeps" / "blank" / "table.csv")
+    summary = rows_of(kantor.folder / "sweeps" / "blank" / "summary.csv")
+
+    assert finished.code == 0, finished.err
+    assert [float(row["map_explored"]) for row in table] == [1.0] * 4
+    assert all(float(row["map_wtv_final_r8"]) > 0.0 for row in table)
+    assert "map_epv_mean_r64" in {row["measure"] for row in summary}
+    assert "map_distance_m" in finished.out
+
+
 @group
 def test_a_sweep_leaves_its_folder(reference: Path) -> None:
     """A row for each run in the order of the plan; a result's fields; the times apart."""
@@ -348,6 +364,8 @@ def test_a_sweep_leaves_its_folder(reference: Path) -> None:
     ]
     assert {"w_ub_paper", "bytes_per_robot_tick_total", "digest", "failed"} <= set(table[0])
     assert "wall_s" not in table[0]
+    assert not any(name.startswith("map_") for name in table[0])
+    assert not any(row["measure"].startswith("map_") for row in summary)
     assert len(rows_of(reference / "timings.csv")) == RUNS
     assert (reference / "plot.png").read_bytes().startswith(b"\x89PNG")
 

@@ -1,16 +1,15 @@
 """Real processes on the real bus: the three exchanges, and what happens to a fleet."""
 
-import json
 import os
 import signal
 import statistics
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import psutil
 import pytest
 
+from fleets import await_line, children_named, result_of
 from kantor_fleet.catalog import find
 from kantor_fleet.team import team
 from kantor_protocol.scenario import Scenario
@@ -20,8 +19,6 @@ from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 
 if TYPE_CHECKING:
-    import subprocess
-
     from conftest import Kantor
 
 LOSSY = (
@@ -30,33 +27,12 @@ LOSSY = (
 )  # fmt: skip
 
 
-def result_of(folder: Path) -> dict[str, object]:
-    """result.json of a run folder."""
-    tree = json.loads((folder / "result.json").read_text())
-    assert isinstance(tree, dict)
-    return tree
-
-
 def detection(scenario: Scenario, seed: int) -> float:
     """The detection rate in virtual time."""
     site, metrics = Site.of(scenario, seed), Metrics()
     stage = Stage(scenario, seed, site, [metrics.take])
     simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
     return len(metrics.finds) / len(site.targets_m)
-
-
-def await_line(process: "subprocess.Popen[str]", start: str, part: str = "") -> str:
-    """The first line of output that starts so and has that part; fails when the output ends before."""
-    assert process.stdout is not None
-    for line in process.stdout:
-        if line.startswith(start) and part in line:
-            return line
-    raise AssertionError(f"no line starts with {start!r} and has {part!r}")
-
-
-def children_named(process: "subprocess.Popen[str]", log: Path) -> int:
-    """The process id that a participant's log tells."""
-    return int(json.loads(log.read_text().splitlines()[0])["pid"])
 
 
 def test_same_seed_same_digest_in_process_and_over_the_bus(kantor: "Kantor") -> None:

@@ -665,7 +665,8 @@ class Checker:
         if self._visiting:
             self._check_registers(batch)
         if self._map_rules is not None:
-            self.count += self._map_rules.check(batch)
+            unsaid = self._map_rules.check(batch)
+            self.count += unsaid
 
     def _lengthen(self, name: str) -> None:
         """Double one of the arrays that grow with the run."""

@@ -90,7 +90,7 @@ def _merged(finest: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDAr
     """(…, 64) sums of the finest blocks as sums of fewer."""
     rows, columns = shape
     square = finest.reshape(-1, rows, _FINEST // rows, columns, _FINEST // columns)
-    return square.sum(axis=(2, 4)).reshape(finest.shape[0], -1)
+    return np.asarray(square.sum(axis=(2, 4)).reshape(finest.shape[0], -1))
 
 
 def _variance(sums: npt.NDArray[np.float64], counts: npt.NDArray[np.float64]) -> float:

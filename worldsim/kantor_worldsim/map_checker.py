@@ -6,7 +6,7 @@ which notes faults as numbers; here they are put into words.
 
 from collections.abc import Callable
 
-from kantor_protocol.grid import FREE, free_way
+from kantor_protocol.grid import FREE, NOWHERE, free_way
 from kantor_protocol.machine import ParticipantId, State
 from kantor_worldsim import survey as found
 from kantor_worldsim.records import Act, Batch, Opening
@@ -69,7 +69,7 @@ class MapRules:
             if act.ruling is not None and act.outputs is not None and act.name in self._poses_m:
                 self._check_way(act)
                 self._check_finish(act)
-        return count - faults.shape[0]
+        return count - len(faults)
 
     def _put_into_words(self, batch: Batch, fault: int, row: int, a: int, b: int) -> None:
         rule, text = _WORDS[fault]
@@ -89,9 +89,9 @@ class MapRules:
             self._complain("wall", act.name, f"went to {now[0]:.6g}, {now[1]:.6g} m through a wall")
 
     def _is_free(self, name: ParticipantId) -> bool:
-        frame, cells = self._survey.ground
-        cell = frame.cell_of(*self._poses_m[name])
-        return bool(cell >= 0 and cells[divmod(cell, frame.columns)] == FREE)
+        """Whether a robot is in a free cell now."""
+        cell = self._survey.cell_of(self._survey.places[name])
+        return bool(cell != NOWHERE and self._survey.ground.cells.flat[cell] == FREE)
 
     def _uv(self, xy_m: tuple[float, float]) -> tuple[float, float]:
         """In cells, column axis first."""

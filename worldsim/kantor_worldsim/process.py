@@ -98,6 +98,8 @@ class _Doorway:
         """Nonce of the process that plays each participant and has its mission."""
         self.refused = 0
         """Messages that were malformed, or from a process that does not play that participant."""
+        self.first_looks: dict[ParticipantId, Observation] = {}
+        """Wall: what each participant sees before its first step."""
         self._plan = plan
         self._metrics = metrics
         self._show = show
@@ -207,7 +209,8 @@ class _Doorway:
     def go(self, name: ParticipantId) -> None:
         """Wall: start a participant's clock."""
         now_ns = self.stage.now_ns if self.stage is not None else 0
-        message = Go(VERSION, self.ready[name], now_ns, self._plan.speed)
+        look = self.first_looks.get(name)
+        message = Go(VERSION, self.ready[name], now_ns, self._plan.speed, look)
         self.host.send(name, encode(message), patiently=True)
 
     def tell(self, _record: object) -> None:
@@ -268,6 +271,7 @@ class _Relay:
         for name in plan.scenario.roster:
             given = stage.inputs(name, 0)
             self._observed[name] = {0: given.observation}
+            doorway.first_looks[name] = given.observation
             self._handed[name] = []
 
     def run(self) -> str:

@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.evidence import Evidence, entries
-from kantor_protocol.grid import FREE
+from kantor_protocol.grid import FREE, NOWHERE
 from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import Observation, ParticipantId, Pose
+from kantor_protocol.messages import RefusedError
 from kantor_protocol.packing import take_int, take_uint
 from kantor_protocol.replica import LENGTH_MAX
 from kantor_worldsim import reading as of
@@ -243,7 +244,7 @@ def _append(books: Books, land: Land, who: int, entry: int) -> int:
 
 
 @kernel
-def _follow_suffix(
+def _follow_entry(
     books: Books, land: Land, who: int, origin: int, position: int, entry: int
 ) -> int:
     """An entry of an origin's log as `who` sends it: a fault, or NEVER."""
@@ -253,7 +254,7 @@ def _follow_suffix(
     if origin != who:
         return FOREIGN
     if position == books.counts[who, TOLD]:
-        return _append(books, land, who, entry)
+        return int(_append(books, land, who, entry))
     return NEVER if books.counts[who, ABSENCES] > 0 else GAP
 
 
@@ -278,6 +279,28 @@ def _follow_have(
 
 
 @kernel
+def _follow_logs(
+    books: Books, land: Land, reading: Reading, row: int, item: int, at: int, end: int
+) -> None:
+    """The suffixes in payload[at:end], up to the first fault."""
+    who, payload = reading.acts[row, of.PLACE], reading.payload
+    while at < end:
+        origin, at = take_uint(payload, at)
+        position, at = take_uint(payload, at)
+        _span, at = take_uint(payload, at)
+        count, at = take_uint(payload, at)
+        entry = 0
+        for _ in range(count):
+            step, at = take_int(payload, at)
+            entry += step
+            fault = _follow_entry(books, land, who, origin, position, entry)
+            if fault != NEVER:
+                _note(books, fault, row, item, origin, position)
+                return
+            position += 1
+
+
+@kernel
 def _follow_news(books: Books, land: Land, reading: Reading, row: int, item: int) -> None:
     """One envelope: its logs, then its version vector, then what the sender holds by it."""
     who = reading.acts[row, of.PLACE]
@@ -293,21 +316,7 @@ def _follow_news(books: Books, land: Land, reading: Reading, row: int, item: int
         return
     if who < robots:
         books.union[LOG_BYTES] += end - at
-    fault = NEVER
-    while at < end and fault == NEVER:
-        origin, at = take_uint(payload, at)
-        position, at = take_uint(payload, at)
-        _span, at = take_uint(payload, at)
-        count, at = take_uint(payload, at)
-        entry = 0
-        for _ in range(count):
-            step, at = take_int(payload, at)
-            entry += step
-            if fault == NEVER:
-                fault = _follow_suffix(books, land, who, origin, position, entry)
-                if fault != NEVER:
-                    _note(books, fault, row, item, origin, position)
-            position += 1
+    _follow_logs(books, land, reading, row, item, at, end)
     _follow_have(books, payload, have, who, robots, row, item)
     for origin in range(robots if who < robots else 0):
         last = min(books.have[who, origin], books.counts[origin, TOLD])
@@ -410,7 +419,7 @@ class Survey:
         self._record: Record | None = None
 
     def take(self, record: Record) -> None:
-        """Follow one record. The first must be an opening with a true map."""
+        """Follow one record. The first must be an opening with a true map; raises RefusedError."""
         if record is self._record:
             return
         self._record = record
@@ -422,7 +431,8 @@ class Survey:
     def _open(self, opening: Opening) -> None:
         self._reader.read(opening)
         scenario, site = opening.scenario, opening.site
-        assert site.ground is not None
+        if site.ground is None:
+            raise RefusedError("a mission on a map, and no map in its opening")
         self.ground, self.frame = site.ground, site.ground.frame
         self.observable = observable(site.ground, site.starts_m)
         """(rows, columns)"""
@@ -461,7 +471,8 @@ class Survey:
         self.t99_tick: int | None = None
         self.all_t99_tick: int | None = None
         self._period_ns = scenario.period_ns
-        self._places = {name: i for i, name in enumerate(scenario.robot_ids)}
+        self.places = {name: i for i, name in enumerate(scenario.robot_ids)}
+        """Of the robots, in the order of the roster."""
         self._queue = np.zeros(cells, dtype=np.int32)
         self._evidence = [
             Evidence(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
@@ -503,14 +514,19 @@ class Survey:
         count = self.books.union.item(FAULTS)
         return self.books.faults[: min(count, _FAULTS_MAX)], count
 
+    def cell_of(self, place: int) -> int:
+        """The cell in which a robot is, or NOWHERE."""
+        x_m, y_m = self.poses_m[place]
+        return self.frame.cell_of(x_m, y_m) if math.isfinite(x_m + y_m) else NOWHERE
+
     def reachable(self, name: ParticipantId) -> int:
         """A frontier that a robot can reach by all that it holds, or NEVER.
 
         Frontiers that it may have called none in entries that it has not sent yet do not count.
         """
-        place, books = self._places[name], self.books
-        start = self.frame.cell_of(*self.poses_m[place])
-        if start < 0:
+        place, books = self.places[name], self.books
+        start = self.cell_of(place)
+        if start == NOWHERE:
             return NEVER
         held = books.held[place]
         made, voids = books.counts[place, MADE], books.counts[place, VOIDS]
@@ -534,9 +550,9 @@ class Survey:
         self.tick = batch.now_ns // self._period_ns
         reading = Reading(*self._reader.read(batch))
         acted = [
-            (row, self._places[act.name], act)
+            (row, self.places[act.name], act)
             for row, act in enumerate(batch.acts)
-            if act.name in self._places and act.outputs is not None and act.ruling is not None
+            if act.name in self.places and act.outputs is not None and act.ruling is not None
         ]
         for row, place, act in acted:
             self._look(place, act.observation, row)
@@ -572,7 +588,7 @@ class Survey:
 
     def _stand(self, place: int) -> None:
         """Note the cell in which a robot is."""
-        cell = self.frame.cell_of(*self.poses_m[place])
+        cell = self.cell_of(place)
         count = self.books.counts.item(place, STOOD)
         if count and self.books.stood.item(place, count - 1) == cell:
             return

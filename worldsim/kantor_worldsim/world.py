@@ -40,6 +40,8 @@ class Site(NamedTuple):
 
     ground: Ground | None = None
     """The true map, if the robots explore one. There are no samples then."""
+    warnings: tuple[str, ...] = ()
+    """What may be wrong with the map's file, a line each."""
 
     @classmethod
     def of(cls, scenario: Scenario, seed: int) -> "Site":
@@ -54,7 +56,7 @@ class Site(NamedTuple):
     def _of_map(cls, scenario: Scenario, seed: int) -> "Site":
         from kantor_worldsim.starts import starts_on  # noqa: PLC0415  only where there is a map
 
-        ground, _ = ground_of(scenario)
+        ground, warnings = ground_of(scenario)
         starts = scenario.starts
         starts_m = starts_on(
             ground,
@@ -68,7 +70,7 @@ class Site(NamedTuple):
         left_m, right_m, bottom_m, top_m = ground.frame.extent_m
         over_map = Domain(min_m=(left_m, bottom_m), max_m=(right_m, top_m))
         targets_m = targets_of(msgspec.structs.replace(scenario, domain=over_map), seed)
-        return cls(np.zeros((0, 2)), targets_m, starts_m, ground)
+        return cls(np.zeros((0, 2)), targets_m, starts_m, ground, tuple(warnings))
 
 
 def ground_of(scenario: Scenario) -> tuple[Ground, list[str]]:

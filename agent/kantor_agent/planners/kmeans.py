@@ -149,7 +149,7 @@ def _fill_empty(regions: int, label: np.ndarray, away: np.ndarray, sizes: np.nda
         if farthest < 0:
             return
         sizes[label[farthest]] -= 1
-        label[farthest], away[farthest], sizes[k] = k, 0.0, 1
+        label[farthest], sizes[k] = k, 1
 
 
 @kernel
@@ -340,7 +340,7 @@ def mark_taken(
         return
     for j in range(frontiers.shape[0]):
         near = squared(frontiers[j], target, columns) < range_cells * range_cells
-        taken[j] = taken[j] or near or frontiers[j] == target
+        taken[j] = taken[j] or near
 
 
 @kernel

@@ -130,11 +130,12 @@ def quadtree_goals(terrain: Terrain) -> list[int]:
 class Costs:
     """What goals cost: from each robot's place to each goal, and from goal to goal, in cells.
 
-    From a place it is the value function, with what is unknown taken for open floor. A field from each goal
-    would be exact but four times the work of all else. Between two goals stands the most that is known of
-    it without one: the straight line, or the difference of what both cost from any of the places, whichever is
-    more (the triangle inequality; landmarks, Goldberg and Harrelson 2005). It is a metric that agrees with
-    the costs from the places, so that no insertion shortens a tour.
+    From a place it is the value function, with what is unknown taken for open floor. Between two goals it is
+    the most that follows without a field from either: the straight line, or the difference of what both cost
+    from one of the places (the triangle inequality; landmarks, Goldberg and Harrelson 2005). That is a metric
+    and agrees with the costs from the places, so that no insertion shortens a tour. A field from every goal
+    doubles the time of an assignment, and missions took as long: 1.00 of the ticks in 15 pairs, 0.88 of them on
+    unstructured maps and 1.11 in the office.
     """
 
     def __init__(self, terrain: Terrain, fields: Sequence[Field], goals: Iterable[int]) -> None:
@@ -200,6 +201,12 @@ def price_of(cost: float) -> int:
     return round(min(cost * _PER_CELL, _PRICE_MAX))
 
 
+def near(terrain: Terrain, goal: int, others: Iterable[int]) -> bool:
+    """Whether one of others is as good as a goal: it lies within half a sensor range."""
+    half = 0.5 * terrain.sensor_cells
+    return any(terrain.cells_between(goal, other) <= half for other in others)
+
+
 class _Rules:
     """What both forms of the market have in common."""
 
@@ -210,11 +217,6 @@ class _Rules:
         self._count = planner.goal_count
         self.capacity = (scenario.register_width - 4 - _HEAD - 2 * robots) // 2
         """Goals of a tour that a memo has room for."""
-
-    def near(self, terrain: Terrain, goal: int, others: Iterable[int]) -> bool:
-        """Whether a goal is as good as one of others: it lies within half a sensor range of it."""
-        half = 0.5 * terrain.sensor_cells
-        return any(terrain.cells_between(goal, other) <= half for other in others)
 
     def propose(
         self, terrain: Terrain, field: Field, robot: int, tick: int, held: Cells
@@ -232,7 +234,7 @@ class _Rules:
             if (
                 len(goals) < count
                 and field[cell] < math.inf
-                and not self.near(terrain, cell, (*held, *goals))
+                and not near(terrain, cell, (*held, *goals))
             ):
                 goals.append(cell)
         return goals
@@ -462,7 +464,7 @@ class _Trader:
         return [held.goal for held in self._tour if held.heir == NOBODY]
 
     def _near(self, goal: int, others: Iterable[int]) -> bool:
-        return self._rules.near(self._terrain, goal, others)
+        return near(self._terrain, goal, others)
 
     def _held_by_mates(self) -> list[int]:
         return [goal for memo in self._mates.values() for goal, _heir in memo.tour]
@@ -471,17 +473,17 @@ class _Trader:
 
     def _let_go(self) -> None:
         """Let go of what an heir has taken up; take back what it did not, or not in time."""
-        kept = []
-        for held in self._tour:
-            memo = self._mates.get(held.heir)
-            answered = memo is not None and memo.seen[self._me] >= held.named
-            if held.heir == NOBODY or (
-                memo is not None and not answered and self._tick < held.until
-            ):
-                kept.append(held)
-            elif memo is None or not answered or not self._near(held.goal, memo.firm):
-                kept.append(_Holding(held.goal))
-        self._tour = kept
+        settled = [self._settled(held) for held in self._tour]
+        self._tour = [held for held in settled if held is not None]
+
+    def _settled(self, held: _Holding) -> _Holding | None:
+        """A holding as the heir's answer leaves it: None if it has been taken up."""
+        memo = self._mates.get(held.heir)
+        if memo is None:  # nobody, or out of contact
+            return _Holding(held.goal)
+        if memo.seen[self._me] >= held.named:
+            return None if self._near(held.goal, memo.firm) else _Holding(held.goal)
+        return held if self._tick < held.until else _Holding(held.goal)
 
     def _take_up(self) -> None:
         """Take up what others want this robot to hold, unless something near is in its tour."""

@@ -1,0 +1,395 @@
+"""The referees of mapping runs: silent on a good record, and each rule noticed when it alone is broken."""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from grounds import drawn
+from kantor_fleet.team import play
+from kantor_protocol.evidence import void
+from kantor_protocol.grid import FREE, OCCUPIED
+from kantor_protocol.machine import Envelope, Pose, State
+from kantor_protocol.messages import Array, News, RefusedError, decode_news, encode_news
+from kantor_protocol.packing import put_int, put_uint
+from kantor_protocol.replica import read_have, read_logs
+from kantor_worldsim.checkers import Checker, check
+from kantor_worldsim.map_checker import MapRules
+from kantor_worldsim.records import Act, Batch, Opening, Record
+from mapping import ROOMS, explored, on_map, site_of
+
+Records = Sequence[Record]
+Change = Callable[[Act], Act]
+
+ALONE = ("radio.range_m=0.01", "radio.beacon=state")
+"""Nobody hears anybody, and everybody tells all that it knows all the time."""
+RADIOS = {
+    "near": (),
+    "everywhere": ("radio.range_m=100",),
+    "alone": ALONE,
+    "lossy": ("radio.drop=0.3", "radio.duplicate=0.3", "radio.delay_s=0.15", "radio.jitter_s=0.2"),
+    "walls": ("radio.line_of_sight=true", "radio.range_m=100"),
+    "centralized": ("coordination=centralized",),
+}
+PLANNERS = ("frontier", "burgard", "market", "kmeans", "hungarian")
+
+
+def rules(records: Iterable[Record]) -> set[str]:
+    """The rules that a record breaks."""
+    return {complaint.partition(":")[0] for complaint in check(records).complaints}
+
+
+# Ways to change a record.
+
+
+def batches(records: Records) -> list[Batch]:
+    return [record for record in records if isinstance(record, Batch)]
+
+
+def acts_of(records: Records, name: str) -> list[Act]:
+    """What a robot did, in order."""
+    return [act for batch in batches(records) for act in batch.acts if act.name == name]
+
+
+def put(records: Records, old: Act, change: Change) -> list[Record]:
+    """The records with one act changed."""
+
+    def changed(batch: Batch) -> Batch:
+        acts = tuple(change(act) if act is old else act for act in batch.acts)
+        return msgspec.structs.replace(batch, acts=acts)
+
+    return [changed(record) if isinstance(record, Batch) else record for record in records]
+
+
+def opened(records: Records, **values: Any) -> list[Record]:
+    """The records with another opening."""
+    return [msgspec.structs.replace(records[0], **values), *records[1:]]
+
+
+def goes(x_m: float, y_m: float) -> Change:
+    """A change of where the world says a robot is."""
+    return lambda act: msgspec.structs.replace(
+        act, ruling=msgspec.structs.replace(act.ruling, pose=Pose(x_m, y_m))
+    )
+
+
+def hurried(records: Records, act: Act, change: Change) -> list[Record]:
+    """The records with one act changed, in a world without a speed limit."""
+    return put(opened(records, scenario=on_map("vehicle.speed_m_s=1000")), act, change)
+
+
+def news_of(act: Act) -> News:
+    assert act.outputs is not None
+    return decode_news(act.outputs.outbox[0].body)
+
+
+def says(change: Callable[[News], News]) -> Change:
+    """A change of the message that a robot sends."""
+
+    def changed(act: Act) -> Act:
+        assert act.outputs is not None
+        (envelope,) = act.outputs.outbox
+        body = encode_news(change(decode_news(envelope.body)))
+        sent: tuple[Envelope, ...] = (msgspec.structs.replace(envelope, body=body),)
+        return msgspec.structs.replace(
+            act, outputs=msgspec.structs.replace(act.outputs, outbox=sent)
+        )
+
+    return changed
+
+
+def uints(*numbers: int) -> bytes:
+    out, at = np.zeros(10 * len(numbers), dtype=np.uint8), 0
+    for number in numbers:
+        at = put_uint(out, at, number)
+    return out[:at].tobytes()
+
+
+def suffix(origin: int, start: int, entries: Sequence[int]) -> bytes:
+    """A part of a log, see News."""
+    out, at, before = np.zeros(10 * len(entries), dtype=np.uint8), 0, 0
+    for entry in entries:
+        at = put_int(out, at, entry - before)
+        before = entry
+    return uints(origin, start, len(entries), len(entries)) + out[:at].tobytes()
+
+
+def having(news: News, **lengths: int) -> News:
+    """The news with other lengths in its version vector; r1, r2: by how much they differ."""
+    have = read_have(news.have, 2)
+    assert have is not None
+    told = [length + lengths.get(f"r{i}", 0) for i, length in enumerate(have, 1)]
+    return msgspec.structs.replace(news, have=uints(*told))
+
+
+def own_log(act: Act, origin: int = 0) -> list[int]:
+    """What a robot sends of its own log."""
+    rows = read_logs(news_of(act).logs, valued=False)
+    assert rows is not None
+    return [int(entry) for who, _, entry, _ in rows if who == origin]
+
+
+def logging(log: Sequence[int], origin: int = 0, start: int = 0) -> Callable[[News], News]:
+    """A change of the logs that are sent: one suffix instead."""
+    return lambda news: msgspec.structs.replace(news, logs=suffix(origin, start, log))
+
+
+# Records that break a rule.
+
+
+def _stands_in_wall(records: Records) -> list[Record]:
+    return hurried(records, acts_of(records, "r1")[-1], goes(0.5, 0.5))
+
+
+def _leaves_map(records: Records) -> list[Record]:
+    return hurried(records, acts_of(records, "r1")[-1], goes(-3.0, 1.5))
+
+
+def _is_nowhere(records: Records) -> list[Record]:
+    return hurried(records, acts_of(records, "r1")[-1], goes(math.nan, math.inf))
+
+
+def _goes_through_wall(records: Records) -> list[Record]:
+    """From the lower left room straight into the lower right one, where no door is."""
+    act = next(act for act in acts_of(records, "r1") if act.ruling and act.ruling.pose.x_m < 6.0)
+    last = acts_of(records, "r1").index(act)
+    assert act.ruling is not None
+    short = [record for record in records[: 2 + last] if not isinstance(record, Opening)]
+    return hurried([records[0], *short], act, goes(13.5, act.ruling.pose.y_m - 0.2))
+
+
+def _tells_another_kind(records: Records) -> list[Record]:
+    act = acts_of(records, "r1")[5]
+    log = own_log(act)
+    return put(records, act, says(logging([*log[:-1], log[-1] ^ 1])))
+
+
+def _leaves_one_out(records: Records) -> list[Record]:
+    act = acts_of(records, "r1")[5]
+    log = own_log(act)
+    return put(records, act, says(logging([*log[:3], *log[4:]])))
+
+
+def _tells_too_much(records: Records) -> list[Record]:
+    act = acts_of(records, "r1")[5]
+    return put(records, act, says(logging([*own_log(act), 2 * 17])))
+
+
+def _calls_far_frontier_none(records: Records) -> list[Record]:
+    act = acts_of(records, "r1")[5]
+    far = void(ROOMS.frame, ROOMS.frame.cell_of(14.5, 1.5))
+    change = says(lambda news: having(logging([*own_log(act), far])(news), r1=1))
+    return put(records, act, change)
+
+
+def _calls_near_frontier_none(records: Records) -> list[Record]:
+    act = acts_of(records, "r1")[-1]
+    near = void(ROOMS.frame, ROOMS.frame.cell_of(2.5, 2.5))
+    change = says(lambda news: having(logging([*own_log(act), near])(news), r1=1))
+    return put(records, act, change)
+
+
+def _starts_late(records: Records) -> list[Record]:
+    act = acts_of(records, "r1")[5]
+    return put(records, act, says(logging(own_log(act), start=10_000)))
+
+
+def _sends_rubbish(records: Records) -> list[Record]:
+    act = acts_of(records, "r1")[5]
+    return put(records, act, says(lambda news: msgspec.structs.replace(news, logs=b"\xff")))
+
+
+def _sends_weights(records: Records) -> list[Record]:
+    """A suffix of entries with a value each, as on a density."""
+    act = acts_of(records, "r1")[5]
+    valued = uints(0, 0, 1, 1) + uints(4, 1)
+    return put(records, act, says(lambda news: msgspec.structs.replace(news, logs=valued)))
+
+
+def _hides_a_scan(records: Records) -> list[Record]:
+    """Its version vector stays behind its scans."""
+    before, act = next(
+        (before, act)
+        for before, act in zip(acts_of(records, "r1"), acts_of(records, "r1")[1:], strict=False)
+        if news_of(before).have[0:2] != news_of(act).have[0:2]
+    )
+    have = news_of(before).have
+    return put(records, act, says(lambda news: msgspec.structs.replace(news, have=have)))
+
+
+def _forgets(records: Records) -> list[Record]:
+    return put(records, acts_of(records, "r1")[-1], says(lambda news: having(news, r2=-1)))
+
+
+def _sees_what_is_not_there(records: Records) -> list[Record]:
+    """The true map has a free cell less than the robots saw."""
+    return _redrawn(records, 14.5, 10.5, FREE, OCCUPIED)
+
+
+def _sees_what_is_no_wall(records: Records) -> list[Record]:
+    return _redrawn(records, 12.5, 2.5, OCCUPIED, FREE)
+
+
+def _redrawn(records: Records, x_m: float, y_m: float, old: int, new: int) -> list[Record]:
+    cells = ROOMS.cells.copy()
+    cell = ROOMS.frame.cell_of(x_m, y_m)
+    assert cells.flat[cell] == old
+    cells.flat[cell] = new
+    return opened(records, ground=Array.of(cells))
+
+
+def _holds_more_than_there_is(records: Records) -> list[Record]:
+    return put(records, acts_of(records, "r1")[-1], says(lambda news: having(news, r2=1)))
+
+
+def _forwards_something_else(records: Records) -> list[Record]:
+    act = acts_of(records, "r1")[-1]
+    return put(records, act, says(logging([2 * 17], origin=1)))
+
+
+def _forwards_too_much(records: Records) -> list[Record]:
+    act = acts_of(records, "r1")[-1]
+    return put(records, act, says(logging([2 * 17], origin=1, start=10_000)))
+
+
+def _gives_up(records: Records) -> list[Record]:
+    act = acts_of(records, "r1")[3]
+
+    def change(act: Act) -> Act:
+        assert act.outputs is not None
+        rests = msgspec.structs.replace(act.outputs, state=State.FINISHED)
+        return msgspec.structs.replace(act, outputs=rests)
+
+    return put(records, act, change)
+
+
+BROKEN: dict[str, tuple[tuple[str, ...], Callable[[Records], list[Record]]]] = {
+    "wall-stands": (ALONE, _stands_in_wall),
+    "wall-outside": (ALONE, _leaves_map),
+    "wall-nowhere": (ALONE, _is_nowhere),
+    "wall-through": (ALONE, _goes_through_wall),
+    "map-another-kind": (ALONE, _tells_another_kind),
+    "map-left-out": (ALONE, _leaves_one_out),
+    "map-too-much": (ALONE, _tells_too_much),
+    "map-far-void": (ALONE, _calls_far_frontier_none),
+    "map-gap": (ALONE, _starts_late),
+    "map-rubbish": (ALONE, _sends_rubbish),
+    "map-weights": (ALONE, _sends_weights),
+    "map-hidden-scan": (ALONE, _hides_a_scan),
+    "map-forgets": ((), _forgets),
+    "truth-floor": ((), _sees_what_is_not_there),
+    "truth-wall": ((), _sees_what_is_no_wall),
+    "union-more": ((), _holds_more_than_there_is),
+    "union-another": ((), _forwards_something_else),
+    "union-too-much": ((), _forwards_too_much),
+    "finish": ((), _gives_up),
+}
+
+
+@pytest.mark.parametrize("radio", list(RADIOS))
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_good_record_brings_no_complaint(planner: str, radio: str) -> None:
+    """Robots that keep the rules are not accused."""
+    checker = check(explored(f"planner={planner}", *RADIOS[radio]))
+
+    assert checker.complaints == []
+    assert checker.count == 0
+
+
+def test_noise_is_no_lie() -> None:
+    """With noise a scan may be wrong, and a robot may finish in error."""
+    assert rules(explored("sensor.noise_m=0.4", "limit_s=20")) == set()
+
+
+@pytest.mark.parametrize("name", list(BROKEN))
+def test_broken_rule_is_named(name: str) -> None:
+    """A record that breaks a rule brings complaints that name this rule, and no other."""
+    run, broken = BROKEN[name]
+    records = explored(*run)
+
+    assert rules(records) == set()
+    also = {"speed"} if name == "wall-nowhere" else set()  # as far as nobody can go
+    assert rules(broken(records)) == {name.partition("-")[0]} | also
+
+
+def test_every_rule_can_be_broken() -> None:
+    """No rule is without a record that breaks it."""
+    assert MapRules.__doc__ is not None
+    listed = MapRules.__doc__.partition("-----\n")[2].splitlines()
+    names = {line.split()[0] for line in listed if line[4:5].isalpha()}
+
+    assert names == {name.partition("-")[0] for name in BROKEN}
+
+
+def test_frontier_may_be_called_none_from_beside_it() -> None:
+    """A robot that stood there may say so, at any place of its log."""
+    assert rules(_calls_near_frontier_none(explored(*ALONE))) == set()
+
+
+def test_rules_of_every_run_hold_on_maps() -> None:
+    """A jump is against the speed limit, whatever is explored."""
+    records = explored(*ALONE)
+    jumps = put(records, acts_of(records, "r1")[-1], goes(5.5, 10.5))
+
+    assert "speed" in rules(jumps)
+
+
+def test_complaint_says_when_who_and_what() -> None:
+    """A complaint is one line: rule, time, who, what."""
+    complaints = check(_forwards_something_else(explored())).complaints
+
+    assert complaints[0].startswith("union: t=")
+    assert complaints[0].endswith("r1: forwards an entry at 0 of r2's log that r2 never sent")
+
+
+def test_broken_record_is_counted_to_its_end() -> None:
+    """A hundred complaints are kept, all are counted."""
+    records = explored()
+    cells = np.where(ROOMS.cells == FREE, OCCUPIED, FREE).astype(np.uint8)
+    checker = check(opened(records, ground=Array.of(cells)))
+
+    assert len(checker.complaints) == 100
+    assert checker.count > 120
+
+
+def test_mission_without_a_way_out_is_sound() -> None:
+    """Robots shut into one cell each have finished as soon as they look around."""
+    ground = drawn("#####", "#.#.#", "#####")
+    scenario = on_map("starts.poses_m=[[1.5, 1.5], [3.5, 1.5]]")
+    records: list[Record] = []
+    play(scenario, 1, site_of(scenario, ground), [records.append])
+
+    assert rules(records) == set()
+
+
+def test_opening_without_a_map_is_refused() -> None:
+    """A record that cannot be judged is no crash later on."""
+    with pytest.raises(RefusedError, match="no map in its opening"):
+        check(opened(explored(), ground=None))
+
+
+def test_checker_stands_what_nobody_can_read() -> None:
+    """Whatever is in the logs, kernels stay inside their arrays."""
+    records = explored()
+    rng = np.random.default_rng(3)
+    checker = Checker()
+    for record in records:
+        told = record
+        if isinstance(record, Batch):
+            acts = tuple(
+                says(
+                    lambda news: msgspec.structs.replace(
+                        news,
+                        have=rng.bytes(int(rng.integers(0, 9))),
+                        logs=rng.bytes(int(rng.integers(0, 30))),
+                    )
+                )(act)
+                for act in record.acts
+            )
+            told = msgspec.structs.replace(record, acts=acts)
+        checker.take(told)
+
+    assert checker.count > 0

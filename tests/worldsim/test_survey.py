@@ -1,0 +1,276 @@
+"""What robots saw and hold, followed from records: the same as a plain reading of them gives."""
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from grounds import grounds
+from kantor_agent.chart import Chart
+from kantor_fleet.team import play, team
+from kantor_protocol.evidence import Evidence, entries
+from kantor_protocol.grid import FREE, OCCUPIED, UNKNOWN
+from kantor_protocol.machine import Inputs, Outputs
+from kantor_protocol.messages import decode_news
+from kantor_protocol.replica import Replica, read_have, read_logs
+from kantor_worldsim.checkers import check
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.maps import Ground, parts
+from kantor_worldsim.reading import Reader
+from kantor_worldsim.records import Act, Batch, Opening, Record
+from kantor_worldsim.stage import Stage
+from kantor_worldsim.survey import KIND, Survey
+from mapping import ROOMS, explored, on_map, site_of
+from strategies import examples
+
+Records = Sequence[Record]
+RUNS = {
+    "near": (),
+    "centralized": ("coordination=centralized",),
+    "alone": ("radio.range_m=0.01",),
+    "ranges": ("planner=burgard", "radio.drop=0.2", "radio.delay_s=0.15"),
+}
+
+
+def surveyed(records: Records) -> Survey:
+    survey = Survey()
+    for record in records:
+        survey.take(record)
+    return survey
+
+
+def acts_of(records: Records) -> list[tuple[int, Act]]:
+    """What robots did, each with its tick."""
+    return [
+        (record.now_ns // 100_000_000, act)
+        for record in records
+        if isinstance(record, Batch)
+        for act in record.acts
+        if act.name != "supervisor"
+    ]
+
+
+class Witness:
+    """The same, literally: sets of cells, logs as lists."""
+
+    def __init__(self, records: Records) -> None:
+        assert isinstance(records[0], Opening)
+        scenario, ground = records[0].scenario, records[0].site.ground
+        assert ground is not None
+        self.frame, names = ground.frame, scenario.robot_ids
+        self.first: dict[int, int] = {}
+        self.own: dict[str, set[int]] = {name: set() for name in names}
+        logs: dict[str, dict[int, int]] = {name: {} for name in scenario.roster}
+        have = {name: [0] * len(scenario.roster) for name in names}
+        evidence = {
+            name: Evidence(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
+            for name in names
+        }
+        last: dict[str, tuple[int, object]] = dict.fromkeys(names, (-1, None))
+        for tick, act in acts_of(records):
+            look, (step, pose) = act.observation, last[act.name]
+            if look.step > step:
+                last[act.name] = look.step, look.pose
+                moved = look.pose != pose
+                for entry in evidence[act.name].take(look.scan, look.pose, moved=moved).tolist():
+                    if entry < 2 * self.frame.cells:
+                        self.first.setdefault(entry // 2, tick)
+                        self.own[act.name].add(entry // 2)
+            assert act.outputs is not None
+            for envelope in act.outputs.outbox:
+                news = decode_news(envelope.body)
+                rows = read_logs(news.logs, valued=False)
+                told = read_have(news.have, len(scenario.roster))
+                assert rows is not None
+                assert told is not None
+                have[act.name] = told
+                for origin, position, entry, _ in rows.tolist():
+                    logs[scenario.roster[origin]][position] = entry
+        self.held = {
+            name: self.own[name].union(
+                logs[origin][i] // 2
+                for origin, length in zip(scenario.roster, have[name], strict=True)
+                for i in range(length)
+                if origin != name and logs[origin][i] < 2 * self.frame.cells
+            )
+            for name in names
+        }
+
+
+def in_survey(survey: Survey) -> dict[int, int]:
+    ticks = survey.books.first_tick
+    return {int(cell): int(ticks[cell]) for cell in np.flatnonzero(ticks >= 0)}
+
+
+@pytest.mark.parametrize("run", list(RUNS))
+def test_stamps_and_holdings_are_those_of_the_record(run: str) -> None:
+    """Who saw what first, and who knows what by the logs that it says it holds."""
+    records = explored(*RUNS[run])
+    survey, witness = surveyed(records), Witness(records)
+    counts = survey.observable.ravel()
+
+    assert in_survey(survey) == witness.first
+    assert survey.seen == sum(counts[cell] for cell in witness.first)
+    for i, name in enumerate(witness.own):
+        held = np.flatnonzero(survey.books.held[i] & KIND)
+        assert set(held.tolist()) == witness.held[name]
+        assert survey.held_cells[i] == counts[held].sum()
+        assert survey.own_cells[i] == sum(counts[cell] for cell in witness.own[name])
+
+
+def test_robots_know_what_their_own_charts_show() -> None:
+    """What a robot holds is what it makes a map of, void frontiers and all."""
+    records = explored("radio.range_m=100")
+    survey = surveyed(records)
+    frame = ROOMS.frame
+    replica = Replica(1, 2, entries(frame), None, ledger=True, claims=False)
+    chart = Chart(frame, 2)
+    for place in (0, 1):
+        count = int(survey.books.counts[place, 1])
+        replica.store.length[place] = 0
+        replica.reserve(count)
+        replica.store.logs[place, :count, 0] = survey.books.told[place, :count]
+        replica.store.length[place] = count
+    chart.fold(replica)
+
+    for place in (0, 1):
+        assert np.array_equal(survey.books.held[place] & KIND, chart.cells)
+
+
+def _frontiers(ground: Ground, counts: npt.NDArray[np.bool_], known: npt.NDArray[np.bool_]) -> int:
+    """Reachable known free cells with an unknown 4-neighbour, literally."""
+    unknown = np.pad(~known, 1)
+    beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]
+    return int((known & counts & (ground.cells == FREE) & beside).sum())
+
+
+@pytest.mark.parametrize("run", list(RUNS))
+def test_moments_are_those_of_the_stamps(run: str) -> None:
+    """95 and 99 % and completion, tick by tick."""
+    records = explored(*RUNS[run])
+    survey = surveyed(records)
+    ticks, counts = survey.books.first_tick, survey.observable
+    seen = [
+        ((ticks >= 0) & (ticks <= tick) & counts.ravel()).sum() / survey.total
+        for tick in range(survey.tick + 1)
+    ]
+    known = [(ticks >= 0) & (ticks <= tick) for tick in range(survey.tick + 1)]
+    left = [_frontiers(ROOMS, counts, now.reshape(counts.shape)) for now in known]
+
+    assert survey.t95_tick == next(i for i, share in enumerate(seen) if share >= 0.95)
+    assert survey.t99_tick == next(i for i, share in enumerate(seen) if share >= 0.99)
+    assert survey.completed_tick == next(i for i, many in enumerate(left) if i and not many)
+    assert sorted(survey.stamps.tolist()) == sorted(ticks[counts.ravel() & (ticks >= 0)].tolist())
+
+
+def test_all_know_later_than_somebody() -> None:
+    """What one has seen takes a while to reach all; who hears nobody must see it all itself."""
+    together, alone = surveyed(explored()), surveyed(explored(*RUNS["alone"]))
+
+    for survey in (together, alone):
+        assert survey.t99_tick is not None
+        assert survey.all_t99_tick is not None
+        assert survey.all_t99_tick >= survey.t99_tick
+    assert alone.all_t99_tick > together.all_t99_tick
+
+
+def test_ways_are_the_sum_of_moves() -> None:
+    """From pose to pose as the world ruled them."""
+    records = explored()
+    survey = surveyed(records)
+    for i, name in enumerate(("r1", "r2")):
+        places = [(1.5, 1.5) if i == 0 else (9.5, 1.5)]
+        places += [
+            (act.ruling.pose.x_m, act.ruling.pose.y_m)
+            for _, act in acts_of(records)
+            if act.name == name and act.ruling
+        ]
+        assert survey.ways_m[i] == pytest.approx(sum(math.dist(a, b) for a, b in pairwise(places)))
+        assert survey.poses_m[i] == places[-1]
+
+
+def test_bumps_are_counted_where_they_happen() -> None:
+    """A ruling that says that a wall ended the move."""
+    records = list(explored())
+    batch = records[5]
+    assert isinstance(batch, Batch)
+    assert batch.acts[0].ruling is not None
+    bumped = msgspec.structs.replace(batch.acts[0].ruling, bumped=True)
+    act = msgspec.structs.replace(batch.acts[0], ruling=bumped)
+    records[5] = msgspec.structs.replace(batch, acts=(act, *batch.acts[1:]))
+
+    assert surveyed(records).bumps == [(bumped.pose.x_m, bumped.pose.y_m)]
+
+
+def test_referees_may_share_a_survey() -> None:
+    """A record that is handed on twice counts once."""
+    reader = Reader()
+    survey = Survey(reader)
+    for record in explored():
+        reader.read(record)
+        survey.take(record)
+        survey.take(record)
+
+    once = surveyed(explored())
+    assert survey.seen == once.seen
+    assert survey.log_bytes == once.log_bytes
+    assert survey.ways_m == once.ways_m
+
+
+@pytest.mark.parametrize("radio", [(), ("radio.range_m=0.01", "radio.beacon=state")])
+def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
+    """A robot whose output was lost has told its log to nobody; it is not accused of that."""
+    scenario = on_map(*radio)
+    site = site_of(scenario)
+    records: list[Record] = []
+    play_all = in_process(team(scenario, 1, site))
+    rounds = iter(range(10_000))
+
+    def lossy(inputs: Mapping[str, Inputs]) -> Mapping[str, Outputs]:
+        outputs = dict(play_all(inputs))
+        if next(rounds) % 5 == 3:
+            del outputs["r1"]
+        return outputs
+
+    reason = simulate(Stage(scenario, 1, site, [records.append]), lossy, 1, lambda: False)
+
+    assert reason == "done"
+    assert check(records).complaints == []
+
+
+@given(grounds(), st.data())
+@examples(25)
+def test_any_small_map_is_explored_and_judged(ground: Ground, data: st.DataObject) -> None:
+    """Robots finish with all seen that can be, the rules hold, and the survey is the record's."""
+    labels, _ = parts(ground.cells)
+    cells = np.flatnonzero(
+        labels.ravel()
+        == data.draw(st.sampled_from(sorted(set(labels[ground.cells == FREE].tolist()))))
+    )
+    starts = [ground.frame.centre_of(int(data.draw(st.sampled_from(cells.tolist())))) for _ in "12"]
+    side_m = ground.frame.resolution_m
+    scenario = on_map(
+        f"starts.poses_m={[list(start) for start in starts]}",
+        f"vehicle.speed_m_s={10.0 * side_m}",
+        f"sensor.range_m={4.0 * side_m}",
+    )
+    records: list[Record] = []
+    reason = play(scenario, 1, site_of(scenario, ground), [records.append])
+    survey, witness = surveyed(records), Witness(records)
+
+    assert reason == "done"
+    assert check(records).complaints == []
+    assert in_survey(survey) == witness.first
+    assert survey.seen == survey.total
+    assert survey.completed_tick is not None
+
+
+def test_kinds_are_two_bits() -> None:
+    """What the survey packs into a byte fits the kinds of cells."""
+    assert {UNKNOWN, FREE, OCCUPIED} == {UNKNOWN & KIND, FREE & KIND, OCCUPIED & KIND}
