@@ -207,6 +207,15 @@ def _print(verdicts: Sequence[Verdict]) -> None:
         figure = line.figure
     console.print(table)
     print(_OURS)
+    for (figure, why), claims in _reasons(verdicts).items():
+        which = claims[0] if len(claims) == 1 else f"{len(claims)} claims"
+        console.print(f"  {figure}, {which}: {why}", highlight=False)
+
+
+def _reasons(verdicts: Sequence[Verdict]) -> dict[tuple[str, str], list[str]]:
+    """Figures and reasons, with the claims that they stand beside."""
+    claims: dict[tuple[str, str], list[str]] = {}
     for line in verdicts:
         if line.why:
-            console.print(f"  {line.figure}, {line.claim}: {line.why}", highlight=False)
+            claims.setdefault((line.figure, line.why), []).append(line.claim)
+    return claims
