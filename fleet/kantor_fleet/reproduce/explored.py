@@ -69,7 +69,10 @@ def curves(panels: Mapping[int, Mapping[str, Sequence[Flight]]], name: str) -> F
             axes.plot(ticks, mean, color=colour, ls=style, lw=width, label=label)
             axes.plot(ticks[-1], mean[-1], "o", color=colour, ms=4.0)
         axes.set_xlim(left=0.0)
-        axes.set_ylim(bottom=0.0)
+        if name == "wtv":
+            axes.set_yscale("log")  # robots that start together may never part, and hide the others
+        else:
+            axes.set_ylim(bottom=0.0)
         tidy(axes, "tick", _CURVES[name])
         write_title(
             axes, f"({letter}) {robots} robots, mean of {len(next(iter(lines.values())))} runs"
