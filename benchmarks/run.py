@@ -6,7 +6,8 @@ planner   CPU time of one planner step, beside the paper's algorithm taken to th
 spectral  the same of multiscale coverage by its modes, and what its registers cost
 routes    CPU time of the value function over a map, beside two other libraries
 fleet     robot-steps that one CPU second buys when the whole fleet is in one process
-peers     the same of other simulators, if they are installed
+maps      what missions on an unknown map cost, and what robots tell of the map
+peers     the speed of other simulators, if they are installed
 lockstep  ticks a second with a process for every robot, beside a bare Zenoh barrier
 wire      bytes that a robot publishes in a tick, beside its whole weight vector
 
@@ -25,7 +26,7 @@ from typing import Any
 
 from tables import Table, show
 
-SECTIONS = ("planner", "spectral", "routes", "fleet", "peers", "lockstep", "wire")
+SECTIONS = ("planner", "spectral", "routes", "fleet", "maps", "peers", "lockstep", "wire")
 LIBRARIES = ("kantor", "eclipse-zenoh", "numpy", "numba", "msgspec")
 
 

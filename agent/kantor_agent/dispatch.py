@@ -49,15 +49,13 @@ def register_of(member: Member, *, resting: bool) -> list[int]:
 
 def member_of(robot: int, register: npt.NDArray[np.int64], cells: int, tick: int) -> Member | None:
     """What a robot has told of itself; None while it has told nothing sound, or rests."""
-    cell, flags, target, since, *memo = register.tolist()
+    cell, flags, target, since = register[:MEMO].tolist()
     if not (1 <= cell <= cells and 0 <= target <= cells) or flags & RESTING:
         return None
     since = min(since, tick)
-    while memo and memo[-1] == 0:  # registers lose them too
-        memo.pop()
-    return Member(
-        robot, cell - 1, Task(target - 1, tuple(memo)), since, arrived=bool(flags & ARRIVED)
-    )
+    used = register.nonzero()[0]
+    memo = tuple(register[MEMO : used[-1] + 1].tolist())  # registers lose zeros at the end too
+    return Member(robot, cell - 1, Task(target - 1, memo), since, arrived=bool(flags & ARRIVED))
 
 
 def roll_call(

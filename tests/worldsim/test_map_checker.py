@@ -31,7 +31,8 @@ RADIOS = {
     "everywhere": ("radio.range_m=100",),
     "alone": ALONE,
     "lossy": ("radio.drop=0.3", "radio.duplicate=0.3", "radio.delay_s=0.15", "radio.jitter_s=0.2"),
-    "walls": ("radio.line_of_sight=true", "radio.range_m=100"),
+    "sight": ("radio.line_of_sight=true", "radio.range_m=100"),
+    "walls": ("radio.wall_loss_m=3", "radio.range_m=12"),
     "centralized": ("coordination=centralized",),
 }
 PLANNERS = ("frontier", "burgard", "market", "kmeans", "hungarian")
@@ -266,6 +267,11 @@ def _gives_up(records: Records) -> list[Record]:
     return put(records, act, change)
 
 
+def _minds_walls(*overrides: str) -> Callable[[Records], list[Record]]:
+    """The record of a radio that goes through walls, as if it minded them."""
+    return lambda records: opened(records, scenario=on_map(*RADIOS["everywhere"], *overrides))
+
+
 BROKEN: dict[str, tuple[tuple[str, ...], Callable[[Records], list[Record]]]] = {
     "wall-stands": (ALONE, _stands_in_wall),
     "wall-outside": (ALONE, _leaves_map),
@@ -285,6 +291,8 @@ BROKEN: dict[str, tuple[tuple[str, ...], Callable[[Records], list[Record]]]] = {
     "union-more": ((), _holds_more_than_there_is),
     "union-another": ((), _forwards_something_else),
     "union-too-much": ((), _forwards_too_much),
+    "sight-line": (RADIOS["everywhere"], _minds_walls("radio.line_of_sight=true")),
+    "sight-loss": (RADIOS["everywhere"], _minds_walls("radio.wall_loss_m=95")),
     "finish": ((), _gives_up),
 }
 

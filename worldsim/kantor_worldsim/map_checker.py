@@ -4,12 +4,15 @@
 which notes faults as numbers; here they are put into words.
 """
 
+import math
 from collections.abc import Callable
 
 from kantor_protocol.grid import FREE, NOWHERE, free_way
-from kantor_protocol.machine import ParticipantId, State
+from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
 from kantor_worldsim import survey as found
+from kantor_worldsim.channel import DROPPED, Verdict
 from kantor_worldsim.records import Act, Batch, Opening
+from kantor_worldsim.sensors import walls_between
 from kantor_worldsim.survey import NEVER, Survey
 
 Complain = Callable[[str, ParticipantId, str], None]
@@ -40,6 +43,7 @@ class MapRules:
     truth       no scan calls a cell free or occupied that is not (without noise)
     union       what is forwarded of a log is what its robot sent, and nobody holds more of it than that;
                 so that what robots hold by their version vectors is the union of these prefixes
+    sight       nothing is delivered through walls that the radio minds
     finish      who says that it has finished can reach no frontier by what it holds (without noise)
     """
 
@@ -54,6 +58,12 @@ class MapRules:
         self._exact = opening.scenario.sensor.noise_m == 0.0
         self._names = opening.scenario.roster
         self._poses_m = dict(zip(self._names, self._survey.poses_m, strict=False))
+        self._radio = opening.scenario.radio
+        self._senders_m = dict(self._poses_m)
+        supervisor = opening.scenario.supervisor
+        if supervisor.pose_m is not None:
+            self._senders_m[SUPERVISOR] = supervisor.pose_m
+        self._supervisor_range_m = supervisor.range_m
         self._finished: set[ParticipantId] = set()
         for name in self._poses_m:
             if not self._is_free(name):
@@ -61,6 +71,9 @@ class MapRules:
 
     def check(self, batch: Batch) -> int:
         """Follow one batch; how many faults went without a complaint, since there are too many."""
+        if self._radio.line_of_sight or self._radio.wall_loss_m > 0.0:
+            for verdict in batch.verdicts:
+                self._check_sight(verdict)
         self._survey.take(batch)
         faults, count = self._survey.faults
         for fault, row, _, a, b in faults.tolist():
@@ -77,12 +90,27 @@ class MapRules:
         kind = "occupied" if b else "free"
         self._complain(rule, batch.acts[row].name, text.format(a=a, b=b, origin=origin, kind=kind))
 
+    def _check_sight(self, verdict: Verdict) -> None:
+        """From where both were before anybody moved; range alone is a rule of every run."""
+        if verdict.due_ns == DROPPED:
+            return
+        here, there = (self._senders_m.get(name) for name in (verdict.source, verdict.target))
+        if here is None or there is None:
+            return
+        walls = walls_between(self._survey.ground.cells, *self._uv(here), *self._uv(there))
+        by_supervisor = SUPERVISOR in (verdict.source, verdict.target)
+        range_m = self._supervisor_range_m if by_supervisor else self._radio.range_m
+        hidden = self._radio.line_of_sight and walls > 0
+        if hidden or not math.dist(here, there) <= range_m - walls * self._radio.wall_loss_m:
+            heard = f"{verdict.source}#{verdict.sequence}"
+            self._complain("sight", verdict.target, f"hears {heard} through {walls} walls")
+
     def _check_way(self, act: Act) -> None:
         assert act.ruling is not None
         before, now = self._poses_m[act.name], (act.ruling.pose.x_m, act.ruling.pose.y_m)
         if now == before:
             return
-        self._poses_m[act.name] = now
+        self._poses_m[act.name] = self._senders_m[act.name] = now
         if not self._is_free(act.name):
             self._complain("wall", act.name, f"stands at {now[0]:.6g}, {now[1]:.6g} m in a wall")
         elif free_way(self._survey.ground.cells, FREE, *self._uv(before), *self._uv(now)) < 1.0:

@@ -1,0 +1,101 @@
+"""What missions on an unknown map cost: CPU time with every referee, and what robots tell of the map.
+
+The office at 0.2 m, three robots that hear each other within 12 m, or a supervisor that hears all; and eight
+robots in a field of obstacles. Runs are in process and exactly repeatable but for the time; over the bus
+the bytes are the same.
+"""
+
+import statistics
+import time
+from typing import NamedTuple
+
+from tables import Table, verdict
+
+from kantor_fleet.catalog import find
+from kantor_fleet.preload import warm_up
+from kantor_fleet.team import play
+from kantor_protocol.scenario import MAP_PLANNERS
+from kantor_worldsim.recording import Recording
+from kantor_worldsim.world import Site
+
+BYTES_MAX = 60.0
+"""Of maps, per robot and tick on average, at 0.2 m."""
+_EIGHT = ("robots.count=8", "coordination=centralized")
+
+
+class Cost(NamedTuple):
+    """One run."""
+
+    steps_per_s: float
+    """Robot-steps in a CPU second."""
+    cpu_s: float
+    map_bytes: float
+    """Per robot and tick."""
+    cells: int
+
+
+def measure(*, quick: bool) -> Table:
+    """Medians over five seeds, or one."""
+    warm_up()
+    rows, met = [], True
+    for planner in sorted(MAP_PLANNERS):
+        settings = (
+            ("office", "12 m", ()),
+            ("office", "supervisor", ("coordination=centralized",)),
+            ("unstructured", "supervisor, 8 robots", _EIGHT),
+        )
+        for name, radio, overrides in settings[:1] if quick else settings:
+            costs = [
+                _run(name, (f"planner={planner}", *overrides), seed)
+                for seed in range(1 if quick else 5)
+            ]
+            map_bytes = statistics.fmean(cost.map_bytes for cost in costs)
+            judged = name == "office"
+            reached = map_bytes <= BYTES_MAX or not judged
+            met = met and reached
+            whole = costs[0].cells // 4
+            rows.append(
+                (
+                    planner,
+                    f"{name}, {radio}",
+                    f"{statistics.median(cost.steps_per_s for cost in costs):,.0f}",
+                    f"{statistics.median(cost.cpu_s for cost in costs):.2f}",
+                    f"{map_bytes:.1f}",
+                    f"{BYTES_MAX:g}" if judged else "",
+                    verdict(met=reached) if judged else "",
+                    f"{whole:,}",
+                    f"{whole / map_bytes:,.0f}",
+                )
+            )
+    return Table(
+        "maps: missions on an unknown map",
+        (
+            "planner",
+            "mission",
+            "robot-steps per CPU s",
+            "CPU s a run",
+            "B of maps",
+            "target",
+            "verdict",
+            "2-bit grid, B",
+            "ratio",
+        ),
+        rows,
+        met=met,
+    )
+
+
+def _run(name: str, overrides: tuple[str, ...], seed: int) -> Cost:
+    scenario = find(name, overrides)
+    site = Site.of(scenario, seed)
+    recording = Recording(scenario, seed, "in-process")
+    start_s = time.process_time()
+    play(scenario, seed, site, [recording.take])
+    spent_s = time.process_time() - start_s
+    result = recording.finish()
+    assert result.map is not None
+    assert site.ground is not None
+    steps = result.ticks * result.robots
+    return Cost(
+        steps / spent_s, spent_s, result.map.log_bytes_per_robot_tick, site.ground.frame.cells
+    )
