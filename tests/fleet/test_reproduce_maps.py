@@ -449,6 +449,16 @@ def test_a_run_that_broke_a_rule_counts_and_is_told(
     assert reproduce({"a": simple_figure()}, None, nothing, tmp_path) == Exit.NOT_MET
 
 
+def test_a_folder_keeps_the_verdicts_of_its_figures(tmp_path: Path) -> None:
+    """Those of a figure that is drawn anew are replaced, whichever command drew it."""
+    pool = pool_of(*(Flight(result=finished_run(seed)) for seed in (0, 1)))
+
+    for name in ("a", "b", "a"):
+        reproduce({name: simple_figure()}, None, pool, tmp_path)
+
+    assert [line["figure"] for line in rows_of(tmp_path / "verdicts.csv")] == ["b", "a"]
+
+
 def test_a_run_without_a_result_is_run_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,5 +1,6 @@
 """`kantor reproduce`: a paper's figures anew, with a verdict beside each published number."""
 
+import csv
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,7 +20,7 @@ from kantor_fleet.reproduce.figure import Figure, Orders, Table
 from kantor_fleet.reproduce.flights import Flight, Flights, Setting
 from kantor_fleet.sweep.journal import Journal
 from kantor_fleet.sweep.plan import Key
-from kantor_fleet.sweep.table import write_csv
+from kantor_fleet.sweep.table import Row, write_csv
 from kantor_worldsim.exact import available
 
 RUNS = "runs.jsonl"
@@ -60,7 +61,7 @@ def reproduce(
     verdicts = [
         line for name, figure in figures.items() for line in _conclude(name, figure, flown, out)
     ]
-    write_csv(out / "verdicts.csv", Verdict._fields, [line._asdict() for line in verdicts])
+    _write_verdicts(out / "verdicts.csv", verdicts)
     _print(verdicts)
     if broken:
         print(f"  {len(broken)} runs broke a rule, and count all the same: {broken[0].failed}")
@@ -154,6 +155,23 @@ def _flight(outcome: Outcome) -> Flight:
     return outcome if isinstance(outcome, Flight) else Flight(failed=outcome.failed)
 
 
+def _write_verdicts(path: Path, verdicts: Sequence[Verdict]) -> None:
+    """Beside those of other figures that were drawn into the same folder before."""
+    anew = {line.figure for line in verdicts}
+    before = _rows_of(path)
+    kept = [row for row in before if row["figure"] not in anew]
+    write_csv(path, Verdict._fields, [*kept, *(line._asdict() for line in verdicts)])
+
+
+def _rows_of(path: Path) -> list[Row]:
+    """A table of verdicts, if there is one."""
+    if not path.exists():
+        return []
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return rows if all(tuple(row) == Verdict._fields for row in rows) else []
+
+
 def _write_runs(path: Path, figure: Figure, flights: Flights) -> None:
     """Every run behind a figure."""
     rows = [
@@ -189,6 +207,15 @@ def _print(verdicts: Sequence[Verdict]) -> None:
         figure = line.figure
     console.print(table)
     print(_OURS)
+    for (figure, why), claims in _reasons(verdicts).items():
+        which = claims[0] if len(claims) == 1 else f"{len(claims)} claims"
+        console.print(f"  {figure}, {which}: {why}", highlight=False)
+
+
+def _reasons(verdicts: Sequence[Verdict]) -> dict[tuple[str, str], list[str]]:
+    """Figures and reasons, with the claims that they stand beside."""
+    claims: dict[tuple[str, str], list[str]] = {}
     for line in verdicts:
         if line.why:
-            console.print(f"  {line.figure}, {line.claim}: {line.why}", highlight=False)
+            claims.setdefault((line.figure, line.why), []).append(line.claim)
+    return claims

@@ -69,7 +69,10 @@ def curves(panels: Mapping[int, Mapping[str, Sequence[Flight]]], name: str) -> F
             axes.plot(ticks, mean, color=colour, ls=style, lw=width, label=label)
             axes.plot(ticks[-1], mean[-1], "o", color=colour, ms=4.0)
         axes.set_xlim(left=0.0)
-        axes.set_ylim(bottom=0.0)
+        if name == "wtv":
+            axes.set_yscale("log")  # robots that start together may never part, and hide the others
+        else:
+            axes.set_ylim(bottom=0.0)
         tidy(axes, "tick", _CURVES[name])
         write_title(
             axes, f"({letter}) {robots} robots, mean of {len(next(iter(lines.values())))} runs"
@@ -93,7 +96,8 @@ def ratios(
                 if (row["measure"], row["against"]) == (measure, other) and row["robots"].isdigit()
             ]
             _draw_ratios(axes, found, 0.12 * (place - 1), colour, f"KME over {other}")
-        _ratio_scale(axes)
+        means = [row["ratio"] for row in rows if row["measure"] == measure and row["ratio"]]
+        _ratio_scale(axes, min(means), max(means))
         axes.set_xticks(teams)
         tidy(axes, "robots" if letter in "cd" else "", "ratio")
         write_title(axes, f"({letter}) {measure}")
@@ -179,8 +183,10 @@ def _draw_ratios(
     )
 
 
-def _ratio_scale(axes: Axes) -> None:
+def _ratio_scale(axes: Axes, low: float, high: float) -> None:
+    """Room for the means; intervals of a few runs reach out of any picture."""
     axes.set_yscale("log")
+    axes.set_ylim(0.5 * min(low, 1.0), 2.0 * max(high, 1.0))
     axes.yaxis.set_major_locator(
         FixedLocator([0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0])
     )

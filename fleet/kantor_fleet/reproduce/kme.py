@@ -52,7 +52,7 @@ _PLOTTED = (2, 4, 6, 8)
 _MANY = tuple(team for team in TEAMS if team >= 4)
 _BY_GOALS = (
     "whether KME lies below Zlot's market depends on how goals are proposed, which the paper leaves "
-    "open; here by quadtree. The reading with two robots has Zlot below KME as well"
+    "open; here by quadtree"
 )
 
 
