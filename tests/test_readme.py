@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from kantor_agent.planners import ALLOCATORS, PLANNERS
+from kantor_agent.planners import PLANNERS
+from kantor_agent.planners.allocators import ALLOCATORS
 from kantor_fleet.catalog import find
 from kantor_fleet.team import play
 from kantor_protocol.scenario import Scenario

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kantor_agent.planners import ALLOCATORS
+from kantor_agent.planners.allocators import ALLOCATORS
 from kantor_agent.planners.team import Member, Situation, Task
 from kantor_agent.terrain import Terrain
 from kantor_protocol.grid import NOWHERE, Frame

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 from kantor_agent.core import Agent
-from kantor_agent.mapper import Mapper
 from kantor_protocol.credentials import Identity
 from kantor_protocol.machine import StateMachine
 from kantor_protocol.messages import Mission
@@ -20,6 +19,8 @@ def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str]
         starts_m = mission.starts.open("<f8", 2)
         x_m, y_m = starts_m[mission.scenario.robot_ids.index(identity.user)].tolist()
         if mission.frame is not None:
+            from kantor_agent.mapper import Mapper  # noqa: PLC0415  only where there is a map
+
             return Mapper(identity.user, mission.scenario, mission.seed, (x_m, y_m), mission.frame)
         samples_m = mission.samples.open("<f8", 2)
         return Agent(identity.user, mission.scenario, mission.seed, (x_m, y_m), samples_m)

@@ -6,7 +6,6 @@ from kantor_protocol.credentials import Identity
 from kantor_protocol.machine import StateMachine
 from kantor_protocol.messages import Mission
 from kantor_protocol.process import participate
-from kantor_supervisor.allocation import Allocation
 from kantor_supervisor.core import Supervisor
 
 
@@ -18,6 +17,8 @@ def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str]
 
     def build(mission: Mission) -> StateMachine:
         if mission.frame is not None:
+            from kantor_supervisor.allocation import Allocation  # noqa: PLC0415  only on a map
+
             return Allocation(identity.user, mission.scenario, mission.seed, mission.frame)
         return Supervisor(identity.user, mission.scenario, mission.samples.shape[0])
 

@@ -239,7 +239,8 @@ def by_the_table(floor: Floor, situation: Situation) -> list[int]:
 
     def lessen(target: int) -> None:
         for t in frontiers:
-            d = math.hypot(t // columns - target // columns, t % columns - target % columns)
+            rise, run = t // columns - target // columns, t % columns - target % columns
+            d = math.sqrt(rise * rise + run * run)  # hypot may differ in the last bit
             seen = not planner.sight or sees(floor, target, t)
             p = share_of(floor, d, reach) if seen else 0.0
             worth[t] = worth[t] - p if planner.discount == "subtract" else worth[t] * (1.0 - p)
@@ -288,8 +289,8 @@ def sees(floor: Floor, one: int, other: int) -> bool:
                 continue
             first, last = sorted(((low - start) / step, (low + 1 - start) / step))
             enter, leave = max(enter, first), min(leave, last)
-        if enter <= leave:
-            return wall == one  # where the line begins does not count
+        if enter <= leave and wall != one:  # where the line begins does not count
+            return False
     return True
 
 

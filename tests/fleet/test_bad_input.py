@@ -80,7 +80,7 @@ def test_an_unknown_scenario_is_refused_with_the_known_ones(kantor: "Kantor") ->
     code, line = refused(kantor, "run", "flet")
 
     assert code == 2
-    assert "flet: no packaged scenario; there are fleet, paper-centralized" in line
+    assert "flet: no packaged scenario; there are fleet, blank, cityblock, office, paper-" in line
 
 
 def test_a_missing_scenario_file_is_refused(kantor: "Kantor") -> None:

@@ -92,7 +92,7 @@ def test_papers_missions_have_the_papers_numbers(
 
 OVERRIDES = (
     (),
-    ("radio.range_m=inf", "supervisor.range_m=12.5", "limit_s=1e3"),
+    ("radio.range_m=inf", "supervisor.range_m=12.5", "supervisor.pose_m=[1, 2]", "limit_s=1e3"),
     ("clock.drift_ppm=250.0", "clock.jitter_s=1e-3", "publish.keyframe_every=3"),
     ('summary="a \\"quoted\\" line\\nand \\u007f another\\\\"', "claims=false"),
     ("starts.random=true", "starts.poses_m=[]", "targets.file='t.csv'", "planner.horizon=12"),
