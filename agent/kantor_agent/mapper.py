@@ -35,8 +35,6 @@ _SURE_STEPS = 3
 """So many steps in a row without a frontier end the mission of a robot."""
 _PROGRESS_CELLS = 0.25
 """A robot gets on when its way gets shorter by as much."""
-_ON_TARGET_CELLS = 0.75
-"""It has arrived when its target's middle is so near."""
 
 
 class Mapper:
@@ -175,9 +173,8 @@ class Mapper:
         self._arrived = self._task.target != NOWHERE and self._is_at(self._task.target)
 
     def _is_at(self, cell: int) -> bool:
-        x_m, y_m = self._frame.centre_of(cell)
-        away_m = math.hypot(self._pose.x_m - x_m, self._pose.y_m - y_m)
-        return away_m <= _ON_TARGET_CELLS * self._frame.resolution_m
+        """In the cell itself: from beside it, what lies behind it may be hidden."""
+        return self._frame.cell_of(self._pose.x_m, self._pose.y_m) == cell
 
     def _move(self, dt_s: float) -> None:
         if self._task.target == NOWHERE or self._arrived or self._queues():

@@ -247,8 +247,8 @@ def reproduce(
         figure: fig4 to fig9 are Kabir & Lee's, section VI, and all stands for these six. burgard-fig8:
             coordinated frontiers. kme-fig6 to kme-fig8: exploration by K-means beside three others;
             kme-all: the same over all 630 configurations.
-        runs: Runs for each setting; by default as many as in the paper (fig6: 50, fig9: 10, burgard-fig8:
-            10, kme-*: 15). kme-all: how many of the configurations, evenly spread over maps, starts and
+        runs: Runs for each setting; by default as many as in the paper (fig6: 50, fig9: 10, kme-*: 15),
+            burgard-fig8: 20. kme-all: how many of the configurations, evenly spread over maps, starts and
             teams.
         jobs: Processes; by default one for each core.
         out: Where the figures go.

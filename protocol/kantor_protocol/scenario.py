@@ -218,8 +218,8 @@ class Planner(_Table, frozen=True, kw_only=True):
     """spectral: K, cosine modes along each axis."""
     cost: Literal["occupancy", "length"] = "occupancy"
     """map: a way costs its length times the smoothed occupancy (Burgard), or its length."""
-    smoothing_cells: Annotated[float, Meta(ge=0.0, le=100.0)] = 1.5
-    """cost = occupancy: deviation of the Gaussian."""
+    smoothing_cells: Annotated[float, Meta(ge=0.0, le=100.0)] = 1.0
+    """cost = occupancy: deviation of the Gaussian; the wider, the dearer are doors."""
     occupied_from: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.5
     """map: no way leads through a cell that is occupied with this probability or more."""
     replan_on: Literal["events", "arrivals"] = "events"

@@ -226,8 +226,14 @@ def _forgets(records: Records) -> list[Record]:
 
 
 def _sees_what_is_not_there(records: Records) -> list[Record]:
-    """The true map has a free cell less than the robots saw."""
-    return _redrawn(records, 14.5, 10.5, FREE, OCCUPIED)
+    """The true map has a free cell less than the robots saw, far from all ways."""
+    stood_m = [act.ruling.pose for batch in batches(records) for act in batch.acts if act.ruling]
+    away_m = {
+        (x, y): min(math.hypot(pose.x_m - x, pose.y_m - y) for pose in stood_m)
+        for x, y in map(ROOMS.frame.centre_of, np.flatnonzero(ROOMS.cells == FREE).tolist())
+    }
+    x_m, y_m = max(away_m, key=lambda place: away_m[place])
+    return _redrawn(records, x_m, y_m, FREE, OCCUPIED)
 
 
 def _sees_what_is_no_wall(records: Records) -> list[Record]:
@@ -335,6 +341,27 @@ def test_every_rule_can_be_broken() -> None:
 def test_frontier_may_be_called_none_from_beside_it() -> None:
     """A robot that stood there may say so, at any place of its log."""
     assert rules(_calls_near_frontier_none(explored(*ALONE))) == set()
+
+
+def test_frontier_may_be_called_none_after_heading_for_it_in_vain() -> None:
+    """A robot that has had the same goal for `planner.patience` steps may give it up from afar."""
+    slow = (*ALONE, "vehicle.speed_m_s=5")
+    records = explored(*slow)
+    acts = acts_of(records, "r1")
+    first = next(i for i, act in enumerate(acts) if act.outputs and act.outputs.goal)
+    act = acts[first + 1]
+    assert act.outputs is not None
+    assert act.outputs.goal is not None
+    assert act.outputs.goal == acts[first].outputs.goal  # type: ignore[union-attr]
+    cell = ROOMS.frame.cell_of(*act.outputs.goal)
+    tells = logging([*own_log(act), void(ROOMS.frame, cell)])
+    given_up = put(records, act, says(lambda news: having(tells(news), r1=1)))
+
+    def accused(records: Records) -> bool:
+        return any("calls a frontier none" in line for line in check(records).complaints)
+
+    assert accused(given_up)
+    assert not accused(opened(given_up, scenario=on_map(*slow, "planner.patience=1")))
 
 
 def test_rules_of_every_run_hold_on_maps() -> None:

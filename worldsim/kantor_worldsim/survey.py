@@ -466,6 +466,9 @@ class Survey:
         """How far each has driven."""
         self.bumps: list[tuple[float, float]] = []
         """Where robots ended a move at a wall."""
+        self._patience = scenario.planner.patience
+        self._strived: list[tuple[tuple[float, float] | None, int]] = [(None, 0)] * robots
+        """The goal of each, and for how many steps it has been that."""
         self.completed_tick: int | None = None
         self.t95_tick: int | None = None
         self.t99_tick: int | None = None
@@ -480,7 +483,7 @@ class Survey:
         ]
         self._looked: list[tuple[int, Pose | None]] = [(NEVER, None)] * robots
         for place in range(robots):
-            self._stand(place)
+            self._stand(place, self.cell_of(place))
 
     @property
     def seen(self) -> int:
@@ -561,7 +564,9 @@ class Survey:
         _follow(*reading, *self._arguments)
         for _, place, act in acted:
             assert act.ruling is not None
+            assert act.outputs is not None
             self._move(place, act.ruling)
+            self._strive(place, act.outputs.goal)
         self._note_moments()
 
     def _look(self, place: int, observation: Observation, row: int) -> None:
@@ -584,11 +589,20 @@ class Survey:
         if (pose.x_m, pose.y_m) != (x_m, y_m):
             self.ways_m[place] += math.hypot(pose.x_m - x_m, pose.y_m - y_m)
             self.poses_m[place] = pose.x_m, pose.y_m
-            self._stand(place)
+            self._stand(place, self.cell_of(place))
 
-    def _stand(self, place: int) -> None:
+    def _strive(self, place: int, goal: tuple[float, float] | None) -> None:
+        """A robot that has headed for the same goal for long enough may speak of it as if it stood there."""
+        before, steps = self._strived[place]
+        self._strived[place] = goal, steps + 1 if goal == before else 1
+        if goal is None or self._strived[place][1] != self._patience:
+            return
+        cell = self.frame.cell_of(*goal)
+        if cell != NOWHERE:
+            self._stand(place, cell)
+
+    def _stand(self, place: int, cell: int) -> None:
         """Note the cell in which a robot is."""
-        cell = self.cell_of(place)
         count = self.books.counts.item(place, STOOD)
         if count and self.books.stood.item(place, count - 1) == cell:
             return
