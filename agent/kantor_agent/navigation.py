@@ -10,18 +10,22 @@ from kantor_protocol.grid import FREE, NOWHERE, free_way
 from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import Pose
 
+_MARGIN_CELLS = 1e-3
+"""How far a way keeps from corners: rounding must not make a wall of one."""
 _AHEAD_CELLS = 64
 """How far along its way a robot looks for a shortcut."""
 
 
 @kernel
-def _farthest_in_sight(cells: np.ndarray, way: np.ndarray, first: int, u: float, v: float) -> int:
+def _farthest_in_sight(
+    cells: np.ndarray, way: np.ndarray, first: int, u: float, v: float, margin: float
+) -> int:
     """The last place along the way to which a straight line is free, or -1; cells: (rows, columns)."""
     columns = cells.shape[1]
     last = -1
     for i in range(first, min(way.shape[0], first + _AHEAD_CELLS)):
         row, column = way[i] // columns, way[i] % columns
-        if free_way(cells, FREE, u, v, column + 0.5, row + 0.5) < 1.0:
+        if free_way(cells, FREE, u, v, column + 0.5, row + 0.5, margin) < 1.0:
             break
         last = i
     return last
@@ -51,6 +55,8 @@ class Navigator:
             self._way = self._terrain.way(cell, target)
             self._beyond = self._to_the_end()
             ahead = self._look_ahead(pose)
+        if ahead < 0:  # it stands beside a corner
+            ahead = self._look_ahead(pose, 0.0)
         if ahead < 0:
             self._target = NOWHERE
             return None
@@ -66,7 +72,7 @@ class Navigator:
         steps = np.hypot(np.diff(rows), np.diff(columns))
         return np.append(steps[::-1].cumsum()[::-1], 0.0)
 
-    def _look_ahead(self, pose: Pose) -> int:
+    def _look_ahead(self, pose: Pose, margin_cells: float = _MARGIN_CELLS) -> int:
         frame = self._frame
         return int(
             _farthest_in_sight(
@@ -75,5 +81,6 @@ class Navigator:
                 self._passed,
                 (pose.x_m - frame.origin_m[0]) / frame.resolution_m,
                 (pose.y_m - frame.origin_m[1]) / frame.resolution_m,
+                margin_cells,
             )
         )

@@ -93,16 +93,24 @@ def next_cell(
 
 @kernel
 def free_way(
-    cells: np.ndarray, passable: int, u: float, v: float, to_u: float, to_v: float
+    cells: np.ndarray,
+    passable: int,
+    u: float,
+    v: float,
+    to_u: float,
+    to_v: float,
+    margin: float = 0.0,
 ) -> float:
     """The share in [0, 1] of the way from (u, v) to (to_u, to_v) until a cell that is not `passable`.
 
     cells: (rows, columns). Coordinates in cells, column axis first; what lies outside is not passable.
-    1.0: the way is free. At a corner both cells beside it must be passable.
+    1.0: the way is free. At a corner both cells beside it must be passable; margin: how near a corner
+    counts, in cells, for whoever must not be a rounding error off.
     """
     rows, columns = cells.shape
     column, row = math.floor(u), math.floor(v)
     du, dv = to_u - u, to_v - v
+    near = margin / math.hypot(du, dv) if margin > 0.0 else 0.0
     while True:
         last_row, last_column = row, column
         row, column, share = next_cell(row, column, u, v, du, dv)
@@ -110,7 +118,13 @@ def free_way(
             return 1.0
         if not (0 <= row < rows and 0 <= column < columns) or cells[row, column] != passable:
             return max(0.0, share)
-        if row == last_row and du != 0.0 and dv != 0.0:  # a corner: the cell above or below as well
-            beyond, _, up = next_cell(last_row, last_column, u, v, 0.0, dv)
-            if up == share and (not 0 <= beyond < rows or cells[beyond, last_column] != passable):
-                return max(0.0, share)
+        if du == 0.0 or dv == 0.0:
+            continue
+        beside_row, _, up = next_cell(last_row, last_column, u, v, 0.0, dv)
+        _, beside_column, across = next_cell(last_row, last_column, u, v, du, 0.0)
+        if abs(up - across) > near or max(up, across) > 1.0:
+            continue
+        if not (0 <= beside_row < rows and 0 <= beside_column < columns):
+            return max(0.0, share)
+        if cells[beside_row, last_column] != passable or cells[last_row, beside_column] != passable:
+            return max(0.0, share)

@@ -345,7 +345,7 @@ def test_frontier_may_be_called_none_from_beside_it() -> None:
 
 def test_frontier_may_be_called_none_after_heading_for_it_in_vain() -> None:
     """A robot that has had the same goal for `planner.patience` steps may give it up from afar."""
-    slow = (*ALONE, "vehicle.speed_m_s=5")
+    slow = (*ALONE, "vehicle.speed_m_s=4")
     records = explored(*slow)
     acts = acts_of(records, "r1")
     first = next(i for i, act in enumerate(acts) if act.outputs and act.outputs.goal)
