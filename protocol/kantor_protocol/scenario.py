@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import Meta
@@ -533,7 +533,7 @@ def _choices(place: str) -> str:
     kind: Any = Scenario
     for part in place.split("."):
         kind = get_type_hints(kind)[part]
-        if isinstance(kind, UnionType):  # a table, or a name, that need not be there
+        if get_origin(kind) in (Union, UnionType):  # a table, or a name, that need not be there
             kind = get_args(kind)[0]
     return ", ".join(get_args(kind))
 

@@ -49,6 +49,79 @@ def test_a_bad_scenario_value_is_refused_by_name(
     assert says in line
 
 
+NAV2 = """
+image: {image}
+resolution: 0.1
+origin: [0.0, 0.0, 0.0]
+negate: 0
+occupied_thresh: 0.65
+free_thresh: {free}
+"""
+
+
+def painted(folder: Path, name: str, shade: int, side: int = 60) -> None:
+    """A grey picture with a black wall in the middle, which parts it in two."""
+    from PIL import Image
+
+    grey = np.full((side, side), shade, dtype=np.uint8)
+    grey[:, side // 2] = 0
+    Image.fromarray(grey).save(folder / name)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "says"),
+    [
+        (("map={file='nowhere.yaml'}",), "nowhere.yaml: no such file"),
+        (("map={file='lost.yaml'}",), "lost.png: no such file"),
+        (("map={file='black.png'}",), "no free cell, so nowhere to stand"),
+        (("map={file='halves.png'}", "map.resolution_m=0.1", "starts.random=false",
+          "starts.poses_m=[[1,1],[5,1],[2,2]]"), "starts.poses_m[1]: (5, 1) cannot be reached"),
+        (("starts.random=false", "starts.poses_m=[[0.05,0.05],[1,1],[2,2]]"), "is inside a wall"),
+        (("starts.random=false", "starts.poses_m=[[-5,0],[1,1],[2,2]]"), "starts.poses_m[0]"),
+        (("map={}",), "map: set either map.file or map.layout"),
+        (("map.layout=castle",), "map.layout: 'castle' is not known; known: office, blank"),
+        (("planner=transport",), "planner.name: transport explores a density; on a map use"),
+        (("energy.points=5",), "map: cannot be joined with a density"),
+        (("vehicle=dubins",), "vehicle.name: dubins cannot stop at a wall"),
+        (("coordination=centralized", "supervisor.range_m=5"), "supervisor.pose_m: missing"),
+    ],
+)  # fmt: skip
+def test_a_map_that_cannot_be_explored_is_refused(
+    kantor: "Kantor", overrides: tuple[str, ...], says: str
+) -> None:
+    """One line that names the key or the file, exit code 2, and no run folder."""
+    (kantor.folder / "lost.yaml").write_text(NAV2.format(image="lost.png", free=0.196))
+    painted(kantor.folder, "black.png", 0)
+    painted(kantor.folder, "halves.png", 255)
+    code, line = refused(kantor, "run", "office", "--exchange", "in-process", "--set", *overrides)
+
+    assert code == 2
+    assert says in line
+
+
+def test_a_map_whose_unknown_cells_become_free_is_warned_of(kantor: "Kantor") -> None:
+    """Nav2 writes 205 for unknown; with free_thresh 0.25 that is free. The mission runs all the same."""
+    (kantor.folder / "trap.yaml").write_text(NAV2.format(image="trap.png", free=0.25))
+    painted(kantor.folder, "trap.png", 205)
+    finished = kantor(
+        "run", "office", "--exchange", "in-process",
+        "--set", "map={file='trap.yaml'}", "robots.count=1", "limit_s=2",
+    )  # fmt: skip
+
+    (line,) = finished.err.splitlines()
+    assert line.startswith("kantor: warning: map.file: ")
+    assert "grey 205" in line
+    assert len(kantor.runs()) == 1
+
+
+def test_a_mission_on_a_density_needs_another_planner(kantor: "Kantor") -> None:
+    """A planner on maps has nothing to explore there."""
+    code, line = refused(kantor, "run", "fleet", "--set", "planner=burgard")
+
+    assert code == 2
+    assert "planner.name: burgard explores a map; add a [map]" in line
+
+
 def test_an_override_without_a_value_is_refused(kantor: "Kantor") -> None:
     """`--set` wants key=value."""
     assert refused(kantor, "run", "fleet", "--set", "radio") == (
