@@ -56,8 +56,7 @@ class Reading(NamedTuple):
 
 _APART = (
     "robots that start anywhere are apart without being coordinated, and a third robot then gains more "
-    "than coordination does; side by side (B), or where an uncoordinated robot chooses anew only when it "
-    "arrives (C), the claim holds"
+    "than coordination does; side by side (B) the claim holds"
 )
 _EVENTS, _ARRIVALS, _OWN = ("events", "team"), ("arrivals", "team"), ("arrivals", "own")
 

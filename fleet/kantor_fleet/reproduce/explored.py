@@ -51,6 +51,7 @@ def bars(
     for axes, (title, sides) in zip(places.flat, panels.items(), strict=True):
         _draw_bars(axes, sides, finished, scenario.clock.period_s)
         write_title(axes, fill(title, _LETTERS))
+    places[0, 0].set_ylim(bottom=0.0)  # of all; two runs may have an interval beyond
     for axes in places[:, 0]:
         axes.set_ylabel("time to explore, s", size=TEXT_PT, color=INK)
     for axes in places[1]:
@@ -155,7 +156,6 @@ def _draw_bars(axes: Axes, sides: Mapping[bool, Runs], finished: Measure, period
             label="coordinated" if coordinated else "uncoordinated",
         )
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_ylim(bottom=0.0)  # two runs may have an interval beyond
     tidy(axes, "", "")
 
 
