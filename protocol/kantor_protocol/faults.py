@@ -169,10 +169,10 @@ class Partition(Fault, frozen=True, kw_only=True, tag="partition"):
     """isolate: who."""
     groups: tuple[Names, ...] = ()
     """groups: who together."""
-    flap_s: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
-    """The cut comes and goes: so often it is drawn whether it is there. 0: it is there all the time."""
-    flap_share: Annotated[float, Meta(gt=0.0, lt=1.0)] = 0.5
-    """Share of the time in which it is there, if it flaps."""
+    flap_s: Span | None = None
+    """The cut comes and goes: so often it is drawn whether it is there. By default it stays."""
+    flap_share: Annotated[float, Meta(gt=0.0, lt=1.0)] | None = None
+    """Share of the time in which it is there, if it flaps; by default half."""
 
     def severs(self, roster: Names) -> Severs:
         """Which links it cuts while it is there."""
@@ -212,6 +212,8 @@ class Partition(Fault, frozen=True, kw_only=True, tag="partition"):
             yield from _complaints_of_names(f"groups[{i}]", group, scenario)
             yield from () if group else (f"groups[{i}]: nobody is in it; name somebody",)
         yield from _complaints_of_names("groups", sum(self.groups, ()), scenario)
+        if self.flap_share is not None and self.flap_s is None:
+            yield "flap_share: only with flap_s; set it"
         if not _cuts_any(self.severs(scenario.roster), scenario.roster):
             yield f"shape: {self.shape} cuts no link of a team of {len(scenario.roster)}"
 

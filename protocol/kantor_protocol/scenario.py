@@ -290,7 +290,7 @@ class Scenario(Table, frozen=True, kw_only=True):
     publish: Publish = Publish()
     metrics: Metrics = Metrics()
     faults: Annotated[tuple[AnyFault, ...], Meta(max_length=FAULTS_MAX)] = ()
-    """What goes wrong, and when; see `faults.py`. Participants take no notice."""
+    """What goes wrong, and when; see `faults.py`. Over the bus participants are not told."""
 
     @property
     def robot_ids(self) -> tuple[ParticipantId, ...]:

@@ -160,6 +160,10 @@ REFUSED = {
         {"kind": "one-way", "senders": ["r1"], "receivers": ["r1"]},
         "faults[0].receivers: no link leads there from the senders; name others",
     ),
+    "a share of no flapping": (
+        {"kind": "partition", "shape": "halves", "flap_share": 0.25},
+        "faults[0].flap_share: only with flap_s; set it",
+    ),
     "unknown shape": (
         {"kind": "partition", "shape": "star"},
         "faults[0].shape: 'star' is not known; known: halves, ring, bridge, isolate, groups",

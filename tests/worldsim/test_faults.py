@@ -474,7 +474,10 @@ PARTS: dict[type[AnyFault], dict[str, st.SearchStrategy[Any]]] = {
     Replay: {"probability": SHARES, "age_s": SPANS},
     Reorder: {"probability": SHARES, "hold_s": SPANS, "robots": NAMES},
     OneWay: {"senders": st.just(("r1",)), "receivers": st.just(("r2", "r3"))},
-    Partition: {"shape": st.sampled_from(["halves", "bridge"]), "flap_s": st.sampled_from([0, 1])},
+    Partition: {
+        "shape": st.sampled_from(["halves", "bridge"]),
+        "flap_s": st.sampled_from([None, 0.5]),
+    },
     Clog: {"robots": NAMES},
     Bandwidth: {
         "bytes_per_s": st.sampled_from([50.0, 1000.0]),

@@ -44,6 +44,7 @@ _NEVER_NS = 2**62
 """Later than any mission; whatever is due then does not arrive."""
 _SLOTS_IN_A_STATE = 10
 """Of a burst: slots in the shorter of its mean times."""
+_FLAP_SHARE = 0.5
 
 # The last word of a draw's counter: which fault, and which of the copies that it may meet.
 _FAULT_SHIFT = 16
@@ -224,7 +225,8 @@ class _OneWay(Cut[OneWay]):
 class _Partition(Cut[Partition]):
     def _prepare(self, scenario: Scenario) -> None:
         self._severs = self.fault.severs(scenario.roster)
-        self._flap_ns = round(self.fault.flap_s * 1e9)
+        self._flap_ns = round((self.fault.flap_s or 0.0) * 1e9)
+        self._share = self.fault.flap_share or _FLAP_SHARE
 
     def cuts(self, now_ns: int, source: ParticipantId, target: ParticipantId) -> bool:
         return self._there(now_ns) and self._severs(source, target)
@@ -233,7 +235,7 @@ class _Partition(Cut[Partition]):
         if not self._flap_ns:
             return True
         draw = self._slot_draw(Purpose.FAULT_FLAP, now_ns // self._flap_ns)
-        return draw < self.fault.flap_share
+        return draw < self._share
 
 
 class _Range(Rule[Range]):
