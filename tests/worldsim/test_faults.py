@@ -460,6 +460,37 @@ def test_order_does_not_matter_and_a_drop_wins(a: Fate, b: Fate, c: Fate) -> Non
     assert (a.joined(b).due_ns(5) == DROPPED) == (a.dropped or b.dropped)
 
 
+FIXED: st.SearchStrategy[AnyFault] = st.sampled_from(
+    [
+        Drop(probability=1.0, from_s=1.0, until_s=1.5, robots=("r1",)),
+        Delay(delay_s=0.2, from_s=0.5),
+        Delay(delay_s=0.1, until_s=2.0, robots=("r2",)),
+        OneWay(senders=("r1",), receivers=("r2",), until_s=3.0),
+        Partition(shape="halves", from_s=2.0, until_s=4.0),
+        Clog(from_s=3.5, until_s=5.0),
+        Clog(from_s=4.0, until_s=4.5, robots=("r3",)),
+        Bandwidth(bytes_per_s=150.0),
+        Bandwidth(bytes_per_s=100.0, queue_bytes=30, robots=("r2",)),
+        Range(range_m=40.0, from_s=0.3),
+        Range(factor=0.7, robots=("r3",)),
+    ]
+)
+
+
+@examples(60)
+@given(st.data())
+def test_order_of_what_is_not_drawn_does_not_matter(data: st.DataObject) -> None:
+    """Cuts, holds, fixed delays, queues and ranges, in whatever order they are listed."""
+    schedule = data.draw(st.lists(FIXED, min_size=2, max_size=5))
+    shuffled = data.draw(st.permutations(schedule))
+    one, other = (
+        Air(*faults, scenario=mission(*LOSSY), at=PLACES).say(*TALK)
+        for faults in (schedule, shuffled)
+    )
+
+    assert one == other
+
+
 NAMES = st.lists(st.sampled_from(["r1", "r2", "r3"]), unique=True, max_size=2).map(tuple)
 WINDOWS = st.tuples(st.floats(0.0, 2.0), st.floats(0.001, 2.0)).map(
     lambda pair: {"from_s": pair[0], "until_s": sum(pair)}

@@ -131,7 +131,9 @@ class Rule(Generic[_F]):
         self.fault = fault
         self.index = index
         self._seed = seed
-        self._until_ns = _NEVER_NS if fault.until_ns is None else fault.until_ns
+        self._window_ns = range(
+            fault.from_ns, _NEVER_NS if fault.until_ns is None else fault.until_ns
+        )
         self._names = frozenset(getattr(fault, "robots", ()))
         self._prepare(scenario)
 
@@ -140,7 +142,7 @@ class Rule(Generic[_F]):
 
     def active(self, now_ns: int) -> bool:
         """Whether its window is open."""
-        return self.fault.from_ns <= now_ns < self._until_ns
+        return now_ns in self._window_ns
 
     def concerns(self, source: ParticipantId, target: ParticipantId) -> bool:
         """Whether it is about a link."""
@@ -152,11 +154,12 @@ class Rule(Generic[_F]):
 
     def _draw(self, purpose: Purpose, hop: Hop) -> float:
         index = self.index << _FAULT_SHIFT | hop.copy
-        draw: float = uniform(self._seed, purpose, hop.link, hop.sequence, index)
+        # An enumeration as such takes numba longer to recognize than everything else here together.
+        draw: float = uniform(self._seed, purpose.value, hop.link, hop.sequence, index)
         return draw
 
     def _slot_draw(self, purpose: Purpose, slot: int) -> float:
-        draw: float = uniform(self._seed, purpose, 0, slot, self.index << _FAULT_SHIFT)
+        draw: float = uniform(self._seed, purpose.value, 0, slot, self.index << _FAULT_SHIFT)
         return draw
 
 
@@ -195,7 +198,7 @@ class _Reorder(Rule[Reorder]):
 
 class _Clog(Rule[Clog]):
     def fate(self, _hop: Hop) -> Fate:
-        return Fate(held_ns=self._until_ns)
+        return Fate(held_ns=self._window_ns.stop)
 
 
 class Cut(Rule[_F]):
