@@ -340,15 +340,19 @@ def test_nothing_is_replayed_that_was_not_sent() -> None:
 
 
 def test_what_was_dropped_may_still_be_replayed() -> None:
-    """Its luck is not that of the first time."""
+    """Its luck is not that of the first time, nor that of what it comes beside."""
     air = Air(Drop(probability=0.5), Replay(probability=1.0, age_s=0.1))
-    own, again = set(), set()
+    own, again, alone = set(), set(), 0
     for i in range(1, 400):
-        for verdict in air.say(said("r1", i, i * 100 * MS, "r2")):
-            if verdict.due_ns != DROPPED:
-                (own if verdict.sequence == i else again).add(verdict.sequence)
+        arrived = [
+            v.sequence for v in air.say(said("r1", i, i * 100 * MS, "r2")) if v.due_ns != DROPPED
+        ]
+        own |= {i} & set(arrived)
+        again |= set(arrived) - {i}
+        alone += bool(arrived) and i not in arrived
 
     assert 50 < len(again - own) < 150
+    assert 50 < alone < 150
 
 
 # Cuts.
@@ -431,6 +435,8 @@ def test_supervisors_range_shrinks_too() -> None:
     air = Air(Range(factor=0.5), scenario=scenario, at=PLACES)
 
     assert {v.target for v in air.say(said(SUPERVISOR, 1))} == {"r1", "r2"}
+    heard = air.say(*[said(name, 1, 0, SUPERVISOR) for name in ("r1", "r2", "r3")])
+    assert {v.source for v in heard} == {"r1", "r2"}
 
 
 def test_walls_shorten_what_is_left() -> None:
