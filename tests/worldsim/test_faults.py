@@ -739,6 +739,37 @@ def test_a_storm_of_everything_is_outlived(played: Play) -> None:
     assert result.mass_left == 0.0
 
 
+@examples(30)
+@given(
+    schedule=SCHEDULES,
+    coordination=st.sampled_from(["decentralized", "centralized"]),
+    merge=st.sampled_from([("merge=ledger",), ("merge=min", "claims=false")]),
+    order=st.sampled_from(["turn", "concurrent"]),
+    delay_s=st.sampled_from([0.0, 0.15]),
+    seed=SEEDS,
+)
+def test_no_schedule_makes_a_sound_robot_break_a_rule(
+    played: Play,
+    schedule: tuple[AnyFault, ...],
+    coordination: str,
+    merge: tuple[str, ...],
+    order: str,
+    delay_s: float,
+    seed: int,
+) -> None:
+    """And when the faults are over, the mission comes to its end."""
+    overrides = (
+        f"coordination={coordination}",
+        f"clock.order={order}",
+        f"radio.delay_s={delay_s}",
+        "energy.steps=90",
+    )
+    result = result_of(played(*merge, *overrides, under(*schedule), seed=seed))
+
+    assert result.complaints == ()
+    assert result.ended == "done"
+
+
 def test_same_seed_gives_the_same_record_under_faults() -> None:
     first, second, other = (
         result_of(explored.__wrapped__(under(*STORM[:8]), seed=seed)).digest for seed in (1, 1, 2)
