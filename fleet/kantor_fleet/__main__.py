@@ -23,6 +23,7 @@ def run(
     out: Path = Path("runs"),
     exact: bool = False,
     exact_every: int = 0,
+    chaos: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002  the flag is --set
 ) -> int:
     """Run a mission, with live progress, and leave its record and its picture.
@@ -36,6 +37,7 @@ def run(
         out: Where the run folder is made.
         exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
         exact_every: Periods from one exact distance to the next, seconds of work each; not on the wall.
+        chaos: A TOML file of [[faults]] that are added to the scenario's own.
         set: Override a key of the scenario, such as radio.range_m=150; any number of times.
     """
     from kantor_fleet.catalog import find  # noqa: PLC0415  each verb imports what it needs
@@ -43,7 +45,7 @@ def run(
 
     _check_seed(seed)
     _check_speed(speed)
-    mission = find(scenario, set)
+    mission = find(scenario, set, chaos)
     every = _exact(mission, exact_every, exchange, exact=exact)
     return run_mission(mission, seed, exchange, speed, out, every)
 
@@ -61,6 +63,7 @@ def worldsim(
     start_after: float | None = None,
     out: Path = Path("runs"),
     exact: bool = False,
+    chaos: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
 ) -> int:
     """World-sim by hand: host the bus, wait for the roster, run the mission, record it.
@@ -76,6 +79,7 @@ def worldsim(
         start_after: Seconds after which to start without whoever is missing; by default never.
         out: Where the run folder is made.
         exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
+        chaos: A TOML file of [[faults]] that are added to the scenario's own.
         set: Override a key of the scenario.
     """
     from kantor_fleet.by_hand import host_by_hand  # noqa: PLC0415
@@ -83,7 +87,7 @@ def worldsim(
 
     _check_seed(seed)
     _check_speed(speed)
-    mission = find(scenario, set)
+    mission = find(scenario, set, chaos)
     every = _exact(mission, 0, exchange, exact=exact)
     return host_by_hand(
         mission, seed, exchange, speed, listen, credentials, fleet, start_after, out, every
@@ -144,6 +148,7 @@ def sweep(
     plot: str | None = None,
     exact: bool = False,
     retry_failed: bool = False,
+    chaos: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
 ) -> int:
     """Run many seeds of many variants: a table, a summary and a plot.
@@ -162,6 +167,7 @@ def sweep(
         plot: The column that plot.png shows.
         exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
         retry_failed: Run again what has failed.
+        chaos: A TOML file of [[faults]] that are added to the scenario's own.
         set: Override a key in every variant.
     """
     from kantor_fleet.pools import pool  # noqa: PLC0415
@@ -169,7 +175,7 @@ def sweep(
     from kantor_fleet.sweep.run import Order  # noqa: PLC0415
     from kantor_fleet.sweep.run import sweep as run_sweep  # noqa: PLC0415
 
-    planned = plan(scenario, vary, seeds, set, exact=exact)
+    planned = plan(scenario, vary, seeds, set, chaos, exact=exact)
     for variant in planned.variants:
         _exact(variant.scenario, 0, "in-process", exact=exact)
     folder = out or Path("sweeps") / planned.name

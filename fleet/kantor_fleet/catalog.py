@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from importlib.resources import files
 from pathlib import Path
 
-from kantor_protocol.scenario import Scenario, ScenarioError, load
+from kantor_protocol.scenario import Scenario, ScenarioError, load, with_chaos
 
 _FOLDER = Path(str(files("kantor_fleet") / "scenarios"))
 DEFAULT = "fleet"
@@ -24,8 +24,11 @@ def path_of(name: str) -> Path:
     return path
 
 
-def find(scenario: str, overrides: Iterable[str] = ()) -> Scenario:
-    """A scenario by packaged name or by file, with `key.sub=value` overrides. Raises ScenarioError."""
-    if scenario.endswith(".toml") or "/" in scenario:
-        return load(Path(scenario), overrides)
-    return load(path_of(scenario), overrides)
+def find(scenario: str, overrides: Iterable[str] = (), chaos: Path | None = None) -> Scenario:
+    """A scenario by packaged name or by file, with `key.sub=value` overrides. Raises ScenarioError.
+
+    chaos: a file of faults that are added to its own.
+    """
+    by_file = scenario.endswith(".toml") or "/" in scenario
+    found = load(Path(scenario) if by_file else path_of(scenario), overrides)
+    return found if chaos is None else with_chaos(found, chaos)

@@ -107,11 +107,21 @@ def summary(result: Result) -> str:
         f"  finished  {finished}; {result.ticks} ticks, {result.wall_s:.1f} s",
         *(_of_mass(result) if result.map is None else ()),
         f"  radio     {radio}",
+        *_of_faults(result),
         f"  checker   {rules}; record {result.record}",
         *(f"            {complaint}" for complaint in result.complaints),
         f"  digest    {result.digest}",
     ]
     return "\n".join(lines)
+
+
+def _of_faults(result: Result) -> list[str]:
+    """What each fault did, in a line of its own."""
+    lines = []
+    for name, counts in result.faults.items():
+        deeds = [f"{n} {deed}" for deed, n in msgspec.structs.asdict(counts).items() if n]
+        lines.append(f"  fault {name:<16} {', '.join(deeds) or 'never struck'}")
+    return lines
 
 
 def _found(result: Result) -> str:

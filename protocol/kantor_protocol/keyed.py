@@ -43,6 +43,13 @@ class Purpose(enum.IntEnum):
     SCAN = 15
     CENTROIDS = 16
     MARKET = 17
+    FAULT_DROP = 18
+    FAULT_BURST = 19
+    FAULT_DELAY = 20
+    FAULT_DUPLICATE = 21
+    FAULT_REPLAY = 22
+    FAULT_REORDER = 23
+    FAULT_FLAP = 24
 
 
 @kernel

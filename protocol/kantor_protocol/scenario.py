@@ -16,13 +16,9 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import msgspec
 from msgspec import Meta
 
+from kantor_protocol.faults import FAULTS_MAX, KINDS, AnyFault, Chaos, Fault
 from kantor_protocol.machine import SUPERVISOR, ParticipantId
-
-Positive = Annotated[float, Meta(gt=0.0)]
-NotNegative = Annotated[float, Meta(ge=0.0)]
-Probability = Annotated[float, Meta(ge=0.0, lt=1.0)]
-Seconds = Annotated[float, Meta(ge=0.0, le=1e6)]
-Point = tuple[float, float]
+from kantor_protocol.tables import NotNegative, Point, Positive, Probability, Seconds, Table
 
 PlannerName = Literal[
     "transport", "spectral", "frontier", "burgard", "market", "kmeans", "hungarian"
@@ -40,11 +36,7 @@ class ScenarioError(ValueError):
         super().__init__(" ".join(message.split()))
 
 
-class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A TOML table in which every key is known."""
-
-
-class Domain(_Table, frozen=True, kw_only=True):
+class Domain(Table, frozen=True, kw_only=True):
     """The rectangle that random starts are drawn from and that plots show. It is no wall.
 
     A mission with a map needs none: the map has an extent of its own.
@@ -54,7 +46,7 @@ class Domain(_Table, frozen=True, kw_only=True):
     max_m: Point
 
 
-class Map(_Table, frozen=True, kw_only=True):
+class Map(Table, frozen=True, kw_only=True):
     """The world of walls that the robots do not know and explore."""
 
     file: str | None = None
@@ -69,13 +61,13 @@ class Map(_Table, frozen=True, kw_only=True):
     """Of the layout, so that runs of many seeds share one map."""
 
 
-class Robots(_Table, frozen=True, kw_only=True):
+class Robots(Table, frozen=True, kw_only=True):
     """The team: `r1` … `rN`."""
 
     count: Annotated[int, Meta(ge=1, le=1000)]
 
 
-class Starts(_Table, frozen=True, kw_only=True):
+class Starts(Table, frozen=True, kw_only=True):
     """Where robots stand at time 0."""
 
     random: bool = False
@@ -89,7 +81,7 @@ class Starts(_Table, frozen=True, kw_only=True):
     Together, a run takes the spot number seed mod spots."""
 
 
-class Vehicle(_Table, frozen=True, kw_only=True):
+class Vehicle(Table, frozen=True, kw_only=True):
     """How a robot moves. A planner never knows."""
 
     name: VehicleName = "first-order"
@@ -105,7 +97,7 @@ class Vehicle(_Table, frozen=True, kw_only=True):
     """On a map: of its body. Robots on the way to the same target keep two radii apart; 0: points."""
 
 
-class Clock(_Table, frozen=True, kw_only=True):
+class Clock(Table, frozen=True, kw_only=True):
     """When robots step."""
 
     period_s: Annotated[float, Meta(ge=1e-6, le=1e6)] = 0.1
@@ -120,7 +112,7 @@ class Clock(_Table, frozen=True, kw_only=True):
     """Each step is late by a time drawn from [0, jitter_s]; below the period."""
 
 
-class Energy(_Table, frozen=True, kw_only=True):
+class Energy(Table, frozen=True, kw_only=True):
     """The budget, eq. 7."""
 
     points: Annotated[int, Meta(ge=0, le=2_000_000_000)] = 0
@@ -129,7 +121,7 @@ class Energy(_Table, frozen=True, kw_only=True):
     """Points that one robot may ship; by default t_e = M / n_a."""
 
 
-class Gaussian(_Table, frozen=True, kw_only=True):
+class Gaussian(Table, frozen=True, kw_only=True):
     """One component of the density."""
 
     mean_m: Point
@@ -138,7 +130,7 @@ class Gaussian(_Table, frozen=True, kw_only=True):
     weight: Positive = 1.0
 
 
-class Samples(_Table, frozen=True, kw_only=True):
+class Samples(Table, frozen=True, kw_only=True):
     """The points y_j that stand for the density."""
 
     count: Annotated[int, Meta(ge=1, le=50_000_000)] | None = None
@@ -149,7 +141,7 @@ class Samples(_Table, frozen=True, kw_only=True):
     """v of eq. 14: samples walk by up to this in x and y each period."""
 
 
-class Targets(_Table, frozen=True, kw_only=True):
+class Targets(Table, frozen=True, kw_only=True):
     """What is to be found."""
 
     count: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
@@ -160,7 +152,7 @@ class Targets(_Table, frozen=True, kw_only=True):
     """v of eq. 13: undetected targets walk by up to this each period."""
 
 
-class Sensor(_Table, frozen=True, kw_only=True):
+class Sensor(Table, frozen=True, kw_only=True):
     """A disc in which a robot detects targets; on a map also a range finder."""
 
     range_m: Positive = 15.0
@@ -172,7 +164,7 @@ class Sensor(_Table, frozen=True, kw_only=True):
     """Standard deviation of a range."""
 
 
-class Radio(_Table, frozen=True, kw_only=True):
+class Radio(Table, frozen=True, kw_only=True):
     """The channel, played by world-sim."""
 
     range_m: NotNegative = math.inf
@@ -196,7 +188,7 @@ class Radio(_Table, frozen=True, kw_only=True):
     With state one message is enough to inform whoever comes into range, as Algorithm 3 presupposes."""
 
 
-class Supervisor(_Table, frozen=True, kw_only=True):
+class Supervisor(Table, frozen=True, kw_only=True):
     """The supervisor of the centralized variant."""
 
     pose_m: Point | None = None
@@ -205,7 +197,7 @@ class Supervisor(_Table, frozen=True, kw_only=True):
     """Radio range between it and any robot."""
 
 
-class Planner(_Table, frozen=True, kw_only=True):
+class Planner(Table, frozen=True, kw_only=True):
     """How goals are chosen."""
 
     name: PlannerName = "transport"
@@ -251,7 +243,7 @@ class Planner(_Table, frozen=True, kw_only=True):
     """market: how long a seller waits for bids, or for a winner to confirm."""
 
 
-class Publish(_Table, frozen=True, kw_only=True):
+class Publish(Table, frozen=True, kw_only=True):
     """What robots tell observers on their weights key."""
 
     weights_every: Annotated[int, Meta(ge=1)] = 10
@@ -260,14 +252,14 @@ class Publish(_Table, frozen=True, kw_only=True):
     """Weights messages from one whole vector to the next."""
 
 
-class Metrics(_Table, frozen=True, kw_only=True):
+class Metrics(Table, frozen=True, kw_only=True):
     """What the record measures."""
 
     every: Annotated[int, Meta(ge=0)] = 0
     """Periods from one row to the next; 0 chooses by size, 1 for the paper's scenarios."""
 
 
-class Scenario(_Table, frozen=True, kw_only=True):
+class Scenario(Table, frozen=True, kw_only=True):
     """A mission as data."""
 
     name: Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]
@@ -297,6 +289,8 @@ class Scenario(_Table, frozen=True, kw_only=True):
     planner: Planner = Planner()
     publish: Publish = Publish()
     metrics: Metrics = Metrics()
+    faults: Annotated[tuple[AnyFault, ...], Meta(max_length=FAULTS_MAX)] = ()
+    """What goes wrong, and when; see `faults.py`. Over the bus participants are not told."""
 
     @property
     def robot_ids(self) -> tuple[ParticipantId, ...]:
@@ -391,6 +385,28 @@ def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
     return rooted(parse(text, str(path), overrides), path.parent)
 
 
+def with_chaos(scenario: Scenario, path: Path) -> Scenario:
+    """The scenario with the faults of a TOML file behind its own. Raises ScenarioError."""
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise ScenarioError(f"{path}: no such file of faults") from None
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error}") from None
+    except (ValueError, RecursionError) as error:
+        raise ScenarioError(f"{path}: not valid TOML: {error}") from None
+    try:
+        chaos = msgspec.convert(tree, Chaos)
+    except msgspec.ValidationError as error:
+        raise ScenarioError(f"{path}: {_readable(str(error), tree, Chaos)}") from None
+    faults = (*scenario.faults, *chaos.faults)
+    if len(faults) > FAULTS_MAX:
+        raise ScenarioError(f"{path}: faults: with the scenario's own more than {FAULTS_MAX}")
+    for complaint in (*_not_finite(to_tree(chaos)), *_complaints_of_faults(chaos.faults, scenario)):
+        raise ScenarioError(f"{path}: {complaint}")
+    return msgspec.structs.replace(scenario, faults=faults)
+
+
 def rooted(scenario: Scenario, folder: Path) -> Scenario:
     """The scenario with its relative file names turned into absolute ones below `folder`.
 
@@ -419,14 +435,14 @@ def from_tree(tree: dict[str, Any], origin: str) -> Scenario:
     try:
         scenario = msgspec.convert(tree, Scenario)
     except msgspec.ValidationError as error:
-        raise ScenarioError(f"{origin}: {_readable(str(error))}") from None
+        raise ScenarioError(f"{origin}: {_readable(str(error), tree)}") from None
     for complaint in _complaints(scenario):
         raise ScenarioError(f"{origin}: {complaint}")
     return scenario
 
 
-def to_tree(scenario: Scenario) -> dict[str, Any]:
-    """The scenario as plain tables, without what is not set."""
+def to_tree(scenario: Table) -> dict[str, Any]:
+    """A scenario, or another table, as plain ones, without what is not set."""
 
     def without_none(value: Any) -> Any:
         if isinstance(value, dict):
@@ -455,13 +471,14 @@ def to_toml(scenario: Scenario) -> str:
         return [f"{key} = {literal(value)}" for key, value in table.items()]
 
     tree = to_tree(scenario)
-    flat = {k: v for k, v in tree.items() if not isinstance(v, dict) and k != "density"}
-    lines = body(flat)
+    rows = {key: tree.pop(key) for key in ("density", "faults")}
+    lines = body({k: v for k, v in tree.items() if not isinstance(v, dict)})
     for key, table in tree.items():
         if isinstance(table, dict) and table:
             lines += ["", f"[{key}]", *body(table)]
-    for component in tree.get("density", []):
-        lines += ["", "[[density]]", *body(component)]
+    for key, tables in rows.items():
+        for table in tables:
+            lines += ["", f"[[{key}]]", *body(table)]
     return "\n".join(lines) + "\n"
 
 
@@ -474,7 +491,7 @@ def _override(tree: dict[str, Any], override: str) -> None:
         value = tomllib.loads(f"value = {text}")["value"]
     except (ValueError, RecursionError):
         value = text.strip()
-    if isinstance(value, str) and "name" in _KNOWN.get(".".join(path), ()):
+    if isinstance(value, str) and ".".join(path) in _NAMED:
         path.append("name")  # planner=spectral says which planner
     table = tree
     for i, part in enumerate(path[:-1]):
@@ -489,59 +506,63 @@ _MAP_LIMIT_PERIODS = 20_000
 _PERIODS_UNDER_WAY = 1000
 """Robots remember what they sent for as long as an answer may take."""
 
-_KNOWN: dict[str, tuple[str, ...]] = {
-    "": Scenario.__struct_fields__,
-    "domain": Domain.__struct_fields__,
-    "map": Map.__struct_fields__,
-    "robots": Robots.__struct_fields__,
-    "starts": Starts.__struct_fields__,
-    "vehicle": Vehicle.__struct_fields__,
-    "clock": Clock.__struct_fields__,
-    "energy": Energy.__struct_fields__,
-    "density": Gaussian.__struct_fields__,
-    "samples": Samples.__struct_fields__,
-    "targets": Targets.__struct_fields__,
-    "sensor": Sensor.__struct_fields__,
-    "radio": Radio.__struct_fields__,
-    "supervisor": Supervisor.__struct_fields__,
-    "planner": Planner.__struct_fields__,
-    "publish": Publish.__struct_fields__,
-    "metrics": Metrics.__struct_fields__,
-}
+_NAMED = frozenset({"planner", "vehicle"})
+"""Tables that a name may stand for."""
 
 
-def _readable(message: str) -> str:
-    """Msgspec's complaint with the key first and, for an unknown key, the nearest known one."""
+def _readable(message: str, tree: Any, whole: type[Table] = Scenario) -> str:
+    """Msgspec's complaint with the key first and, for an unknown key, the nearest known one.
+
+    tree: what msgspec was to make a `whole` of.
+    """
     problem, _, place = message.partition(" - at ")
     place = place.strip("`").removeprefix("$").removeprefix(".")
-    table = re.sub(r"\[.*?\]", "", place)
     for kind in ("unknown", "missing required"):
         if found := re.match(rf"Object (?:contains|{kind}) (?:unknown )?field `(.+)`", problem):
             key = f"{place}.{found[1]}".lstrip(".")
             if "missing" in problem:
-                return f"{key}: missing; set it"
-            near = difflib.get_close_matches(found[1], _KNOWN.get(table, ()), 1)
-            known = f"did you mean {near[0]}?" if near else f"known: {', '.join(_KNOWN[table])}"
+                known = f"; known: {', '.join(sorted(KINDS))}" if found[1] == "kind" else ""
+                return f"{key}: missing; set it{known}"
+            fields = _table_at(place, tree, whole).__struct_fields__
+            near = difflib.get_close_matches(found[1], fields, 1)
+            known = f"did you mean {near[0]}?" if near else f"known: {', '.join(fields)}"
             return f"{key}: no such key; {known}"
-    if problem.startswith("Invalid enum value"):
-        return f"{place}: {problem.removeprefix('Invalid enum value ')} is not known; known: {_choices(place)}"
+    if found := re.match("Invalid (?:enum )?value ('.*')$", problem, re.DOTALL):
+        return f"{place}: {found[1]} is not known; known: {_choices(place, tree, whole)}"
     return f"{place}: {problem[0].lower()}{problem[1:]}" if place else problem
 
 
-def _choices(place: str) -> str:
+def _table_at(place: str, tree: Any, whole: type[Table]) -> type[Table]:
+    """What kind of table a place such as `radio` or `faults[2]` is."""
+    kind: Any = whole
+    if fault := re.match(r"faults\[(\d+)\]", place):
+        return KINDS[tree["faults"][int(fault[1])]["kind"]]
+    for part in filter(None, re.sub(r"\[.*?\]", "", place).split(".")):
+        kind = _plain(get_type_hints(kind)[part])
+    table: type[Table] = kind
+    return table
+
+
+def _choices(place: str, tree: Any, whole: type[Table]) -> str:
     """The names that a key may be set to."""
-    kind: Any = Scenario
-    for part in place.split("."):
-        kind = get_type_hints(kind)[part]
-        if get_origin(kind) in (Union, UnionType):  # a table, or a name, that need not be there
-            kind = get_args(kind)[0]
-    return ", ".join(get_args(kind))
+    table, _, key = place.rpartition(".")
+    if key == "kind":
+        return ", ".join(sorted(KINDS))
+    return ", ".join(get_args(_plain(get_type_hints(_table_at(table, tree, whole))[key])))
+
+
+def _plain(kind: Any) -> Any:
+    """A type without what makes it optional, or many."""
+    if get_origin(kind) in {Union, UnionType, tuple}:
+        return get_args(kind)[0]
+    return kind
 
 
 def _complaints(scenario: Scenario) -> Iterable[str]:
     """What types alone cannot say. The first one is reported."""
     yield from _not_finite(to_tree(scenario))
     yield from _complaints_of_map(scenario) if scenario.map else _complaints_of_density(scenario)
+    yield from _complaints_of_faults(scenario.faults, scenario)
     for key, name in (("samples", scenario.samples.file), ("targets", scenario.targets.file)):
         if name is not None and Path(name).suffix.lower() not in POINT_FILES | IMAGE_FILES:
             known = ", ".join(sorted(POINT_FILES | IMAGE_FILES))
@@ -552,6 +573,12 @@ def _complaints(scenario: Scenario) -> Iterable[str]:
         yield f"clock.jitter_s: must be below the shortest period after spread and drift, {shortest_s:g} s"
     if scenario.radio.delay_s + scenario.radio.jitter_s > _PERIODS_UNDER_WAY * shortest_s:
         yield f"radio.delay_s: with the jitter over {_PERIODS_UNDER_WAY} periods; make it shorter"
+
+
+def _complaints_of_faults(faults: Iterable[Fault], scenario: Scenario) -> Iterable[str]:
+    for i, fault in enumerate(faults):
+        for complaint in fault.complaints(scenario):
+            yield f"faults[{i}].{complaint}"
 
 
 def _complaints_of_density(scenario: Scenario) -> Iterable[str]:

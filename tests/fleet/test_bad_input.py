@@ -122,6 +122,16 @@ def test_a_mission_on_a_density_needs_another_planner(kantor: "Kantor") -> None:
     assert "planner.name: burgard explores a map; add a [map]" in line
 
 
+def test_faults_that_cannot_apply_are_refused(kantor: "Kantor") -> None:
+    """The file and the entry are named."""
+    storm = kantor.folder / "storm.toml"
+    storm.write_text("[[faults]]\nkind = 'drop'\nprobability = 1\nrobots = ['r9']\n")
+    code, line = refused(kantor, "run", "fleet", "--chaos", storm)
+
+    assert code == 2
+    assert line == f"kantor: {storm}: faults[0].robots: r9 is not in the team; known: r1 to r5"
+
+
 def test_an_override_without_a_value_is_refused(kantor: "Kantor") -> None:
     """`--set` wants key=value."""
     assert refused(kantor, "run", "fleet", "--set", "radio") == (

@@ -52,6 +52,43 @@ def test_a_run_leaves_its_folder(kantor: "Kantor") -> None:
     assert str(result["digest"]) in finished.out
 
 
+STORM = """
+[[faults]]
+kind = "burst"
+good_s = 1.0
+bad_s = 0.5
+
+[[faults]]
+kind = "partition"
+shape = "halves"
+from_s = 1.0
+until_s = 3.0
+"""
+
+
+def test_a_run_under_faults_tells_what_they_did(kantor: "Kantor") -> None:
+    """Those of the scenario and those of the file; the record holds them, so that it verifies."""
+    (kantor.folder / "storm.toml").write_text(STORM)
+    own = (
+        "--set",
+        "faults=[{kind='drop', probability=0.1}, {kind='clog', from_s=4, until_s=4.01}]",
+    )
+    wide = ("limit_s=5", "radio.range_m=inf")
+    finished = in_process(kantor, "fleet", "--chaos", "storm.toml", *own, *wide)
+
+    (folder,) = kantor.runs()
+    result = result_of(folder)
+    told = result["faults"]
+    assert isinstance(told, dict)
+    assert list(told) == ["0 drop", "1 clog", "2 burst", "3 partition"]
+    assert told["3 partition"]["dropped"] > 100
+    assert result["violations"] == 0
+    assert f"fault 0 drop           {told['0 drop']['dropped']} dropped" in finished.out
+    assert kantor("verify", folder).code == 0
+    again = in_process(kantor, folder / "scenario.toml")
+    assert str(result["digest"]) in again.out
+
+
 def test_a_run_on_a_map_leaves_its_folder(kantor: "Kantor") -> None:
     """The same files; what was explored in place of the mass; and it verifies."""
     small = ("--set", "map.size_m=[16, 16]", "robots.count=2", "starts.spots=0")

@@ -61,6 +61,17 @@ def wait_until(condition: Callable[[], bool]) -> None:
 # Plans
 
 
+def test_a_file_of_faults_is_added_to_every_variant(tmp_path: Path) -> None:
+    """It makes other runs of them."""
+    storm = tmp_path / "storm.toml"
+    storm.write_text("[[faults]]\nkind = 'drop'\nprobability = 0.5\n")
+    calm = plan("fleet", ["planner.horizon=1,2"], "0")
+    rough = plan("fleet", ["planner.horizon=1,2"], "0", (), storm)
+
+    assert [len(variant.scenario.faults) for variant in rough.variants] == [1, 1]
+    assert len({v.digest for v in (*calm.variants, *rough.variants)}) == 4
+
+
 def test_a_plan_is_the_product_of_its_values_with_the_same_seeds() -> None:
     """The last key is the fastest; seeds are walked through together, so that pairs come early."""
     made = plan("fleet", ["radio.range_m=50,100", "planner.horizon=1,2"], "4,0:2")

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kantor_protocol.faults import AnyFault, Partition, Range
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, Pose
 from kantor_protocol.messages import News, decode_news, encode
 from kantor_protocol.modes import VISIT
@@ -286,6 +287,84 @@ def _range_was_shorter_than_the_radio(records: Records) -> list[Record]:
 @breaks("range", run=("coordination=centralized",))
 def _supervisors_range_was_shorter(records: Records) -> list[Record]:
     return with_scenario(records, supervisor={"range_m": 5.0})
+
+
+SHRUNK = ("faults=[{kind = 'range', range_m = 75.0, until_s = 0.15}]",)
+HALVES = ("faults=[{kind = 'partition', shape = 'halves', until_s = 0.15}]",)
+FLAPPING = ("faults=[{kind = 'partition', shape = 'halves', flap_s = 0.2}]",)
+MUTE = ("faults=[{kind = 'one-way', senders = ['r1'], receivers = ['r3']}]",)
+
+
+def under(records: Records, *faults: AnyFault) -> list[Record]:
+    """The records with other faults in the opening."""
+    first = opening(records)
+    scenario = msgspec.structs.replace(first.scenario, faults=faults)
+    return put(records, first, msgspec.structs.replace(first, scenario=scenario))
+
+
+def revived(records: Records) -> list[Record]:
+    """The records with one drop, the first, as a delivery."""
+    batch = next(b for b in batches(records) if any(v.due_ns == DROPPED for v in b.verdicts))
+    lost = next(v for v in batch.verdicts if v.due_ns == DROPPED)
+    found = msgspec.structs.replace(lost, due_ns=batch.now_ns)
+    told = tuple(found if verdict is lost else verdict for verdict in batch.verdicts)
+    return put(records, batch, msgspec.structs.replace(batch, verdicts=told))
+
+
+@breaks("range", run=SHRUNK)
+def _delivered_beyond_the_shrunk_range(records: Records) -> list[Record]:
+    first = batches(records)[0]
+    return add_verdict(records, first, Verdict("r1", 1, "r2", first.now_ns))
+
+
+@breaks("range")
+def _range_was_to_shrink(records: Records) -> list[Record]:
+    return under(records, Range(range_m=50.0, from_s=0.5))
+
+
+@breaks("range", run=("coordination=centralized", "supervisor.range_m=100"))
+def _supervisors_range_was_to_shrink(records: Records) -> list[Record]:
+    return under(records, Range(factor=0.25, robots=("r2",)))
+
+
+@breaks("cut", run=HALVES)
+def _delivered_across_a_partition(records: Records) -> list[Record]:
+    return revived(records)
+
+
+@breaks("cut", run=FLAPPING)
+def _delivered_across_a_partition_that_flaps(records: Records) -> list[Record]:
+    return revived(records)
+
+
+@breaks("cut", run=MUTE)
+def _delivered_against_a_one_way_link(records: Records) -> list[Record]:
+    return revived(records)
+
+
+@breaks("cut", run=HALVES)
+def _partition_was_to_last_longer(records: Records) -> list[Record]:
+    return under(records, Partition(shape="halves", until_s=0.25))
+
+
+@breaks("cut")
+def _replayed_across_a_partition(records: Records) -> list[Record]:
+    fifth = batches(records)[4]
+    cut = Partition(shape="isolate", robots=("r3",), from_s=0.45, until_s=0.55)
+    apart = msgspec.structs.replace(
+        fifth, verdicts=tuple(v for v in fifth.verdicts if "r3" not in (v.source, v.target))
+    )
+    deaf = put(records, fifth, apart)
+    sixth = batches(deaf)[5]
+    told = tuple(put_heard(act, apart) for act in sixth.acts)
+    deaf = put(deaf, sixth, msgspec.structs.replace(sixth, acts=told))
+    return add_verdict(under(deaf, cut), apart, Verdict("r1", 2, "r3", apart.now_ns))
+
+
+def put_heard(act: Act, batch: Batch) -> Act:
+    """The act without what a batch did not deliver to it."""
+    told = {(v.source, v.sequence) for v in batch.verdicts if v.target == act.name}
+    return msgspec.structs.replace(act, heard=tuple(ref for ref in act.heard if ref in told))
 
 
 @breaks("delivery", run=DEAF)

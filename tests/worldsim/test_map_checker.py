@@ -299,6 +299,10 @@ BROKEN: dict[str, tuple[tuple[str, ...], Callable[[Records], list[Record]]]] = {
     "union-too-much": ((), _forwards_too_much),
     "sight-line": (RADIOS["everywhere"], _minds_walls("radio.line_of_sight=true")),
     "sight-loss": (RADIOS["everywhere"], _minds_walls("radio.wall_loss_m=95")),
+    "sight-shrunk": (
+        RADIOS["everywhere"],
+        _minds_walls("radio.wall_loss_m=9", "faults=[{kind = 'range', range_m = 20.0}]"),
+    ),
     "finish": ((), _gives_up),
 }
 

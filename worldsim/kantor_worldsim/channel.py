@@ -6,7 +6,7 @@ nothing that happened before, so one more message or one more robot changes no o
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from kantor_protocol.scenario import Radio, Scenario
 from kantor_worldsim.maps import Ground
 from kantor_worldsim.sensors import walls_between
 
-_LINK_WIDTH = 4096
+LINK_WIDTH = 4096
 """Links are numbered source * width + target; the roster is smaller, the supervisor comes last."""
 DROPPED = -1
 
@@ -46,6 +46,19 @@ class Sent(NamedTuple):
 
     now_ns: int
     envelope: Envelope
+
+
+Ruled = tuple[int, int, int]
+"""Receiver (place in the roster), row of what is sent, due_ns or DROPPED."""
+
+Reaches = Callable[[int, int, float], bool]
+"""Whether one participant hears another (places in the roster) if their range were so many metres."""
+
+Interference = Callable[
+    [Sequence[Sent], Iterable[Ruled], Reaches], tuple[Sequence[Sent], Iterable[Ruled], int]
+]
+"""Rules on what the radio has ruled: what is on the air then, which may be more than was sent, the verdicts
+on that, and how many receivers are no longer in range."""
 
 
 class _Law(NamedTuple):
@@ -194,9 +207,9 @@ def _transmit(
             if not _in_range(*walls, xy_m, source, other, range_m, through):
                 out_of_range += 1
                 continue
-            here = _LINK_WIDTH - 1 if source == supervisor else source
-            there = _LINK_WIDTH - 1 if other == supervisor else other
-            link = here * _LINK_WIDTH + there
+            here = LINK_WIDTH - 1 if source == supervisor else source
+            there = LINK_WIDTH - 1 if other == supervisor else other
+            link = here * LINK_WIDTH + there
             copies = 1
             if law.duplicate > 0.0:
                 draw = uniform(law.seed, Purpose.DUPLICATE.value, link, sequence, 0)
@@ -218,8 +231,15 @@ def _transmit(
 class Channel:
     """Rules on transmissions and holds what is under way."""
 
-    def __init__(self, scenario: Scenario, seed: int, ground: Ground | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        ground: Ground | None = None,
+        interference: Interference | None = None,
+    ) -> None:
         radio = scenario.radio
+        self._interference = interference
         self._walls = Walls.of(radio, ground)
         self._roster = scenario.roster
         self._places = {name: i for i, name in enumerate(scenario.roster)}
@@ -277,14 +297,22 @@ class Channel:
             self._supervisor,
             self._ruled,
         )
+        ruled: Iterable[Ruled] = _RULED.iter_unpack(self._ruled_bytes[: _RULED.size * count])
+        if self._interference is not None:
+            sent, ruled, lost = self._interference(sent, ruled, self._reaches)
+            out_of_range += lost
         verdicts = []
-        for to, row, due_ns in _RULED.iter_unpack(self._ruled_bytes[: _RULED.size * count]):
-            envelope, target = sent[row].envelope, self._roster[to]
-            source, sequence = envelope.source, envelope.sequence
-            verdicts.append(Verdict(source, sequence, target, due_ns))
+        for to, row, due_ns in ruled:
+            envelope, receiver = sent[row].envelope, self._roster[to]
+            speaker, sequence = envelope.source, envelope.sequence
+            verdicts.append(Verdict(speaker, sequence, receiver, due_ns))
             if due_ns != DROPPED:
-                self._under_way[target].append((due_ns, places[source], sequence, envelope))
+                self._under_way[receiver].append((due_ns, places[speaker], sequence, envelope))
         return verdicts, out_of_range
+
+    def _reaches(self, one: int, other: int, range_m: float) -> bool:
+        through = self._supervisor in {one, other} and not self._law.supervisor_stands
+        return bool(_in_range(*self._walls, self._xy_m, one, other, range_m, through))
 
     def take(self, name: ParticipantId, now_ns: int) -> tuple[Envelope, ...]:
         """What has arrived at a participant by now, in order of (arrival, source, sequence)."""

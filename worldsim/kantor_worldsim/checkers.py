@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -25,6 +26,7 @@ from kantor_protocol.weights import WeightsSubscriber
 from kantor_worldsim import reading as of
 from kantor_worldsim.channel import DROPPED
 from kantor_worldsim.exact import ROUNDING
+from kantor_worldsim.faults import LinkFaults
 from kantor_worldsim.map_checker import MapRules
 from kantor_worldsim.metrics import Row
 from kantor_worldsim.reading import Reader, Reading
@@ -541,7 +543,9 @@ class Checker:
 
     Rules
     -----
-    range       no envelope is delivered to anybody beyond the range at the time of sending
+    range       no envelope is delivered to anybody beyond the range at the time of sending, nor beyond
+                what a fault leaves of it
+    cut         nothing is delivered over a link that a partition or a one-way fault cuts at that time
     delivery    what is in an inbox was delivered to it, is due, and came as often as ruled
     weights     no entry of a weight vector ever rises or is negative, and what is published on the
                 weights key rebuilds exactly this vector
@@ -610,6 +614,7 @@ class Checker:
         names = scenario.roster
         self._places = {name: i for i, name in enumerate(names)}
         self._subscriber = WeightsSubscriber()
+        self._faults = LinkFaults.of(scenario, opening.seed)
         self._law = Law(
             sample_units=self._units.sample,
             point_units=self._units.point,
@@ -654,6 +659,8 @@ class Checker:
         if batch.now_ns < self._now_ns:
             self._complain("order", "record", f"time runs back to {batch.now_ns * 1e-9:.3f} s")
         self._now_ns = batch.now_ns
+        if self._faults is not None:
+            self._check_links(batch, self._faults)
         reading = self._reader.read(batch)
         noted = _check(*reading, *self._arguments, batch.now_ns)
         while noted < 0:
@@ -667,6 +674,21 @@ class Checker:
         if self._map_rules is not None:
             unsaid = self._map_rules.check(batch)
             self.count += unsaid
+
+    def _check_links(self, batch: Batch, faults: LinkFaults) -> None:
+        """By the places that everybody had at the time of sending, before the batch moves them."""
+        for source, sequence, target, due_ns in map(msgspec.structs.astuple, batch.verdicts):
+            here, there = self._places.get(source), self._places.get(target)
+            if due_ns == DROPPED or here is None or there is None:
+                continue
+            if faults.cuts(batch.now_ns, source, target):
+                self._complain("cut", target, f"{source}#{sequence} over a link that is cut")
+            reach_m = faults.reach_m(batch.now_ns, source, target)
+            dx, dy = (self._state.poses_m[there] - self._state.poses_m[here]).tolist()
+            if not dx * dx + dy * dy <= reach_m * reach_m:
+                way_m = math.hypot(dx, dy)
+                what = f"{source}#{sequence} over {way_m:.6g} m, a fault leaves {reach_m:.6g} m"
+                self._complain("range", target, what)
 
     def _lengthen(self, name: str) -> None:
         """Double one of the arrays that grow with the run."""

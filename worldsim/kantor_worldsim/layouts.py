@@ -14,7 +14,8 @@ import numpy as np
 
 from kantor_protocol.grid import CELLS_MAX, FREE, OCCUPIED, Frame
 from kantor_protocol.keyed import Purpose, generator
-from kantor_protocol.scenario import Point, ScenarioError
+from kantor_protocol.scenario import ScenarioError
+from kantor_protocol.tables import Point
 from kantor_worldsim.maps import RESOLUTION_MAX_M, RESOLUTION_MIN_M, Cells, Ground, parts
 
 

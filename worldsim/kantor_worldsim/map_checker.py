@@ -11,6 +11,7 @@ from kantor_protocol.grid import FREE, NOWHERE, free_way
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
 from kantor_worldsim import survey as found
 from kantor_worldsim.channel import DROPPED, Verdict
+from kantor_worldsim.faults import LinkFaults
 from kantor_worldsim.records import Act, Batch, Opening
 from kantor_worldsim.sensors import walls_between
 from kantor_worldsim.survey import NEVER, Survey
@@ -63,7 +64,7 @@ class MapRules:
         supervisor = opening.scenario.supervisor
         if supervisor.pose_m is not None:
             self._senders_m[SUPERVISOR] = supervisor.pose_m
-        self._supervisor_range_m = supervisor.range_m
+        self._faults = LinkFaults(opening.scenario, opening.seed)
         self._finished: set[ParticipantId] = set()
         for name in self._poses_m:
             if not self._is_free(name):
@@ -73,7 +74,7 @@ class MapRules:
         """Follow one batch; how many faults went without a complaint, since there are too many."""
         if self._radio.line_of_sight or self._radio.wall_loss_m > 0.0:
             for verdict in batch.verdicts:
-                self._check_sight(verdict)
+                self._check_sight(batch.now_ns, verdict)
         self._survey.take(batch)
         faults, count = self._survey.faults
         for fault, row, _, a, b in faults.tolist():
@@ -90,7 +91,7 @@ class MapRules:
         kind = "occupied" if b else "free"
         self._complain(rule, batch.acts[row].name, text.format(a=a, b=b, origin=origin, kind=kind))
 
-    def _check_sight(self, verdict: Verdict) -> None:
+    def _check_sight(self, now_ns: int, verdict: Verdict) -> None:
         """From where both were before anybody moved; range alone is a rule of every run."""
         if verdict.due_ns == DROPPED:
             return
@@ -98,8 +99,7 @@ class MapRules:
         if here is None or there is None:
             return
         walls = walls_between(self._survey.ground.cells, *self._uv(here), *self._uv(there))
-        by_supervisor = SUPERVISOR in (verdict.source, verdict.target)
-        range_m = self._supervisor_range_m if by_supervisor else self._radio.range_m
+        range_m = self._faults.reach_m(now_ns, verdict.source, verdict.target)
         hidden = self._radio.line_of_sight and walls > 0
         if hidden or not math.dist(here, there) <= range_m - walls * self._radio.wall_loss_m:
             heard = f"{verdict.source}#{verdict.sequence}"

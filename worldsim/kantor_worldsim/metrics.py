@@ -24,12 +24,14 @@ about: every shipped point where it was shipped, what is left shared evenly by t
 """
 
 import math
+from collections import Counter
 from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from kantor_protocol.faults import kind_of
 from kantor_protocol.kernels import kernel, sum_kernel
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import ParticipantId, State
@@ -149,6 +151,19 @@ class MapResult(msgspec.Struct, frozen=True, kw_only=True):
     epv_mean: ByRegions
 
 
+class FaultCounts(msgspec.Struct, frozen=True, kw_only=True):
+    """What one fault of the scenario did, in copies of messages; all 0 says that it never struck."""
+
+    dropped: int = 0
+    """For receivers that the radio alone would have let hear; one that several faults drop counts for each."""
+    delayed: int = 0
+    doubled: int = 0
+    replayed: int = 0
+
+
+_DEEDS = FaultCounts.__struct_fields__
+
+
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """result.json. The names are stable."""
 
@@ -189,6 +204,8 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     """What the checker found, at most the first ten."""
     digest: str
     wall_s: float
+    faults: dict[str, FaultCounts] = {}
+    """By place in the scenario's list and kind, such as `0 partition`."""
     map: MapResult | None = None
     """Of a mission that explores a map; bounds, energy and mass then say nothing but mass_left, the share
     of cells that nobody has seen."""
@@ -477,6 +494,7 @@ class Following:
         self._tally.standing[:, 2] = _NEVER
         self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
         self._out_of_range = self._absences = 0
+        self._tolls = Counter[tuple[int, str]]()
         self._ending = Ending(0, "cut")
         self._tick = 0
         for name, found in opening.first_look.items():
@@ -493,6 +511,9 @@ class Following:
         self._walk.advance(batch.now_ns)
         self._out_of_range += batch.out_of_range
         self._absences += len(batch.absent)
+        for toll in batch.tolls:
+            for deed in _DEEDS:
+                self._tolls[toll.fault, deed] += getattr(toll, deed)
         reading = self._reader.read(batch)
         if _follow(*reading, *self._arguments):
             self._note_finds(batch)
@@ -605,6 +626,10 @@ class Following:
             complaints=complaints[:10],
             digest=digest,
             wall_s=wall_s,
+            faults={
+                f"{i} {kind_of(fault)}": FaultCounts(**{d: self._tolls[i, d] for d in _DEEDS})
+                for i, fault in enumerate(scenario.faults)
+            },
             **self._measured(),
         )
 

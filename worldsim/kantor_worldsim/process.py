@@ -4,6 +4,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
+import msgspec
+
 from kantor_protocol.bus import Heard, Host, Joined, Left
 from kantor_protocol.machine import Inputs, Observation, Outputs, ParticipantId
 from kantor_protocol.messages import (
@@ -174,7 +176,7 @@ class _Doorway:
         mission = Mission(
             VERSION,
             event.nonce,
-            plan.scenario,
+            msgspec.structs.replace(plan.scenario, faults=()),  # nobody knows what is to come
             plan.seed,
             self._starts,
             self._samples,

@@ -13,6 +13,7 @@ from kantor_protocol.messages import Array, RefusedError
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.weights import Units
 from kantor_worldsim.channel import Verdict
+from kantor_worldsim.faults import Toll
 from kantor_worldsim.maps import Ground
 from kantor_worldsim.world import Found, Ruling, Site, units_of
 
@@ -83,6 +84,8 @@ class Batch(msgspec.Struct, frozen=True, array_like=True, tag="batch"):
     """Receivers that an envelope did not reach for range."""
     absent: tuple[ParticipantId, ...] = ()
     """Participants that were due and gave no outputs."""
+    tolls: tuple[Toll, ...] = ()
+    """What the scenario's faults had to do with the verdicts."""
 
 
 class Ending(msgspec.Struct, frozen=True, array_like=True, tag="ending"):

@@ -10,6 +10,7 @@ from kantor_protocol.machine import Inputs, Outputs, ParticipantId, State
 from kantor_protocol.messages import RefusedError, check_outputs
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.channel import Channel, Sent, Verdict
+from kantor_worldsim.faults import LinkFaults
 from kantor_worldsim.records import Act, Batch, Ending, Record, opening_of
 from kantor_worldsim.world import Site, World
 
@@ -34,7 +35,10 @@ class Stage:
         self.scenario = scenario
         self.now_ns = 0
         self.limit_ns = scenario.limit_ns
-        self.channel = Channel(scenario, seed, site.ground)
+        self._faults = LinkFaults.of(scenario, seed)
+        self.channel = Channel(
+            scenario, seed, site.ground, self._faults.rule if self._faults else None
+        )
         self._robots = frozenset(scenario.robot_ids)
         self._world = World(scenario, seed, site)
         self._listeners = tuple(listeners)
@@ -79,7 +83,8 @@ class Stage:
         verdicts = tuple(ruled)
         acts = tuple([self._act(name, inputs, outputs) for name, inputs, outputs in sound])
         absent = tuple([act.name for act in acts if act.outputs is None])
-        self._tell(Batch(now_ns, acts, verdicts, out_of_range, absent))
+        tolls = self._faults.take_tolls() if self._faults else ()
+        self._tell(Batch(now_ns, acts, verdicts, out_of_range, absent, tolls))
         return verdicts
 
     def end(self, reason: str) -> None:

@@ -12,7 +12,8 @@ import numpy.typing as npt
 
 from kantor_protocol.grid import FREE, NOWHERE, OCCUPIED
 from kantor_protocol.keyed import Purpose, generator
-from kantor_protocol.scenario import Point, ScenarioError
+from kantor_protocol.scenario import ScenarioError
+from kantor_protocol.tables import Point
 from kantor_worldsim.maps import Ground, parts
 
 Spread = Literal["together", "separate"]

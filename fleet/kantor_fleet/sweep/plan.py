@@ -79,13 +79,14 @@ def plan(
     vary: Sequence[str],
     seeds: str,
     overrides: Sequence[str] = (),
+    chaos: Path | None = None,
     *,
     exact: bool = False,
 ) -> Plan:
     """A sweep in which every variant is known to be a scenario.
 
     scenario: as `catalog.find` takes it. vary: each `key.sub=value,value`. seeds: see `parse_seeds`.
-    overrides: for all variants alike. Raises ScenarioError.
+    overrides: for all variants alike. chaos: a file of faults, for all as well. Raises ScenarioError.
     """
     varied = dict(_axis(text) for text in vary)
     keys = [text.partition("=")[0].strip() for text in vary]
@@ -96,7 +97,7 @@ def plan(
         if override.partition("=")[0].strip() in varied:
             raise SweepError(f"--set {override}: it is varied as well; drop one of the two")
     variants = [
-        _variant(scenario, overrides, dict(zip(varied, texts, strict=True)))
+        _variant(scenario, overrides, chaos, dict(zip(varied, texts, strict=True)))
         for texts in itertools.product(*varied.values())
     ]
     _refuse_twins(variants, tuple(varied))
@@ -153,10 +154,12 @@ def _split(values: str) -> list[str]:
     return [part.strip() for part in parts]
 
 
-def _variant(scenario: str, overrides: Sequence[str], texts: dict[str, str]) -> Variant:
+def _variant(
+    scenario: str, overrides: Sequence[str], chaos: Path | None, texts: dict[str, str]
+) -> Variant:
     settings = [f"{key}={text}" for key, text in texts.items()]
     try:
-        resolved = find(scenario, [*overrides, *settings])
+        resolved = find(scenario, [*overrides, *settings], chaos)
         digest = _digest(resolved)
     except ScenarioError as error:
         place = f"{' '.join(settings)}: " if settings else ""

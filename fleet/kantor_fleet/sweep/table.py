@@ -8,7 +8,7 @@ import io
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import NoneType
-from typing import Any, NamedTuple, get_args, get_type_hints
+from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -39,8 +39,13 @@ def finished(plan: Plan, outcomes: Mapping[Key, Outcome]) -> list[Run]:
 
 
 def _leaves(kind: type[msgspec.Struct], before: str = "") -> Iterator[tuple[str, type]]:
-    """Names and types of a result, those of what is in it with its name before theirs."""
+    """Names and types of a result, those of what is in it with its name before theirs.
+
+    Mappings are left out: what is in them differs from variant to variant.
+    """
     for name, hint in get_type_hints(kind).items():
+        if get_origin(hint) is dict:
+            continue
         (plain,) = set(get_args(hint) or (hint,)) - {NoneType, ...}
         if issubclass(plain, msgspec.Struct):
             yield from _leaves(plain, f"{before}{name}_")

@@ -1,0 +1,372 @@
+"""Faults as data: read, written, and refused in one line when they cannot apply."""
+
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from grounds import exploration
+from kantor_protocol.faults import KINDS, OneWay, Partition
+from kantor_protocol.scenario import (
+    Scenario,
+    ScenarioError,
+    from_tree,
+    parse,
+    to_toml,
+    to_tree,
+    with_chaos,
+)
+from strategies import SMALL, TOML_KEYS, TOML_VALUES, examples, mission, paths_of, planted
+
+EVERY_KIND = """
+[[faults]]
+kind = "drop"
+probability = 0.25
+robots = ["r1"]
+
+[[faults]]
+kind = "burst"
+from_s = 1
+until_s = 9.5
+good_s = 2.0
+bad_s = 0.5
+drop_bad = 0.9
+
+[[faults]]
+kind = "delay"
+delay_s = 0.2
+jitter_s = 0.1
+
+[[faults]]
+kind = "duplicate"
+probability = 1.0
+copies = 3
+
+[[faults]]
+kind = "replay"
+probability = 0.5
+age_s = 3.0
+
+[[faults]]
+kind = "reorder"
+probability = 0.5
+hold_s = 1.0
+
+[[faults]]
+kind = "one-way"
+senders = ["r1"]
+receivers = ["r2", "r3"]
+
+[[faults]]
+kind = "partition"
+shape = "groups"
+groups = [["r1"], ["r2", "r3"]]
+flap_s = 1.5
+
+[[faults]]
+kind = "clog"
+until_s = 4.0
+
+[[faults]]
+kind = "bandwidth"
+bytes_per_s = 1000.0
+queue_bytes = 0
+
+[[faults]]
+kind = "range"
+range_m = 12.0
+"""
+
+
+def refusal(text: str, *overrides: str) -> str:
+    """What is said of a scenario with such faults: one line that begins with the place."""
+    with pytest.raises(ScenarioError) as caught:
+        parse(SMALL + text, "small", overrides)
+    message = str(caught.value)
+    assert len(message.splitlines()) == 1
+    return message.removeprefix("small: ")
+
+
+def fault(**values: Any) -> str:
+    """One fault as `--set` takes it."""
+    pairs = ", ".join(f"{key} = {value!r}" for key, value in values.items())
+    return f"faults=[{{{pairs}}}]"
+
+
+def test_every_kind_is_read_and_written() -> None:
+    scenario = parse(SMALL + EVERY_KIND, "small")
+
+    assert {type(each) for each in scenario.faults} == set(KINDS.values())
+    assert parse(to_toml(scenario), "written") == scenario
+    assert from_tree(to_tree(scenario), "tree") == scenario
+
+
+def test_windows_are_in_nanoseconds_and_open_by_default() -> None:
+    burst, drop = parse(SMALL + EVERY_KIND, "small").faults[1::-1]
+
+    assert (burst.from_ns, burst.until_ns) == (1_000_000_000, 9_500_000_000)
+    assert (drop.from_ns, drop.until_ns) == (0, None)
+
+
+def test_faults_can_be_set() -> None:
+    """A list in TOML, as for every other key."""
+    assert mission(fault(kind="drop", probability=1)).faults[0].until_s is None
+    assert mission(fault(kind="drop", probability=1), "faults=[]").faults == ()
+
+
+REFUSED = {
+    "no kind": ({"from_s": 1}, "faults[0].kind: missing; set it; known: bandwidth, burst,"),
+    "unknown kind": ({"kind": "flood"}, "faults[0].kind: 'flood' is not known; known: bandwidth"),
+    "kind of number": ({"kind": 3}, "faults[0].kind: expected `str`, got `int`"),
+    "misspelt key": (
+        {"kind": "drop", "probability": 0.5, "robot": ["r1"]},
+        "faults[0].robot: no such key; did you mean robots?",
+    ),
+    "key of another kind": (
+        {"kind": "clog", "until_s": 1, "shape": "ring"},
+        "faults[0].shape: no such key; known: from_s, until_s, robots",
+    ),
+    "missing key": ({"kind": "drop"}, "faults[0].probability: missing; set it"),
+    "impossible": ({"kind": "drop", "probability": 1.5}, "faults[0].probability: expected `float`"),
+    "never": ({"kind": "drop", "probability": 0.0}, "faults[0].probability: expected `float` >"),
+    "before": ({"kind": "drop", "probability": 1, "from_s": -1}, "faults[0].from_s: expected"),
+    "nan": ({"kind": "delay", "delay_s": float("nan")}, "faults[0].delay_s: "),
+    "backwards": (
+        {"kind": "drop", "probability": 1, "from_s": 5, "until_s": 5},
+        "faults[0].until_s: 5 s is not after from_s, 5 s; set a later end",
+    ),
+    "too late": (
+        {"kind": "drop", "probability": 1, "from_s": 17},
+        "faults[0].from_s: 17 s is never reached; the mission is cut at 16.5 s",
+    ),
+    "unknown robot": (
+        {"kind": "drop", "probability": 1, "robots": ["r2", "r9"]},
+        "faults[0].robots: r9 is not in the team; known: r1 to r3",
+    ),
+    "absent supervisor": (
+        {"kind": "one-way", "senders": ["supervisor"]},
+        "faults[0].senders: supervisor is not in the team; known: r1 to r3",
+    ),
+    "named twice": (
+        {"kind": "drop", "probability": 1, "robots": ["r2", "r2"]},
+        "faults[0].robots: r2 is named twice; name it once",
+    ),
+    "no delay": ({"kind": "delay"}, "faults[0].delay_s: delays nothing; set it, or jitter_s"),
+    "one-way to all": ({"kind": "one-way"}, "faults[0].senders: missing; set senders, receivers"),
+    "one-way to itself": (
+        {"kind": "one-way", "senders": ["r1"], "receivers": ["r1"]},
+        "faults[0].receivers: no link leads there from the senders; name others",
+    ),
+    "a share of no flapping": (
+        {"kind": "partition", "shape": "halves", "flap_share": 0.25},
+        "faults[0].flap_share: only with flap_s; set it",
+    ),
+    "unknown shape": (
+        {"kind": "partition", "shape": "star"},
+        "faults[0].shape: 'star' is not known; known: halves, ring, bridge, isolate, groups",
+    ),
+    "whom to isolate": (
+        {"kind": "partition", "shape": "isolate"},
+        "faults[0].robots: missing; set it",
+    ),
+    "groups of halves": (
+        {"kind": "partition", "shape": "halves", "groups": [["r1"]]},
+        'faults[0].groups: only with shape = "groups"',
+    ),
+    "joint groups": (
+        {"kind": "partition", "shape": "groups", "groups": [["r1", "r2"], ["r2"]]},
+        "faults[0].groups: r2 is named twice",
+    ),
+    "empty group": (
+        {"kind": "partition", "shape": "groups", "groups": [["r1"], []]},
+        "faults[0].groups[1]: nobody is in it; name somebody",
+    ),
+    "all together": (
+        {"kind": "partition", "shape": "groups", "groups": [["r1", "r2", "r3"]]},
+        "faults[0].shape: groups cuts no link of a team of 3",
+    ),
+    "ring of three": (
+        {"kind": "partition", "shape": "ring"},
+        "faults[0].shape: ring cuts no link of a team of 3",
+    ),
+    "endless clog": ({"kind": "clog"}, "faults[0].until_s: missing; a clog needs an end"),
+    "trickle": ({"kind": "bandwidth", "bytes_per_s": 1e-9}, "faults[0].bytes_per_s: 1e-09 is"),
+    "no range": ({"kind": "range"}, "faults[0].range_m: set either range_m or factor"),
+    "two ranges": (
+        {"kind": "range", "range_m": 1.0, "factor": 0.5},
+        "faults[0].range_m: set either range_m or factor",
+    ),
+    "half of infinity": (
+        {"kind": "range", "factor": 0.5},
+        "faults[0].factor: radio.range_m is infinite and stays so; set range_m",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_apply_is_refused(name: str) -> None:
+    """One line: which entry, which key, what to do about it."""
+    values, says = REFUSED[name]
+    tree = {**to_tree(mission()), "faults": [values]}
+    with pytest.raises(ScenarioError) as caught:
+        from_tree(tree, "small")
+
+    assert str(caught.value).startswith(f"small: {says}")
+
+
+def test_the_entry_is_counted() -> None:
+    text = EVERY_KIND + '[[faults]]\nkind = "drop"\nprobability = 1\nuntil_s = 0\n'
+
+    assert refusal(text).startswith("faults[11].until_s: 0 s is not after from_s, 0 s")
+
+
+def test_range_must_shrink() -> None:
+    """The one that counts: the supervisor's in a centralized mission."""
+    shrunk = fault(kind="range", range_m=50.0)
+
+    assert refusal("", "radio.range_m=50", shrunk) == (
+        "faults[0].range_m: radio.range_m is 50 m already; set a shorter one"
+    )
+    assert "supervisor.range_m is 9 m already" in refusal(
+        "", "coordination=centralized", "supervisor.range_m=9", shrunk
+    )
+    assert mission("coordination=centralized", shrunk).faults
+
+
+def test_nowhere_is_in_no_range() -> None:
+    """A supervisor without a place on the map."""
+    with pytest.raises(ScenarioError, match="the supervisor has no place on the map"):
+        exploration("coordination=centralized", fault(kind="range", range_m=5.0))
+
+
+# Partitions.
+
+
+def cut(partition: Partition | OneWay, robots: int, *, centralized: bool = False) -> set[str]:
+    """Links that are cut, as sender>receiver with r and the supervisor in short."""
+    roster = tuple(f"r{i}" for i in range(1, robots + 1))
+    roster += ("supervisor",) if centralized else ()
+    severs = partition.severs(roster)
+    return {f"{one[-1]}{other[-1]}" for one, other in permutations(roster, 2) if severs(one, other)}
+
+
+def both(*links: str) -> set[str]:
+    return {link for each in links for link in (each, each[::-1])}
+
+
+@pytest.mark.parametrize(
+    ("partition", "robots", "links"),
+    [
+        (Partition(shape="halves"), 2, both("12")),
+        (Partition(shape="halves"), 3, both("13", "23")),
+        (Partition(shape="halves"), 4, both("13", "14", "23", "24")),
+        (Partition(shape="ring"), 4, both("13", "24")),
+        (Partition(shape="ring"), 5, both("13", "14", "24", "25", "35")),
+        (Partition(shape="bridge"), 3, both("13")),
+        (Partition(shape="bridge"), 4, both("14", "24")),
+        (Partition(shape="bridge"), 5, both("14", "15", "24", "25")),
+        (Partition(shape="isolate", robots=("r2",)), 3, both("12", "23")),
+        (Partition(shape="isolate", robots=("r1", "r2")), 3, both("12", "13", "23")),
+        (Partition(shape="groups", groups=(("r1", "r3"),)), 4, both("12", "14", "32", "34")),
+        (Partition(shape="groups", groups=(("r1",), ("r2",))), 3, both("12", "13", "23")),
+        (OneWay(senders=("r1",)), 3, {"12", "13"}),
+        (OneWay(receivers=("r1",)), 3, {"21", "31"}),
+        (OneWay(senders=("r1", "r2"), receivers=("r2", "r3")), 3, {"12", "13", "23"}),
+    ],
+)
+def test_shapes_cut_their_links(
+    partition: Partition | OneWay, robots: int, links: set[str]
+) -> None:
+    assert cut(partition, robots) == links
+
+
+def test_supervisor_is_the_last_of_the_roster() -> None:
+    halves = Partition(shape="halves")
+
+    assert cut(halves, 3, centralized=True) == both("13", "1r", "23", "2r")
+
+
+# Files of faults.
+
+
+def chaos(folder: Path, text: str, scenario: Scenario | None = None) -> Scenario:
+    path = folder / "storm.toml"
+    path.write_text(text)
+    return with_chaos(scenario or mission(), path)
+
+
+def test_a_file_adds_its_faults_behind(tmp_path: Path) -> None:
+    own = mission(fault(kind="drop", probability=0.5))
+    storm = chaos(tmp_path, EVERY_KIND, own)
+
+    assert storm.faults == (*own.faults, *parse(SMALL + EVERY_KIND, "small").faults)
+    assert parse(to_toml(storm), "written") == storm
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "faults: missing; set it"),
+        ("faults = []", "faults: expected `array` of length >= 1"),
+        ("[radio]\ndrop = 0.5", "radio: no such key; known: faults"),
+        ("[[fault]]\nkind='drop'", "fault: no such key; did you mean faults?"),
+        ("[[faults]]\nkind='dorp'", "faults[0].kind: 'dorp' is not known; known: bandwidth"),
+        ("[[faults]]\nkind='drop'\nprobabilty=1", "faults[0].probabilty: no such key; did you"),
+        ("[[faults]]\nkind='partition'\nshape='x'", "faults[0].shape: 'x' is not known; known: ha"),
+        ("[[faults]]\nkind='drop'\nprobability=1\nrobots=['r7']", "faults[0].robots: r7 is not"),
+        ("[[faults]]\nkind='bandwidth'\nbytes_per_s=inf", "faults[0].bytes_per_s: inf is no usab"),
+        ("[[faults", "not valid TOML: "),
+    ],
+)
+def test_a_file_is_refused_by_name(tmp_path: Path, text: str, says: str) -> None:
+    """Its own entries are counted, whatever faults the scenario has."""
+    own = mission(fault(kind="drop", probability=0.5))
+    with pytest.raises(ScenarioError) as caught:
+        chaos(tmp_path, text, own)
+
+    assert str(caught.value).startswith(f"{tmp_path / 'storm.toml'}: {says}")
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "absent.toml", tmp_path):
+        with pytest.raises(ScenarioError, match=str(path)):
+            with_chaos(mission(), path)
+    (tmp_path / "noise.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(ScenarioError, match="not valid TOML"):
+        with_chaos(mission(), tmp_path / "noise.toml")
+
+
+# Whatever is written.
+
+
+def survives(tree: Any) -> None:
+    scenario, said = None, ""
+    try:
+        scenario = from_tree(tree, "any")
+    except ScenarioError as error:
+        said = str(error)
+    if scenario is None:
+        assert len(said.splitlines()) == 1
+    else:
+        assert parse(to_toml(scenario), "written") == scenario
+
+
+TREE = to_tree(parse(SMALL + EVERY_KIND, "small"))
+PLACES = [("faults", *path) for path in paths_of(TREE["faults"])]
+
+
+@examples(300)
+@given(path=st.sampled_from(PLACES), value=TOML_VALUES)
+def test_any_value_in_any_place_is_refused_or_a_scenario(
+    path: tuple[str | int, ...], value: Any
+) -> None:
+    survives(planted(TREE, path, value))
+
+
+@examples(100)
+@given(i=st.integers(0, len(TREE["faults"]) - 1), key=TOML_KEYS, value=TOML_VALUES)
+def test_any_key_in_any_fault_is_refused_or_a_scenario(i: int, key: str, value: Any) -> None:
+    survives(planted(TREE, ("faults", i), {**TREE["faults"][i], key: value}))
