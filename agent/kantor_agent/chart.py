@@ -5,8 +5,6 @@ cell are the sum over the layers, each counted as certain as evidence gets, and 
 more. A cell is explored once any layer knows it, whatever its probability.
 """
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 
@@ -131,9 +129,3 @@ class Chart:
     def explored(self) -> npt.NDArray[np.bool_]:
         """(cells,) known to anybody."""
         return np.asarray(self.cells != UNKNOWN)
-
-    def metres(self, one: int, other: int) -> float:
-        """Between the middles of two cells, as the crow flies."""
-        rows = one // self.frame.columns - other // self.frame.columns
-        columns = one % self.frame.columns - other % self.frame.columns
-        return math.hypot(rows, columns) * self.frame.resolution_m

@@ -79,8 +79,7 @@ class Navigator:
                 self._terrain.chart.cells.reshape(frame.rows, frame.columns),
                 self._way,
                 self._passed,
-                (pose.x_m - frame.origin_m[0]) / frame.resolution_m,
-                (pose.y_m - frame.origin_m[1]) / frame.resolution_m,
+                *frame.uv(pose.x_m, pose.y_m),
                 margin_cells,
             )
         )

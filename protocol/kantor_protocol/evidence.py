@@ -182,15 +182,9 @@ class Evidence:
         if len(scan) != 2 * self._beams:
             return np.zeros(0, dtype=np.int64)
         codes = np.frombuffer(scan, dtype="<u2")
-        x_m, y_m = self._frame.origin_m
-        u, v = (
-            (pose.x_m - x_m) / self._frame.resolution_m,
-            (pose.y_m - y_m) / self._frame.resolution_m,
-        )
         count = _integrate(
             codes,
-            u,
-            v,
+            *self._frame.uv(pose.x_m, pose.y_m),
             pose.heading_rad,
             *self._sensor,
             self._votes,

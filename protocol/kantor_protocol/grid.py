@@ -48,10 +48,17 @@ class Frame(msgspec.Struct, frozen=True, array_like=True):
         """From corner to corner."""
         return math.hypot(self.rows, self.columns) * self.resolution_m
 
+    def uv(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """A place in the world in cells from the lower left corner, column axis first."""
+        return (
+            (x_m - self.origin_m[0]) / self.resolution_m,
+            (y_m - self.origin_m[1]) / self.resolution_m,
+        )
+
     def cell_of(self, x_m: float, y_m: float) -> int:
         """The cell at a place in the world, or NOWHERE."""
-        column = math.floor((x_m - self.origin_m[0]) / self.resolution_m)
-        row = math.floor((y_m - self.origin_m[1]) / self.resolution_m)
+        u, v = self.uv(x_m, y_m)
+        column, row = math.floor(u), math.floor(v)
         if 0 <= row < self.rows and 0 <= column < self.columns:
             return row * self.columns + column
         return NOWHERE

@@ -98,7 +98,8 @@ class MapRules:
         here, there = (self._senders_m.get(name) for name in (verdict.source, verdict.target))
         if here is None or there is None:
             return
-        walls = walls_between(self._survey.ground.cells, *self._uv(here), *self._uv(there))
+        frame, cells = self._survey.ground
+        walls = walls_between(cells, *frame.uv(*here), *frame.uv(*there))
         range_m = self._faults.reach_m(now_ns, verdict.source, verdict.target)
         hidden = self._radio.line_of_sight and walls > 0
         if hidden or not math.dist(here, there) <= range_m - walls * self._radio.wall_loss_m:
@@ -111,23 +112,16 @@ class MapRules:
         if now == before:
             return
         self._poses_m[act.name] = self._senders_m[act.name] = now
+        frame, cells = self._survey.ground
         if not self._is_free(act.name):
             self._complain("wall", act.name, f"stands at {now[0]:.6g}, {now[1]:.6g} m in a wall")
-        elif free_way(self._survey.ground.cells, FREE, *self._uv(before), *self._uv(now)) < 1.0:
+        elif free_way(cells, FREE, *frame.uv(*before), *frame.uv(*now)) < 1.0:
             self._complain("wall", act.name, f"went to {now[0]:.6g}, {now[1]:.6g} m through a wall")
 
     def _is_free(self, name: ParticipantId) -> bool:
         """Whether a robot is in a free cell now."""
         cell = self._survey.cell_of(self._survey.places[name])
         return bool(cell != NOWHERE and self._survey.ground.cells.flat[cell] == FREE)
-
-    def _uv(self, xy_m: tuple[float, float]) -> tuple[float, float]:
-        """In cells, column axis first."""
-        frame = self._survey.frame
-        return (
-            (xy_m[0] - frame.origin_m[0]) / frame.resolution_m,
-            (xy_m[1] - frame.origin_m[1]) / frame.resolution_m,
-        )
 
     def _check_finish(self, act: Act) -> None:
         assert act.outputs is not None

@@ -164,8 +164,6 @@ class RangeFinder:
     def scan(self, robot: int, step: int, pose: Pose) -> bytes:
         """The scan of a robot, by its place in the roster, at its step: a little-endian uint16 a beam."""
         frame, cells = self._ground
-        left_m, bottom_m = frame.origin_m
-        u = (pose.x_m - left_m) / frame.resolution_m
-        v = (pose.y_m - bottom_m) / frame.resolution_m
+        u, v = frame.uv(pose.x_m, pose.y_m)
         _scan(cells, u, v, pose.heading_rad, *self._sensor, robot, step, self._codes)
         return self._codes.tobytes()

@@ -232,19 +232,11 @@ def stopped(ground: Ground, start: Pose, end: Pose) -> tuple[Pose, bool]:
     A robot that meets a wall stands STANDOFF_CELLS before it, or where it was; it has turned.
     """
     frame, cells = ground
-    side_m, (left_m, bottom_m) = frame.resolution_m, frame.origin_m
     dx, dy = end.x_m - start.x_m, end.y_m - start.y_m
-    share = free_way(
-        cells,
-        FREE,
-        (start.x_m - left_m) / side_m,
-        (start.y_m - bottom_m) / side_m,
-        (end.x_m - left_m) / side_m,
-        (end.y_m - bottom_m) / side_m,
-    )
+    share = free_way(cells, FREE, *frame.uv(start.x_m, start.y_m), *frame.uv(end.x_m, end.y_m))
     if share >= 1.0 and is_free(ground, end.x_m, end.y_m):
         return end, False
-    share -= STANDOFF_CELLS * side_m / math.hypot(dx, dy)
+    share -= STANDOFF_CELLS * frame.resolution_m / math.hypot(dx, dy)
     x_m, y_m = start.x_m + share * dx, start.y_m + share * dy
     if share <= 0.0 or not is_free(ground, x_m, y_m):
         x_m, y_m = start.x_m, start.y_m
