@@ -13,9 +13,9 @@ from pathlib import Path
 
 import msgspec
 
-from kantor_protocol.machine import ParticipantId
+from kantor_protocol.machine import WORLD_SIM, ParticipantId
 
-HOST = "worldsim"
+HOST = WORLD_SIM
 OBSERVER = "observer"
 _USERS = "users.txt"
 FLEET_PATTERN = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")

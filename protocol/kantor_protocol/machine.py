@@ -20,6 +20,9 @@ EVERYBODY: ParticipantId = ""
 
 SUPERVISOR: ParticipantId = "supervisor"
 
+WORLD_SIM: ParticipantId = "worldsim"
+"""The process that plays the world. It is no participant, but it can fail like one."""
+
 
 class State(enum.IntEnum):
     """What a participant is doing. The last two are final."""
@@ -38,6 +41,19 @@ class Pose(msgspec.Struct, frozen=True, array_like=True, gc=False):
     y_m: float
     heading_rad: float = 0.0
     speed_m_s: float = 0.0
+
+
+class Body(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """What the world knows of a body when a process takes it over."""
+
+    pose: Pose
+    step: int = 0
+    """The last step that the world has accepted; 0: it has not moved yet."""
+    energy_spent: int = 0
+    """Its gauge: points shipped, whoever drove it."""
+    epoch: int = 0
+    """The incarnation that drove it last. Whoever cannot go on from its own snapshot begins the next
+    one: two writers must never share a log."""
 
 
 class Envelope(msgspec.Struct, frozen=True, array_like=True, gc=False):

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.grid import Frame
-from kantor_protocol.machine import Inputs, Observation, Outputs, ParticipantId, Pose
+from kantor_protocol.machine import Body, Inputs, Observation, Outputs, ParticipantId, Pose
 from kantor_protocol.scenario import Scenario
 
 VERSION = 1
@@ -77,6 +77,8 @@ class News(_Message, frozen=True, array_like=True, tag=1, gc=False):
     registers: bytes = b""
     """For every origin the stamp of the register that the sender holds; then registers: origin, stamp,
     numbers. LEB128, the numbers zigzag-folded. Empty in a mission whose planner has none."""
+    epoch: int = 0
+    """The sender's incarnation."""
 
 
 class Mission(_Message, frozen=True, array_like=True, tag=2):
@@ -94,6 +96,10 @@ class Mission(_Message, frozen=True, array_like=True, tag=2):
     """`lockstep` or `wall`."""
     frame: Frame | None = None
     """How the cells of the map lie, if there is one; what is in them is for the robots to find out."""
+    run: str = ""
+    """Names this run of the mission, so that no snapshot of another is taken for its own."""
+    body: Body | None = None
+    """What the participant takes over."""
 
 
 class Refusal(_Message, frozen=True, array_like=True, tag=3):
@@ -112,6 +118,8 @@ class Go(_Message, frozen=True, array_like=True, tag=4):
     """Simulated seconds in a real one."""
     observation: Observation | None = None
     """What the participant sees before its first step."""
+    skew_ns: int = 0
+    """So far ahead is the clock that its machine reads. Sent again, it sets that clock anew."""
 
 
 class Turn(_Message, frozen=True, array_like=True, tag=5):
@@ -131,12 +139,20 @@ class Report(_Message, frozen=True, array_like=True, tag=6):
     """Wall: source and sequence of each envelope in the inbox of this step, in order."""
     observed: int = 0
     """Wall: the step in the observation that it used."""
+    skew_ns: int = 0
+    """Wall: how far the clock that its machine read was ahead of now_ns."""
 
 
 class Ready(_Message, frozen=True, array_like=True, tag=7):
     """Participant to world-sim: mission received, prepared to step."""
 
     nonce: str
+    epoch: int = 0
+    """Which incarnation it is."""
+    step: int = 0
+    """The step that it goes on from, by its own snapshot."""
+    now_ns: int = 0
+    """Wall: the time on its clock, if that runs already."""
 
 
 class Stop(_Message, frozen=True, array_like=True, tag=8):
@@ -189,13 +205,17 @@ _OUTPUTS = msgspec.msgpack.Decoder(Outputs)
 _PROGRESS = msgspec.msgpack.Decoder(Progress)
 
 encode = _ENCODER.encode
-_EIGHT_ITEMS, _EMPTY = b"\x98", encode(b"")
+_NO_EPOCH, _NO_REGISTERS = encode(0), encode(b"") + encode(0)
 
 
 def encode_news(news: News) -> bytes:
-    """The body of an envelope. Without registers it is an array of one item less: they have a default."""
+    """The body of an envelope. What has a default and is at the end is left out."""
     body = encode(news)
-    return body if news.registers else _EIGHT_ITEMS + body[1 : -len(_EMPTY)]
+    if news.epoch:
+        return body
+    if news.registers:
+        return b"\x99" + body[1 : -len(_NO_EPOCH)]
+    return b"\x98" + body[1 : -len(_NO_REGISTERS)]
 
 
 def decode_news(body: bytes) -> News:

@@ -16,7 +16,8 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 import msgspec
 from msgspec import Meta
 
-from kantor_protocol.faults import FAULTS_MAX, KINDS, AnyFault, Chaos, Fault
+from kantor_protocol import faults as of_faults
+from kantor_protocol.faults import FAULTS_MAX, KINDS, AnyFault, Chaos
 from kantor_protocol.machine import SUPERVISOR, ParticipantId
 from kantor_protocol.tables import NotNegative, Point, Positive, Probability, Seconds, Table
 
@@ -290,7 +291,7 @@ class Scenario(Table, frozen=True, kw_only=True):
     publish: Publish = Publish()
     metrics: Metrics = Metrics()
     faults: Annotated[tuple[AnyFault, ...], Meta(max_length=FAULTS_MAX)] = ()
-    """What goes wrong, and when; see `faults.py`. Over the bus participants are not told."""
+    """What goes wrong, and when; see `faults`. Over the bus participants are not told."""
 
     @property
     def robot_ids(self) -> tuple[ParticipantId, ...]:
@@ -402,7 +403,10 @@ def with_chaos(scenario: Scenario, path: Path) -> Scenario:
     faults = (*scenario.faults, *chaos.faults)
     if len(faults) > FAULTS_MAX:
         raise ScenarioError(f"{path}: faults: with the scenario's own more than {FAULTS_MAX}")
-    for complaint in (*_not_finite(to_tree(chaos)), *_complaints_of_faults(chaos.faults, scenario)):
+    for complaint in (
+        *_not_finite(to_tree(chaos)),
+        *of_faults.complaints(chaos.faults, scenario, scenario.faults),
+    ):
         raise ScenarioError(f"{path}: {complaint}")
     return msgspec.structs.replace(scenario, faults=faults)
 
@@ -562,7 +566,7 @@ def _complaints(scenario: Scenario) -> Iterable[str]:
     """What types alone cannot say. The first one is reported."""
     yield from _not_finite(to_tree(scenario))
     yield from _complaints_of_map(scenario) if scenario.map else _complaints_of_density(scenario)
-    yield from _complaints_of_faults(scenario.faults, scenario)
+    yield from of_faults.complaints(scenario.faults, scenario)
     for key, name in (("samples", scenario.samples.file), ("targets", scenario.targets.file)):
         if name is not None and Path(name).suffix.lower() not in POINT_FILES | IMAGE_FILES:
             known = ", ".join(sorted(POINT_FILES | IMAGE_FILES))
@@ -573,12 +577,6 @@ def _complaints(scenario: Scenario) -> Iterable[str]:
         yield f"clock.jitter_s: must be below the shortest period after spread and drift, {shortest_s:g} s"
     if scenario.radio.delay_s + scenario.radio.jitter_s > _PERIODS_UNDER_WAY * shortest_s:
         yield f"radio.delay_s: with the jitter over {_PERIODS_UNDER_WAY} periods; make it shorter"
-
-
-def _complaints_of_faults(faults: Iterable[Fault], scenario: Scenario) -> Iterable[str]:
-    for i, fault in enumerate(faults):
-        for complaint in fault.complaints(scenario):
-            yield f"faults[{i}].{complaint}"
 
 
 def _complaints_of_density(scenario: Scenario) -> Iterable[str]:

@@ -4,16 +4,40 @@ import heapq
 from collections.abc import Callable, Mapping
 from itertools import groupby
 from operator import itemgetter
+from typing import Protocol
 
 import msgspec
 
 from kantor_protocol.clock import Clock, clocks
-from kantor_protocol.machine import Exchange, Inputs, Outputs, ParticipantId, StateMachine
+from kantor_protocol.faults import Disk
+from kantor_protocol.machine import Body, Exchange, Inputs, Outputs, ParticipantId, StateMachine
 from kantor_protocol.messages import decode_inputs, encode
 from kantor_worldsim.stage import Stage, Step
 
 _decode_outputs = msgspec.msgpack.Decoder(Outputs).decode
 """The stage checks their numbers."""
+
+
+class Crew(Protocol):
+    """Who runs the participants of a mission: has them step, and ends and starts them on order."""
+
+    def __call__(
+        self, inputs: Mapping[ParticipantId, Inputs], /
+    ) -> Mapping[ParticipantId, Outputs]:
+        """Step all of a batch; a missing output is a value, see `Exchange`."""
+        ...
+
+    def kill(self, name: ParticipantId) -> None:
+        """End a process at once. World-sim's does not return where it is a process of its own."""
+        ...
+
+    def start(self, name: ParticipantId, body: Body, disk: Disk) -> tuple[int, int]:
+        """Start a process for a body, with what is left of its snapshot; its (epoch, step)."""
+        ...
+
+    def pretend(self, name: ParticipantId) -> bool:
+        """Have a second process ask to join under this id; whether it was let in."""
+        ...
 
 
 def in_process(machines: Mapping[ParticipantId, StateMachine]) -> Exchange:

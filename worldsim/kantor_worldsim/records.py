@@ -72,6 +72,8 @@ class Act(msgspec.Struct, frozen=True, array_like=True, gc=False):
     outputs: Outputs | None
     """None: late, crashed or cut off."""
     ruling: Ruling | None
+    skew_ns: int = 0
+    """How far the clock that it read was ahead of now_ns."""
 
 
 class Batch(msgspec.Struct, frozen=True, array_like=True, tag="batch"):
@@ -86,6 +88,24 @@ class Batch(msgspec.Struct, frozen=True, array_like=True, tag="batch"):
     """Participants that were due and gave no outputs."""
     tolls: tuple[Toll, ...] = ()
     """What the scenario's faults had to do with the verdicts."""
+    injected: tuple[Envelope, ...] = ()
+    """What a fault put on the air and nobody sent; verdicts may be about it."""
+
+
+class Incident(msgspec.Struct, frozen=True, array_like=True, tag="incident", gc=False):
+    """Something that befell a process."""
+
+    now_ns: int
+    who: ParticipantId
+    """A participant, or world-sim."""
+    what: str
+    """See `outages.Deed`; `leave` and `join` are nobody's deeds."""
+    fault: int = -1
+    """Its place in the scenario's list; -1: nobody ordered it."""
+    step: int = 0
+    """start, join: the step that it goes on from."""
+    epoch: int = 0
+    """start, join: its incarnation."""
 
 
 class Ending(msgspec.Struct, frozen=True, array_like=True, tag="ending"):
@@ -96,7 +116,7 @@ class Ending(msgspec.Struct, frozen=True, array_like=True, tag="ending"):
     """`done`, `limit`, `interrupted` or `deserted` (nobody left)."""
 
 
-Record = Opening | Batch | Ending
+Record = Opening | Batch | Incident | Ending
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Record)

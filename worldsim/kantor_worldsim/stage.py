@@ -11,7 +11,7 @@ from kantor_protocol.messages import RefusedError, check_outputs
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.channel import Channel, Sent, Verdict
 from kantor_worldsim.faults import LinkFaults
-from kantor_worldsim.records import Act, Batch, Ending, Record, opening_of
+from kantor_worldsim.records import Act, Batch, Ending, Incident, Record, opening_of
 from kantor_worldsim.world import Site, World
 
 Listener = Callable[[Record], None]
@@ -86,6 +86,10 @@ class Stage:
         tolls = self._faults.take_tolls() if self._faults else ()
         self._tell(Batch(now_ns, acts, verdicts, out_of_range, absent, tolls))
         return verdicts
+
+    def note(self, incident: Incident) -> None:
+        """Put on record what befell a process."""
+        self._tell(incident)
 
     def end(self, reason: str) -> None:
         """Close the record."""

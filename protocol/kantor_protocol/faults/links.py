@@ -1,65 +1,29 @@
-"""Faults as data: what goes wrong in a run, and when.
+"""Faults of links, and of what travels over them.
 
-A scenario lists them as `[[faults]]`, each of a `kind` and within a window of simulated time. Whoever
-runs the mission injects them; no participant looks at them. Here is what each kind may say, and what
-cannot apply to a scenario: that is refused before anything starts.
-
-The kinds below concern links. They are injected where the radio rules (`kantor_worldsim.faults`), so
-they hold for every exchange, and a message that is under way when a window ends still arrives as ruled.
+They are injected where the radio rules (`kantor_worldsim.faults`), so they hold for every exchange, and a
+message that is under way when a window ends still arrives as ruled.
 """
 
 import math
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Annotated, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from msgspec import Meta
 
+from kantor_protocol.faults.fault import Fault, Names, Share, Span, complaints_of_names
 from kantor_protocol.machine import ParticipantId
-from kantor_protocol.tables import NotNegative, Positive, Probability, Seconds, Table
+from kantor_protocol.tables import NotNegative, Positive, Probability, Seconds
 
 if TYPE_CHECKING:
     from kantor_protocol.scenario import Scenario
 
-Share = Annotated[float, Meta(gt=0.0, le=1.0)]
-"""A probability of something that can happen."""
-Span = Annotated[float, Meta(ge=1e-3, le=1e6)]
-"""Seconds that pass."""
-Names = tuple[ParticipantId, ...]
-
 Severs = Callable[[ParticipantId, ParticipantId], bool]
 """Whether nothing of a sender (first) reaches a receiver (second)."""
 
-FAULTS_MAX = 1000
 COPIES_MAX = 8
 
 _BRIDGE = -1
 """The side of a participant that hears both halves."""
-
-
-class Fault(Table, frozen=True, kw_only=True, tag_field="kind"):
-    """What every fault has: a window, its end excluded, in simulated time since the mission's start."""
-
-    from_s: Seconds = 0.0
-    until_s: Seconds | None = None
-    """By default it never ends."""
-
-    @property
-    def from_ns(self) -> int:
-        """When it begins."""
-        return round(self.from_s * 1e9)
-
-    @property
-    def until_ns(self) -> int | None:
-        """When it is over, or None."""
-        return None if self.until_s is None else round(self.until_s * 1e9)
-
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Why it cannot apply to a scenario: `key: what, and the remedy`."""
-        if self.until_ns is not None and self.until_ns <= self.from_ns:
-            yield f"until_s: {self.until_s:g} s is not after from_s, {self.from_s:g} s; set a later end"
-        if self.from_ns >= scenario.limit_ns:
-            limit_s = scenario.limit_ns * 1e-9
-            yield f"from_s: {self.from_s:g} s is never reached; the mission is cut at {limit_s:g} s"
 
 
 class OnLinks(Fault, frozen=True, kw_only=True):
@@ -71,7 +35,7 @@ class OnLinks(Fault, frozen=True, kw_only=True):
     def complaints(self, scenario: "Scenario") -> Iterable[str]:
         """Also names that nobody has."""
         yield from super().complaints(scenario)
-        yield from _complaints_of_names("robots", self.robots, scenario)
+        yield from complaints_of_names("robots", self.robots, scenario)
 
 
 class Drop(OnLinks, frozen=True, kw_only=True, tag="drop"):
@@ -149,8 +113,8 @@ class OneWay(Fault, frozen=True, kw_only=True, tag="one-way"):
     def complaints(self, scenario: "Scenario") -> Iterable[str]:
         """Also names that nobody has, and a cut of nothing or of everything."""
         yield from super().complaints(scenario)
-        yield from _complaints_of_names("senders", self.senders, scenario)
-        yield from _complaints_of_names("receivers", self.receivers, scenario)
+        yield from complaints_of_names("senders", self.senders, scenario)
+        yield from complaints_of_names("receivers", self.receivers, scenario)
         if not self.senders and not self.receivers:
             yield "senders: missing; set senders, receivers or both"
         elif not _cuts_any(self.severs(scenario.roster), scenario.roster):
@@ -207,11 +171,11 @@ class Partition(Fault, frozen=True, kw_only=True, tag="partition"):
             if bool(getattr(self, key)) != (self.shape == shape):
                 needs = "missing; set it" if self.shape == shape else f'only with shape = "{shape}"'
                 yield f"{key}: {needs}"
-        yield from _complaints_of_names("robots", self.robots, scenario)
+        yield from complaints_of_names("robots", self.robots, scenario)
         for i, group in enumerate(self.groups):
-            yield from _complaints_of_names(f"groups[{i}]", group, scenario)
+            yield from complaints_of_names(f"groups[{i}]", group, scenario)
             yield from () if group else (f"groups[{i}]: nobody is in it; name somebody",)
-        yield from _complaints_of_names("groups", sum(self.groups, ()), scenario)
+        yield from complaints_of_names("groups", sum(self.groups, ()), scenario)
         if self.flap_share is not None and self.flap_s is None:
             yield "flap_share: only with flap_s; set it"
         if not _cuts_any(self.severs(scenario.roster), scenario.roster):
@@ -241,7 +205,7 @@ class Bandwidth(Fault, frozen=True, kw_only=True, tag="bandwidth"):
     def complaints(self, scenario: "Scenario") -> Iterable[str]:
         """Also names that nobody has, and a trickle."""
         yield from super().complaints(scenario)
-        yield from _complaints_of_names("robots", self.robots, scenario)
+        yield from complaints_of_names("robots", self.robots, scenario)
         if self.bytes_per_s < 1e-3:
             yield f"bytes_per_s: {self.bytes_per_s:g} is less than a byte in 1000 s; use drop"
 
@@ -276,6 +240,16 @@ class Range(OnLinks, frozen=True, kw_only=True, tag="range"):
             yield "range_m: the supervisor has no place on the map; set supervisor.pose_m"
 
 
+class Hostile(OnLinks, frozen=True, kw_only=True, tag="hostile"):
+    """With this probability something that nobody sent comes beside a message, to be refused.
+
+    It is in the sender's name, or in that of a stranger: noise, what is cut short, of another version,
+    oversized, deeply nested, with numbers that are none, or of origins that nobody is.
+    """
+
+    probability: Share
+
+
 LinkFault = (
     Drop
     | Burst
@@ -288,35 +262,9 @@ LinkFault = (
     | Clog
     | Bandwidth
     | Range
+    | Hostile
 )
-AnyFault = LinkFault
-"""What may stand in a list of faults."""
-
-KINDS: dict[str, type[Fault]] = {str(k.__struct_config__.tag): k for k in get_args(AnyFault)}
-"""By their names in a file."""
-
-
-class Chaos(Table, frozen=True, kw_only=True):
-    """A schedule of faults in a file of its own, which may be added to any scenario."""
-
-    faults: Annotated[tuple[AnyFault, ...], Meta(min_length=1, max_length=FAULTS_MAX)]
-
-
-def kind_of(fault: Fault) -> str:
-    """Its name in a file."""
-    return str(fault.__struct_config__.tag)
 
 
 def _cuts_any(severs: Severs, roster: Names) -> bool:
     return any(severs(one, other) for one in roster for other in roster if one != other)
-
-
-def _complaints_of_names(key: str, names: Names, scenario: "Scenario") -> Iterable[str]:
-    roster = scenario.roster
-    for name in names:
-        if name not in roster:
-            known = f"{roster[0]} to r{scenario.robots.count}"
-            known += " and supervisor" if scenario.centralized else ""
-            yield f"{key}: {name} is not in the team; known: {known}"
-        elif names.count(name) > 1:
-            yield f"{key}: {name} is named twice; name it once"

@@ -1,0 +1,137 @@
+"""Faults as data: what goes wrong in a run, and when.
+
+A scenario lists them as `[[faults]]`, each of a `kind` and within a window of simulated time. Whoever
+runs the mission injects them; no participant looks at them. Here is what each kind may say, and what
+cannot apply to a scenario: that is refused before anything starts.
+"""
+
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+from typing import TYPE_CHECKING, Annotated, get_args
+
+from msgspec import Meta
+
+from kantor_protocol.faults.fault import Fault, Names, Share, Span
+from kantor_protocol.faults.links import (
+    COPIES_MAX,
+    Bandwidth,
+    Burst,
+    Clog,
+    Delay,
+    Drop,
+    Duplicate,
+    Hostile,
+    LinkFault,
+    OneWay,
+    OnLinks,
+    Partition,
+    Range,
+    Reorder,
+    Replay,
+    Severs,
+)
+from kantor_protocol.faults.processes import (
+    Clock,
+    Disk,
+    FullDisk,
+    Impostor,
+    Kill,
+    Late,
+    OnProcesses,
+    Pause,
+    ProcessFault,
+    Slow,
+)
+from kantor_protocol.machine import WORLD_SIM
+from kantor_protocol.tables import Table
+
+if TYPE_CHECKING:
+    from kantor_protocol.scenario import Scenario
+
+__all__ = [
+    "COPIES_MAX",
+    "FAULTS_MAX",
+    "KINDS",
+    "AnyFault",
+    "Bandwidth",
+    "Burst",
+    "Chaos",
+    "Clock",
+    "Clog",
+    "Delay",
+    "Disk",
+    "Drop",
+    "Duplicate",
+    "Fault",
+    "FullDisk",
+    "Hostile",
+    "Impostor",
+    "Kill",
+    "Late",
+    "LinkFault",
+    "Names",
+    "OnLinks",
+    "OnProcesses",
+    "OneWay",
+    "Partition",
+    "Pause",
+    "ProcessFault",
+    "Range",
+    "Reorder",
+    "Replay",
+    "Severs",
+    "Share",
+    "Slow",
+    "Span",
+    "complaints",
+    "kind_of",
+]
+
+AnyFault = LinkFault | ProcessFault
+"""What may stand in a list of faults."""
+
+FAULTS_MAX = 1000
+
+KINDS: dict[str, type[Fault]] = {str(k.__struct_config__.tag): k for k in get_args(AnyFault)}
+"""By their names in a file."""
+
+
+class Chaos(Table, frozen=True, kw_only=True):
+    """A schedule of faults in a file of its own, which may be added to any scenario."""
+
+    faults: Annotated[tuple[AnyFault, ...], Meta(min_length=1, max_length=FAULTS_MAX)]
+
+
+def kind_of(fault: Fault) -> str:
+    """Its name in a file."""
+    return str(fault.__struct_config__.tag)
+
+
+def complaints(
+    faults: Sequence[Fault], scenario: "Scenario", earlier: Sequence[Fault] = ()
+) -> Iterable[str]:
+    """Why a list of faults cannot apply to a scenario; `faults[i].key: what, and the remedy`.
+
+    earlier: those that the scenario has already, which are in order.
+    """
+    for i, fault in enumerate(faults):
+        for complaint in fault.complaints(scenario):
+            yield f"faults[{i}].{complaint}"
+    known = [(f"the scenario's faults[{i}]", fault) for i, fault in enumerate(earlier)]
+    listed = [*known, *((f"faults[{i}]", fault) for i, fault in enumerate(faults))]
+    stopping = [(at, f) for at, f in listed if isinstance(f, OnProcesses) and f.stops]
+    for (there, one), (here, other) in combinations(stopping, 2):
+        for name in one.who:
+            if name in other.who and _overlap(one, other):
+                yield (
+                    f"{here}.who: {name} has a {kind_of(one)} then already, by {there}; "
+                    f"move one of the two"
+                )
+        for one_, other_, at in ((one, other, here), (other, one, there)):
+            if WORLD_SIM in one_.who and isinstance(other_, Kill) and _overlap(one_, other_):
+                yield f"{at}.from_s: world-sim is down then and can see nobody die; move it"
+
+
+def _overlap(one: Fault, other: Fault) -> bool:
+    first, second = sorted((one, other), key=lambda fault: fault.from_ns)
+    return first.until_ns is None or second.from_ns < first.until_ns

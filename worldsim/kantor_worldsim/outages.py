@@ -1,0 +1,125 @@
+"""When the process faults of a scenario strike: a schedule of deeds, and who is idle meanwhile.
+
+Whoever runs the mission does the deeds: the virtual loop to its crew, the wall's relay to real processes.
+"""
+
+from itertools import chain
+from typing import Literal, NamedTuple
+
+from kantor_protocol.faults import Clock, FullDisk, Impostor, Kill, Late, OnProcesses, Pause, Slow
+from kantor_protocol.faults.processes import Disk
+from kantor_protocol.machine import WORLD_SIM, ParticipantId
+from kantor_protocol.scenario import Scenario
+
+What = Literal[
+    "kill",
+    "start",
+    "pause",
+    "resume",
+    "fill",
+    "free",
+    "slow",
+    "quicken",
+    "skew",
+    "right",
+    "pretend",
+]
+_FIRST: dict[type[OnProcesses], What] = {
+    Kill: "kill",
+    Pause: "pause",
+    FullDisk: "fill",
+    Slow: "slow",
+    Clock: "skew",
+    Impostor: "pretend",
+}
+_LAST: dict[type[OnProcesses], What] = {
+    Kill: "start",
+    Late: "start",
+    Pause: "resume",
+    FullDisk: "free",
+    Slow: "quicken",
+    Clock: "right",
+}
+
+
+class Deed(NamedTuple):
+    """One thing that is done to one process."""
+
+    at_ns: int
+    fault: int
+    """The place of its fault in the scenario's list."""
+    who: ParticipantId
+    what: What
+    disk: Disk = "kept"
+    """start: what is left of its snapshot."""
+    mid_step: bool = False
+    """kill: in its next step."""
+
+
+def deeds_of(scenario: Scenario) -> list[Deed]:
+    """Everything that is done to processes in a mission, in order of time and of the list."""
+    deeds: list[Deed] = []
+    for index, fault in enumerate(scenario.faults):
+        if not isinstance(fault, OnProcesses):
+            continue
+        disk = fault.disk if isinstance(fault, Kill) else "kept"
+        mid_step = isinstance(fault, Kill) and fault.mid_step
+        for who in fault.who:
+            if first := _FIRST.get(type(fault)):
+                deeds.append(Deed(fault.from_ns, index, who, first, disk, mid_step))
+            if (last := _LAST.get(type(fault))) and fault.until_ns is not None:
+                deeds.append(Deed(fault.until_ns, index, who, last, disk, mid_step))
+    return sorted(deeds, key=lambda deed: deed.at_ns)
+
+
+class Outages:
+    """The process faults of a scenario as time goes by."""
+
+    def __init__(self, scenario: Scenario, after_ns: int = -1) -> None:
+        """after_ns: deeds up to then are done already."""
+        self._deeds = [deed for deed in deeds_of(scenario) if deed.at_ns > after_ns]
+        self._period_ns = scenario.period_ns
+        faults = [fault for fault in scenario.faults if isinstance(fault, OnProcesses)]
+        self._faults = {
+            name: [fault for fault in faults if name in fault.who]
+            for name in (*scenario.roster, WORLD_SIM)
+        }
+
+    @property
+    def next_ns(self) -> int | None:
+        """When the next deed is due."""
+        return self._deeds[0].at_ns if self._deeds else None
+
+    def take(self, now_ns: int) -> list[Deed]:
+        """The deeds that are due, handed out once."""
+        due = [deed for deed in self._deeds if deed.at_ns <= now_ns]
+        self._deeds = self._deeds[len(due) :]
+        return due
+
+    def idle(self, name: ParticipantId, now_ns: int) -> bool:
+        """Whether a participant takes no step now, because of its own or of world-sim's state."""
+        return any(
+            self._stops(fault, now_ns)
+            for fault in chain(self._faults[name], self._faults[WORLD_SIM])
+        )
+
+    def lost(self, name: ParticipantId, now_ns: int) -> bool:
+        """Whether a participant is dead and will not come back."""
+        return any(
+            isinstance(fault, Kill) and fault.until_ns is None and fault.from_ns <= now_ns
+            for fault in self._faults[name]
+        )
+
+    def skew_ns(self, name: ParticipantId, now_ns: int) -> int:
+        """How far the clock of a participant is ahead."""
+        clocks = (fault for fault in self._faults[name] if isinstance(fault, Clock))
+        return sum(clock.skew_ns(now_ns) for clock in clocks if _within(clock, now_ns))
+
+    def _stops(self, fault: OnProcesses, now_ns: int) -> bool:
+        if not fault.stops or not _within(fault, now_ns):
+            return False
+        return not isinstance(fault, Slow) or now_ns // self._period_ns % fault.every != 0
+
+
+def _within(fault: OnProcesses, now_ns: int) -> bool:
+    return fault.from_ns <= now_ns and (fault.until_ns is None or now_ns < fault.until_ns)
