@@ -6,7 +6,7 @@ nothing that happened before, so one more message or one more robot changes no o
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from heapq import heappop, heappush
 from typing import Any, NamedTuple
 
@@ -391,26 +391,26 @@ class Channel:
 
         Raises KeyError for what is not under way.
         """
-        waiting = self._under_way[name]
-        waiting.sort(key=_ARRIVAL)
+        waiting = sorted(self._under_way[name])
         taken = []
         for reference in heard:
-            places = (i for i, item in enumerate(waiting) if (item[3].source, item[2]) == reference)
+            places = (i for i, item in enumerate(waiting) if (item[4].source, item[2]) == reference)
             place = next(places, None)
             if place is None:
                 raise KeyError(reference)
-            taken.append(waiting.pop(place)[3])
+            taken.append(waiting.pop(place)[4])
+        self._under_way[name][:] = waiting  # in order, it is a heap
         return tuple(taken)
 
     def lose(self, name: ParticipantId, from_ns: int, until_ns: int) -> None:
         """Throw away what arrives at a participant within a window, its end excluded."""
-        self._under_way[name] = [
-            item for item in self._under_way[name] if not from_ns <= item[0] < until_ns
-        ]
+        box = self._under_way[name]
+        box[:] = sorted(item for item in box if not from_ns <= item[0] < until_ns)
 
     def clear(self) -> None:
         """Throw away all that is under way."""
-        self._under_way = {name: [] for name in self._under_way}
+        for box in self._under_way.values():
+            box.clear()
 
     def waits(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether something has arrived at a participant that was not taken."""
