@@ -1,9 +1,12 @@
 """The participants of a scenario as objects, and a mission of theirs inside one process."""
 
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 
 from kantor_agent.core import Agent
 from kantor_agent.mapper import Mapper
+from kantor_protocol.faults import Kill
+from kantor_protocol.life import Mortal
 from kantor_protocol.machine import SUPERVISOR, Body, ParticipantId, Pose, StateMachine
 from kantor_protocol.scenario import Scenario
 from kantor_supervisor.allocation import Allocation
@@ -14,8 +17,13 @@ from kantor_worldsim.world import Site
 
 
 def team(scenario: Scenario, seed: int, site: Site) -> dict[ParticipantId, StateMachine]:
-    """Everybody in the roster."""
-    return {name: participant(name, scenario, seed, site) for name in scenario.roster}
+    """Everybody in the roster; whom the scenario has killed can be killed."""
+    killed = {name for fault in scenario.faults if isinstance(fault, Kill) for name in fault.who}
+    made: dict[ParticipantId, StateMachine] = {}
+    for name in scenario.roster:
+        build = partial(participant, name, scenario, seed, site)
+        made[name] = Mortal(build, _at_start(name, scenario, site)) if name in killed else build()
+    return made
 
 
 def participant(

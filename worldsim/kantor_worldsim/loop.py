@@ -1,18 +1,34 @@
 """The virtual loop: discrete events in simulated time, the same for every exchange."""
 
 import heapq
+from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from itertools import groupby
 from operator import itemgetter
-from typing import Protocol
+from typing import Protocol, cast
 
 import msgspec
 
 from kantor_protocol.clock import Clock, clocks
 from kantor_protocol.faults import Disk
-from kantor_protocol.machine import Body, Exchange, Inputs, Outputs, ParticipantId, StateMachine
+from kantor_protocol.life import Mortal
+from kantor_protocol.machine import (
+    WORLD_SIM,
+    Body,
+    Exchange,
+    Inputs,
+    Outputs,
+    ParticipantId,
+    StateMachine,
+)
 from kantor_protocol.messages import decode_inputs, encode
-from kantor_worldsim.stage import Stage, Step
+from kantor_worldsim.admission import Admission, Entry
+from kantor_worldsim.outages import Deed, Outages
+from kantor_worldsim.records import Incident
+from kantor_worldsim.stage import Stage
+
+_NEVER_NS = 2**63 - 1
+_STEPS = range(1, 2**40)
 
 _decode_outputs = msgspec.msgpack.Decoder(Outputs).decode
 """The stage checks their numbers."""
@@ -40,24 +56,73 @@ class Crew(Protocol):
         ...
 
 
-def in_process(machines: Mapping[ParticipantId, StateMachine]) -> Exchange:
-    """The exchange without processes. Everything passes the codec, so nothing is shared."""
+def in_process(machines: Mapping[ParticipantId, StateMachine]) -> Crew:
+    """The crew without processes. Whom the scenario has killed must be a `Mortal`."""
+    return _InProcess(machines)
 
-    def exchange(inputs: Mapping[ParticipantId, Inputs]) -> Mapping[ParticipantId, Outputs]:
+
+class _InProcess:
+    """The crew without processes. Everything passes the codec, so nothing is shared."""
+
+    def __init__(self, machines: Mapping[ParticipantId, StateMachine]) -> None:
+        self._machines = machines
+        self._lives = dict.fromkeys(machines, 0)
+        """How often each participant was started anew."""
+        self._admission = Admission(machines)
+        for name in machines:
+            self._admission.join(name, self._nonce(name))
+
+    def __call__(
+        self, inputs: Mapping[ParticipantId, Inputs], /
+    ) -> Mapping[ParticipantId, Outputs]:
+        """Step all of a batch."""
+        machines = self._machines
         return {
             name: _decode_outputs(encode(machines[name].step(decode_inputs(encode(given)))))
             for name, given in inputs.items()
         }
 
-    return exchange
+    def kill(self, name: ParticipantId) -> None:
+        """End a participant; nothing has to be done to world-sim, which is rebuilt."""
+        if name != WORLD_SIM:
+            self._mortal(name).kill()
+            self._admission.leave(name, self._nonce(name))
+
+    def start(self, name: ParticipantId, body: Body, disk: Disk) -> tuple[int, int]:
+        """Start one that was killed, or is late."""
+        machine = self._machines[name]
+        if not isinstance(machine, Mortal):  # it has been there all the time, and was not asked
+            return body.epoch, body.step
+        self._lives[name] += 1
+        self._admission.join(name, self._nonce(name))
+        return machine.start(body, disk)
+
+    def pretend(self, name: ParticipantId) -> bool:
+        """Have the register decide on somebody else; whoever gets in leaves again at once."""
+        let_in = self._admission.join(name, "impostor") in {Entry.NEW, Entry.BACK}
+        self._admission.leave(name, "impostor")
+        return let_in
+
+    def _nonce(self, name: ParticipantId) -> str:
+        return f"{name}, life {self._lives[name]}"
+
+    def _mortal(self, name: ParticipantId) -> Mortal:
+        machine = self._machines[name]
+        if not isinstance(machine, Mortal):
+            raise TypeError(f"{name} is killed in this scenario; hand over a life.Mortal")
+        return machine
 
 
 class Agenda:
     """Who is due when: the next step of every clock."""
 
-    def __init__(self, owned: Mapping[ParticipantId, Clock]) -> None:
+    def __init__(self, owned: Mapping[ParticipantId, Clock], from_ns: int = 0) -> None:
+        """from_ns: whatever was due before is done."""
         self._clocks = owned
-        self._due = [(clock.due_ns(1), i, 1, name) for i, (name, clock) in enumerate(owned.items())]
+        self._due = []
+        for order, (name, clock) in enumerate(owned.items()):
+            step = _STEPS[bisect_left(_STEPS, from_ns, key=clock.due_ns)] if from_ns > 0 else 1
+            self._due.append((clock.due_ns(step), order, step, name))
         heapq.heapify(self._due)
 
     @property
@@ -65,14 +130,17 @@ class Agenda:
         """When the next participant is due."""
         return self._due[0][0]
 
-    def batch(self, lookahead_ns: int) -> list[tuple[int, ParticipantId]]:
+    def batch(
+        self, lookahead_ns: int, before_ns: int = _NEVER_NS
+    ) -> list[tuple[int, ParticipantId]]:
         """Everybody due before a message sent at the earliest of them could arrive, by (time, roster).
 
-        The batch ends before a participant's second step, so that time never runs back.
+        The batch ends before a participant's second step, so that time never runs back, and before
+        before_ns, which is later than the earliest.
         """
         due = self._due
         first_ns = due[0][0]
-        until_ns = first_ns + lookahead_ns
+        until_ns = min(first_ns + lookahead_ns, before_ns)
         batch: list[tuple[int, ParticipantId]] = []
         while due[0][0] < until_ns or due[0][0] == first_ns:
             due_ns, order, step, name = due[0]
@@ -84,24 +152,113 @@ class Agenda:
 
 
 def simulate(stage: Stage, exchange: Exchange, seed: int, stopped: Callable[[], bool]) -> str:
-    """Run until every robot rests, the limit is reached or `stopped()`; the reason, also recorded."""
-    agenda = Agenda(clocks(stage.scenario, seed))
-    while not (reason := _reason(stage, agenda.next_ns, stopped)):
-        batch = agenda.batch(stage.channel.lookahead_ns)
-        inputs = {name: stage.inputs(name, due_ns) for due_ns, name in batch}
-        outputs = exchange(inputs)
-        for moment_ns, due in groupby(batch, key=itemgetter(0)):
-            if _reason(stage, moment_ns, stopped):  # what was looked ahead to does not happen
-                break
-            steps = [Step(name, inputs[name], outputs.get(name)) for _, name in due]
-            stage.settle(moment_ns, steps)
-    stage.end(reason)
-    return reason
+    """Run until every robot rests, the limit is reached or `stopped()`; the reason, also recorded.
+
+    stage: new, or resumed. exchange: a Crew, where the scenario has faults of processes.
+    """
+    return _Mission(stage, exchange, seed, stopped).run()
 
 
-def _reason(stage: Stage, next_ns: int, stopped: Callable[[], bool]) -> str | None:
-    if over := stage.over:
-        return over
-    if next_ns > stage.limit_ns:
-        return "limit"
-    return "interrupted" if stopped() else None
+class _Mission:
+    """A mission turn by turn. Beside the stage it knows nothing but functions of time."""
+
+    def __init__(
+        self, stage: Stage, exchange: Exchange, seed: int, stopped: Callable[[], bool]
+    ) -> None:
+        self._exchange = exchange
+        self._crew = cast("Crew", exchange)
+        self._clocks = clocks(stage.scenario, seed)
+        self._stopped = stopped
+        self._go_on(stage)
+
+    def _go_on(self, stage: Stage) -> None:
+        self._stage = stage
+        self._agenda = Agenda(self._clocks, stage.done_ns)
+        self._outages = Outages(stage.scenario, done=stage.deeds)
+
+    def run(self) -> str:
+        while True:
+            step_ns, deed_ns = self._agenda.next_ns, self._outages.next_ns
+            if reason := self._reason(step_ns if deed_ns is None else min(step_ns, deed_ns)):
+                self._stage.end(reason)
+                return reason
+            if deed_ns is None:
+                self._step(self._agenda.batch(self._stage.channel.lookahead_ns))
+            elif deed_ns > step_ns:
+                self._step(self._agenda.batch(self._stage.channel.lookahead_ns, deed_ns))
+            else:
+                self._do(self._outages.pop())
+
+    def _reason(self, next_ns: int) -> str | None:
+        if over := self._stage.over:
+            return over
+        if next_ns > self._stage.limit_ns:
+            return "limit"
+        return "interrupted" if self._stopped() else None
+
+    def _step(self, batch: list[tuple[int, ParticipantId]]) -> None:
+        """Let everybody in a batch step who can, then let it happen moment by moment.
+
+        There is no reason yet to end before its first moment.
+        """
+        outages, stage = self._outages, self._stage
+        due = [event for event in batch if self._is_asked(*event)] if outages.some else batch
+        turns = {
+            name: stage.turn(name, due_ns, outages.skew_ns(name, due_ns)) for due_ns, name in due
+        }
+        outputs = self._exchange({name: turn.inputs for name, turn in turns.items()})
+        if outages.some:
+            outputs = self._cut_short(due, outputs)
+        for moment_ns, acting in groupby(due, key=itemgetter(0)):
+            if moment_ns > batch[0][0] and self._reason(moment_ns):
+                break  # what was looked ahead to does not happen
+            stage.settle(moment_ns, [turns[name].answered(outputs.get(name)) for _, name in acting])
+
+    def _is_asked(self, due_ns: int, name: ParticipantId) -> bool:
+        return not self._outages.idle(name, due_ns) or self._dies(due_ns, name)
+
+    def _dies(self, due_ns: int, name: ParticipantId) -> bool:
+        """Whether a participant dies in this step. Who has a turn to answer is dead already."""
+        return self._outages.dies(name, due_ns) and not self._stage.unanswered(name)
+
+    def _cut_short(
+        self, due: list[tuple[int, ParticipantId]], outputs: Mapping[ParticipantId, Outputs]
+    ) -> Mapping[ParticipantId, Outputs]:
+        """Kill whoever dies in its step, before anybody hears of that."""
+        dying = {name for due_ns, name in due if self._dies(due_ns, name)}
+        for name in self._clocks:
+            if name in dying:
+                self._crew.kill(name)
+        return {name: told for name, told in outputs.items() if name not in dying}
+
+    def _do(self, deed: Deed) -> None:
+        if deed.what == "kill":
+            self._kill(deed)
+        elif deed.what == "start" and deed.who != WORLD_SIM:
+            self._start(deed)
+        elif deed.what == "pretend" and self._crew.pretend(deed.who):
+            self._note(deed, "let in")
+        else:
+            self._note(deed, deed.what)
+
+    def _kill(self, deed: Deed) -> None:
+        self._note(deed, deed.what)
+        if deed.who == WORLD_SIM:
+            self._crew.kill(WORLD_SIM)
+            self._go_on(self._stage.rebuilt())
+        elif not deed.mid_step or self._stage.unanswered(deed.who):
+            self._crew.kill(deed.who)
+
+    def _start(self, deed: Deed) -> None:
+        """Start a process, and have it answer what it was asked."""
+        stage, who = self._stage, deed.who
+        if deed.mid_step and not stage.unanswered(who):  # it had no step to die in
+            self._crew.kill(who)
+        epoch, step = self._crew.start(who, stage.body(who), deed.disk)
+        stage.note(Incident(deed.at_ns, who, "start", deed.fault, step, epoch))
+        if asked := stage.unanswered(who):
+            outputs = self._exchange({who: asked.inputs}).get(who)
+            stage.settle(deed.at_ns, [asked.answered(outputs)])
+
+    def _note(self, deed: Deed, what: str) -> None:
+        self._stage.note(Incident(deed.at_ns, deed.who, what, deed.fault))
