@@ -294,7 +294,8 @@ class Tally(NamedTuple):
     shipped: npt.NDArray[np.float64]
     """(2,) mass times metres: since the start, in this tick."""
     standing: npt.NDArray[np.int64]
-    """(n, 3): refused messages; whether it rests; step in which it saw no weight left, or _NEVER."""
+    """(n, 4): refused messages; whether it rests; step in which it saw no weight left, or _NEVER; how far
+    its clock was ahead in its last step."""
     shipped_by: npt.NDArray[np.float64]
     """(m,) since the start."""
     xy_m: npt.NDArray[np.float64]
@@ -392,6 +393,9 @@ def _follow(
         if place < 0 or not act[of.PRESENT]:
             continue
         counts[_VIOLATIONS] += act[of.VIOLATIONS]
+        if act[of.TOO_FAST] > 0 and act[of.SKEW_NS] > standing[place, 3]:  # see the checker's rule
+            counts[_VIOLATIONS] -= 1
+        standing[place, 3] = act[of.SKEW_NS]
         standing[place, 0] = act[of.REFUSED]
         for i in range(act[of.LOWERED], act[of.LOWERED] + max(0, act[of.LOWERED_COUNT])):
             _lower(tally, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS])
@@ -573,7 +577,7 @@ class Following:
         self._tally = Tally(
             counts=np.zeros(11, dtype=np.int64),
             shipped=np.zeros(2),
-            standing=np.zeros((len(names), 3), dtype=np.int64),
+            standing=np.zeros((len(names), 4), dtype=np.int64),
             shipped_by=np.zeros(robots),
             xy_m=site.starts_m.copy(),
             views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
