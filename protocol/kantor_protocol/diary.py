@@ -115,17 +115,16 @@ class DiaryFile:
             os.close(file)
 
 
-def tear(path: Path, steps: int) -> None:
-    """Cut a diary in the middle of a page, as a power cut may, so that it ends before the given step.
+def tear(path: Path, step: int) -> None:
+    """Cut a diary in the middle of a page, as a power cut may, so that it lacks the given step.
 
-    A birth at that step or later leaves nothing. Raises OSError.
+    If there is no such page nothing is cut. Raises OSError.
     """
-    content = path.read_bytes()
-    sound = _sound(content)
-    kept = -1 if sound is None else steps - 1 - sound.header.birth.step
-    if sound is None or kept < 0:
-        path.unlink()
-    elif kept + 1 < len(sound.ends):
+    sound = _sound(path.read_bytes())
+    if sound is None:
+        return
+    kept = max(0, step - sound.header.birth.step - 1)
+    if kept < len(sound.pages):
         os.truncate(path, (sound.ends[kept] + sound.ends[kept + 1]) // 2)
 
 

@@ -126,23 +126,20 @@ def test_a_diary_of_another_run_or_of_none_is_nothing(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["r1.diary"]
 
 
-@pytest.mark.parametrize(("step", "left"), [(9, 5), (8, 4), (4, 0), (12, 6)])
-def test_torn_it_ends_before_the_step_in_the_middle_of_a_page(
+@pytest.mark.parametrize(("step", "left"), [(9, 5), (8, 4), (4, 0), (3, 0), (12, 6)])
+def test_torn_it_lacks_a_step_and_ends_in_the_middle_of_a_page(
     tmp_path: Path, step: int, left: int
 ) -> None:
     path = tmp_path / "r1.diary"
     written(path, PAGES)
+    whole = path.stat().st_size
     tear(path, step)
 
+    assert (path.stat().st_size == whole) == (left == len(PAGES))
     assert found(path) == Pages(BIRTH, PAGES[:left])
-
-
-def test_torn_before_its_birth_nothing_is_left(tmp_path: Path) -> None:
-    path = tmp_path / "r1.diary"
-    written(path, PAGES)
-    tear(path, BIRTH.step)
-
-    assert found(path) is None
+    tear(path, 0)
+    tear(path, 0)
+    assert found(path) == Pages(BIRTH, [])
 
 
 def found_beside(path: Path) -> list[bytes]:
