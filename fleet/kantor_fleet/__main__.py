@@ -99,6 +99,7 @@ def agent(
     /,
     connect: str = "tcp/127.0.0.1:7447",
     credentials: Path = Path("credentials"),
+    state: Path = Path("state"),
     patience: float = 60.0,
 ) -> int:
     """A robot by hand. It needs only an endpoint, its id and its credentials.
@@ -107,6 +108,7 @@ def agent(
         id: Which robot, such as r1.
         connect: World-sim's endpoint, tcp/HOST:PORT.
         credentials: The credentials folder, or this robot's file.
+        state: Folder of its diary; started again with it, the robot goes on where it was.
         patience: Seconds to wait for world-sim to come up.
     """
     from kantor_agent.process import run as run_agent  # noqa: PLC0415
@@ -114,12 +116,13 @@ def agent(
 
     if id == "supervisor":
         fail(Exit.USAGE, "supervisor: not a robot; use `kantor supervisor`")
-    return participate_by_hand(run_agent, id, connect, credentials, patience)
+    return participate_by_hand(run_agent, id, connect, credentials, patience, state)
 
 
 def supervisor(
     connect: str = "tcp/127.0.0.1:7447",
     credentials: Path = Path("credentials"),
+    state: Path = Path("state"),
     patience: float = 60.0,
 ) -> int:
     """The supervisor by hand, for centralized scenarios.
@@ -127,12 +130,13 @@ def supervisor(
     Args:
         connect: World-sim's endpoint, tcp/HOST:PORT.
         credentials: The credentials folder, or the supervisor's file.
+        state: Folder of its diary.
         patience: Seconds to wait for world-sim to come up.
     """
     from kantor_fleet.by_hand import participate_by_hand  # noqa: PLC0415
     from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
 
-    return participate_by_hand(run_supervisor, "supervisor", connect, credentials, patience)
+    return participate_by_hand(run_supervisor, "supervisor", connect, credentials, patience, state)
 
 
 def sweep(

@@ -8,10 +8,10 @@ from kantor_fleet.interrupts import Interrupts
 from kantor_protocol import bus, credentials
 from kantor_protocol.credentials import FLEET_PATTERN, Identity
 from kantor_protocol.machine import ParticipantId
-from kantor_protocol.process import NotWantedError
+from kantor_protocol.process import NotWantedError, StateError
 from kantor_protocol.scenario import Scenario
 
-RunParticipant = Callable[[str, Identity, float, Callable[[str], None]], str]
+RunParticipant = Callable[[str, Identity, float, Callable[[str], None], Path], str]
 
 
 def host_by_hand(
@@ -59,7 +59,12 @@ def host_by_hand(
 
 
 def participate_by_hand(
-    run: RunParticipant, name: ParticipantId, connect: str, place: Path, patience_s: float
+    run: RunParticipant,
+    name: ParticipantId,
+    connect: str,
+    place: Path,
+    patience_s: float,
+    state: Path,
 ) -> Exit:
     """A participant in this terminal. Raises BusError, CredentialsError."""
     bus.check_endpoint(connect)
@@ -73,8 +78,8 @@ def participate_by_hand(
         print(line, flush=True)
 
     try:
-        reason = run(connect, identity, patience_s, say)
-    except NotWantedError as error:
+        reason = run(connect, identity, patience_s, say, state)
+    except (NotWantedError, StateError) as error:
         fail(Exit.USAGE, str(error))
     say(f"{name}: mission over: {reason}")
     return Exit.DONE

@@ -80,7 +80,9 @@ class Past(NamedTuple):
         except (OSError, ValueError) as error:
             raise ResumeError(f"{folder}: no folder that a run left ({error})") from None
         if not isinstance(manifest, dict) or not isinstance(manifest.get("run"), str):
-            raise ResumeError(f"{folder / MANIFEST}: written by another version; resume with that one")
+            raise ResumeError(
+                f"{folder / MANIFEST}: written by another version; resume with that one"
+            )
         if not records or not isinstance(records[0], Opening):
             raise ResumeError(f"{folder / JOURNAL}: nothing has happened in it; start the run anew")
         last = records[-1]
@@ -135,9 +137,7 @@ class Recording:
         if folder is not None:
             _write_json(folder / MANIFEST, self._manifest)
             self._table = _Table(folder / METRICS, self.metrics.columns)
-        self.journal = Journal(
-            None if folder is None else folder / JOURNAL, anew=past is not None
-        )
+        self.journal = Journal(None if folder is None else folder / JOURNAL, anew=past is not None)
         if past is not None:
             self._follow(past.records)
 

@@ -12,7 +12,15 @@ from typing import NamedTuple
 import msgspec
 
 from kantor_protocol.faults import Kill, OnProcesses
-from kantor_protocol.machine import WORLD_SIM, Body, Inputs, Outputs, ParticipantId, State
+from kantor_protocol.machine import (
+    WORLD_SIM,
+    Body,
+    Inputs,
+    Observation,
+    Outputs,
+    ParticipantId,
+    State,
+)
 from kantor_protocol.messages import RefusedError, check_outputs
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.channel import Channel, Sent, Verdict
@@ -138,6 +146,10 @@ class Stage:
     def body(self, name: ParticipantId) -> Body:
         """What whoever takes a participant over has to know."""
         return self._world.body(name)
+
+    def look(self, name: ParticipantId) -> Observation:
+        """What the world tells a participant of itself."""
+        return self._world.observe(name)
 
     def acted(self, name: ParticipantId) -> bool:
         """Whether a participant has ever stepped in this mission."""
