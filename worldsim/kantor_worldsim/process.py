@@ -13,7 +13,7 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from kantor_protocol.bus import BusError, Heard, Host, Joined, Left
+from kantor_protocol.bus import LEASE_MS, BusError, Heard, Host, Joined, Left
 from kantor_protocol.faults import Disk, Late
 from kantor_protocol.machine import (
     WORLD_SIM,
@@ -54,6 +54,8 @@ BARRIER_S = 10.0
 """Lockstep: a participant that has not answered by then misses the step."""
 RETURN_S = 20.0
 """How long to wait for a process that was started, or for the roster after world-sim was."""
+_COME_BACK_S = 3.0
+"""How soon whoever is cut off because world-sim was frozen is back."""
 _PROGRESS_S = 0.2
 _POLL_S = 0.02
 _CLOCK_TOLERANCE_NS = 500_000_000
@@ -162,6 +164,11 @@ class _Doorway:
         """Nonces of the processes that have got ready."""
         self._away: set[ParticipantId] = set()
         """Those that left without an excuse, or never came."""
+        self._doubtful: set[ParticipantId] = set()
+        """Those that may seem to have left because world-sim itself was frozen."""
+        self._looked_s = time.monotonic()
+        self._sure_s = 0.0
+        """When it is clear who has left."""
         self._clock: Callable[[], int] | None = None
         self._shown = 0.0
         self._starts = Array.of(plan.site.starts_m)
@@ -216,7 +223,9 @@ class _Doorway:
 
     def next(self, timeout_s: float) -> tuple[ParticipantId, Report] | None:
         """The next report, or None when something else came or the timeout passed."""
+        self._mind_own_absence()
         event = self.host.next(timeout_s)
+        self._looked_s = time.monotonic()
         if isinstance(event, Joined):
             self._join(event)
         elif isinstance(event, Left):
@@ -230,6 +239,20 @@ class _Doorway:
         for name in self._plan.scenario.roster:
             if self._admission.player(name) is not None:
                 self.host.send(name, encode(Stop(VERSION, reason)), patiently=True)
+
+    def _mind_own_absence(self) -> None:
+        """Who left while world-sim itself was frozen gets time to come back."""
+        now_s = time.monotonic()
+        if now_s - self._looked_s > LEASE_MS * 0.5e-3:
+            self._sure_s = now_s + _COME_BACK_S
+        elif self._doubtful and now_s >= self._sure_s:
+            for name in sorted(self._doubtful):
+                self._lose(name)
+            self._doubtful.clear()
+
+    def is_expected(self, name: ParticipantId) -> bool:
+        """Whether a participant may answer."""
+        return name in self.ready or name in self._doubtful
 
     def is_there(self, name: ParticipantId) -> bool:
         """Whether a process that plays a participant is on the bus."""
@@ -273,10 +296,17 @@ class _Doorway:
         name = event.name
         if not self._admission.leave(name, event.nonce) or self.ready.pop(name, None) is None:
             return
-        if self._clock is not None and name not in self.excused:
-            self._away.add(name)
-            self.stage.gone = self.stage.gone | {name}
-            self._note(name, "leave")
+        if self._clock is None or name in self.excused:
+            return
+        if time.monotonic() < self._sure_s:
+            self._doubtful.add(name)
+        else:
+            self._lose(name)
+
+    def _lose(self, name: ParticipantId) -> None:
+        self._away.add(name)
+        self.stage.gone = self.stage.gone | {name}
+        self._note(name, "leave")
 
     def _hear(self, event: Heard) -> tuple[ParticipantId, Report] | None:
         try:
@@ -305,6 +335,7 @@ class _Doorway:
         self.ready[name] = nonce
         self._met.add(nonce)
         self.visits[name] += 1
+        self._doubtful.discard(name)
         if self._clock is not None and name in self._away:
             self._come(name)
         self.newcomers.append(name)
@@ -378,7 +409,7 @@ class _Lockstep:
                 if name in doorway.ready and name not in outputs and asked.get(name) != visit:
                     asked[name] = visit
                     doorway.host.send(name, encode(Turn(VERSION, inputs[name])), patiently=True)
-            if all(name in outputs or name not in doorway.ready for name in inputs):
+            if all(name in outputs or not doorway.is_expected(name) for name in inputs):
                 break
             report = doorway.next(0.05)
             while report is not None:
@@ -625,11 +656,8 @@ class _Deeds:
         deeds = deeds_of(plan.scenario)
         for deed in deeds[: stage.deeds]:
             self._keep_count(deed)
-        following = deeds[stage.deeds] if stage.deeds < len(deeds) else None
-        self.world_starts_ns: int | None = None
+        self.world_starts_ns = _world_starts_ns(deeds, stage.deeds)
         """When world-sim is to start again, if a fault has killed it."""
-        if following is not None and (following.what, following.who) == ("start", WORLD_SIM):
-            self.world_starts_ns = following.at_ns
 
     @property
     def busy(self) -> bool:
@@ -766,6 +794,15 @@ class _Deeds:
     def _order(self, order: Order) -> bool | None:
         assert self._doorway.hands is not None, "faults of processes need hands"
         return self._doorway.hands(order)
+
+
+def _world_starts_ns(deeds: list[Deed], done: int) -> int | None:
+    """When world-sim starts again, if it has been killed by then."""
+    of_world = [(i, deed) for i, deed in enumerate(deeds) if deed.who == WORLD_SIM]
+    killed = [deed.what for i, deed in of_world if i < done and deed.what in {"kill", "start"}]
+    if killed[-1:] != ["kill"]:
+        return None
+    return next(deed.at_ns for i, deed in of_world if i >= done and deed.what == "start")
 
 
 def progress(metrics: Following, scenario: Scenario, phase: str, detail: str) -> Progress:
