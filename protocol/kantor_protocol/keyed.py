@@ -50,6 +50,8 @@ class Purpose(enum.IntEnum):
     FAULT_REPLAY = 22
     FAULT_REORDER = 23
     FAULT_FLAP = 24
+    FAULT_HOSTILE = 25
+    FORGERY = 26
 
 
 @kernel

@@ -18,11 +18,12 @@ def run(
     state: folder of its diary. Raises BusError, NotWantedError and StateError.
     """
 
-    def build(mission: Mission, _body: Body) -> StateMachine:
+    def build(mission: Mission, body: Body) -> StateMachine:
+        me, scenario = identity.user, mission.scenario
         if mission.frame is not None:
             from kantor_supervisor.allocation import Allocation  # noqa: PLC0415  only on a map
 
-            return Allocation(identity.user, mission.scenario, mission.seed, mission.frame)
-        return Supervisor(identity.user, mission.scenario, mission.samples.shape[0])
+            return Allocation(me, scenario, mission.seed, body, mission.frame)
+        return Supervisor(me, scenario, body, mission.samples.shape[0])
 
     return participate(connect, identity, build, patience_s, say, state)
