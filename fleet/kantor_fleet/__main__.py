@@ -64,6 +64,7 @@ def worldsim(
     out: Path = Path("runs"),
     exact: bool = False,
     chaos: Path | None = None,
+    resume: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
 ) -> int:
     """World-sim by hand: host the bus, wait for the roster, run the mission, record it.
@@ -80,11 +81,17 @@ def worldsim(
         out: Where the run folder is made.
         exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
         chaos: A TOML file of [[faults]] that are added to the scenario's own.
+        resume: The folder of a run that was cut short: go on with its mission. Participants that wait
+            for it come back by themselves; give the same --listen, --credentials and --fleet.
         set: Override a key of the scenario.
     """
-    from kantor_fleet.by_hand import host_by_hand  # noqa: PLC0415
+    from kantor_fleet.by_hand import host_by_hand, resume_by_hand  # noqa: PLC0415
     from kantor_fleet.catalog import find  # noqa: PLC0415
 
+    if resume is not None:
+        if set or chaos is not None:
+            fail(Exit.USAGE, "--resume: the run has its scenario; leave out --set and --chaos")
+        return resume_by_hand(resume, listen, credentials, fleet)
     _check_seed(seed)
     _check_speed(speed)
     mission = find(scenario, set, chaos)

@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import msgspec
 
 from kantor_protocol.bus import LEASE_MS, BusError, Heard, Host, Joined, Left
-from kantor_protocol.faults import Disk, Late
+from kantor_protocol.faults import Clock, Disk, Impostor, Kill, Late, OnProcesses, kind_of
 from kantor_protocol.machine import (
     WORLD_SIM,
     Body,
@@ -376,6 +376,15 @@ class _Doorway:
             self._show(message)
 
 
+def needs_hands(scenario: Scenario, exchange: str) -> str | None:
+    """The first fault that only whoever has started the processes can carry out, as `faults[i]: kind`."""
+    real = (Kill, Late, Impostor) if exchange == "lockstep" else OnProcesses
+    for i, fault in enumerate(scenario.faults):
+        if isinstance(fault, real) and not isinstance(fault, Clock):
+            return f"faults[{i}]: {kind_of(fault)}"
+    return None
+
+
 def late(scenario: Scenario) -> Iterator[ParticipantId]:
     """Participants that are not there from the start."""
     for fault in scenario.faults:
@@ -516,10 +525,11 @@ class _Relay:
             while doorway.newcomers:
                 self._welcome(doorway.newcomers.popleft())
             report = doorway.next(self._patience_s())
-            if report is not None:
-                self._settle(*report)
             deeds.do(self._now_ns)
-            self._deliver()
+            if not deeds.world_is_down:  # what is said now is said again
+                if report is not None:
+                    self._settle(*report)
+                self._deliver()
 
     @property
     def _now_ns(self) -> int:
@@ -649,6 +659,8 @@ class _Deeds:
         """What has been begun and is not done."""
         self._since_s = 0.0
         self._visit = 0
+        self.world_is_down = False
+        """On record it has not gone on yet."""
         self._paused: set[ParticipantId] = set()
         self._slow: set[ParticipantId] = set()
         self._held: set[ParticipantId] = set()
@@ -692,8 +704,9 @@ class _Deeds:
         return True
 
     def welcome(self, name: ParticipantId) -> None:
-        """Whoever is there again is excused no more."""
-        if name not in self._paused | self._slow:
+        """Whoever is there again is excused no more, unless it is about to go."""
+        going = self._deed is not None and (self._deed.what, self._deed.who) == ("kill", name)
+        if not going and name not in self._paused | self._slow:
             self._doorway.excused.discard(name)
 
     def do(self, now_ns: int) -> None:
@@ -710,8 +723,8 @@ class _Deeds:
 
     def _begin(self, deed: Deed, now_ns: int) -> None:
         self._since_s = time.monotonic()
-        self._keep_count(deed)
         who, doorway = deed.who, self._doorway
+        self._keep_count(deed)
         if who == WORLD_SIM:
             self._begin_on_world_sim(deed, now_ns)
         elif deed.what == "kill":
@@ -776,8 +789,8 @@ class _Deeds:
     def _keep_count(self, deed: Deed) -> None:
         """Know who is stopped by what."""
         if deed.who == WORLD_SIM:
-            return
-        if deed.what == "pause":
+            self.world_is_down = deed.what in {"kill", "pause"}
+        elif deed.what == "pause":
             self._paused.add(deed.who)
         elif deed.what == "resume":
             self._paused.discard(deed.who)
