@@ -57,14 +57,14 @@ def resume_by_hand(folder: Path, listen: str, secrets: Path, fleet: str) -> Exit
         past = Past.of(folder)
     except ResumeError as error:
         fail(Exit.USAGE, str(error))
-    opening, manifest = past.opening, past.manifest
-    scenario, seed = opening.scenario, opening.seed
-    exchange, speed, every = (manifest.get(key) for key in ("exchange", "speed", "exact_every"))
+    terms, opening = past.terms, past.opening
+    scenario, seed, exchange = opening.scenario, opening.seed, terms.exchange
     _check_faults(scenario, exchange)
-    plan = Plan(scenario, seed, opening.site, exchange, speed)
+    plan = Plan(scenario, seed, opening.site, exchange, terms.speed)
 
     def record() -> tuple[Path, "Recording"]:
-        return folder, Recording(scenario, seed, exchange, folder, every, speed=speed, past=past)
+        every = terms.exact_every
+        return folder, Recording(scenario, seed, exchange, folder, every, past=past)
 
     return _host(plan, listen, secrets, fleet, record, past)
 

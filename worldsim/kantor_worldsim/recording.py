@@ -63,9 +63,20 @@ class ResumeError(ValueError):
     """A run folder from which no mission can go on; the message is one line with the remedy."""
 
 
+class Terms(msgspec.Struct, frozen=True):
+    """How a run is run, in its manifest."""
+
+    run: str
+    """Names it."""
+    exchange: str
+    speed: float
+    exact_every: int | None = None
+
+
 class Past(NamedTuple):
     """What a run folder holds of a mission that was cut short."""
 
+    terms: Terms
     opening: Opening
     records: tuple[Record, ...]
     """The opening and all that followed, without an ending."""
@@ -77,12 +88,11 @@ class Past(NamedTuple):
         try:
             manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
             records = [record for _, record in read(folder / JOURNAL)]
-        except (OSError, ValueError) as error:
+            terms = msgspec.convert(manifest, Terms)
+        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
             raise ResumeError(f"{folder}: no folder that a run left ({error})") from None
-        if not isinstance(manifest, dict) or not isinstance(manifest.get("run"), str):
-            raise ResumeError(
-                f"{folder / MANIFEST}: written by another version; resume with that one"
-            )
+        except msgspec.ValidationError as error:
+            raise ResumeError(f"{folder / MANIFEST}: of another version: {error}") from None
         if not records or not isinstance(records[0], Opening):
             raise ResumeError(f"{folder / JOURNAL}: nothing has happened in it; start the run anew")
         last = records[-1]
@@ -90,7 +100,7 @@ class Past(NamedTuple):
             if "digest" in manifest and last.reason != "interrupted":
                 raise ResumeError(f"{folder}: its mission is over ({last.reason})")
             records.pop()
-        return cls(records[0], tuple(records), manifest)
+        return cls(terms, records[0], tuple(records), manifest)
 
 
 class Recording:
@@ -125,7 +135,7 @@ class Recording:
         self._started = monotonic()
         self._rows = 0
         self._table: _Table | None = None
-        self.run = secrets.token_hex(8) if past is None else past.manifest["run"]
+        self.run = secrets.token_hex(8) if past is None else past.terms.run
         """Names the run."""
         if folder is not None and past is not None:
             resumed = past.manifest.get("resumed", 0) + 1
