@@ -325,7 +325,8 @@ class _Doorway:
     def _get_ready(self, name: ParticipantId, message: Ready) -> None:
         if not _follows(message, self.stage.body(name)):
             self._refuse(
-                Joined(name, message.nonce), "has another past than the world; start it again"
+                Joined(name, message.nonce),
+                "has another past than this run; delete its diary and start it again",
             )
             return
         self.told[name] = message
@@ -349,7 +350,9 @@ class _Doorway:
         """Put on record what nobody ordered."""
         assert self._clock is not None
         now_ns, told = max(self._clock(), self.stage.now_ns), self.told.get(name)
-        step, epoch = (told.step, told.epoch) if what == "join" and told else (0, 0)
+        step = epoch = 0
+        if what == "join" and told is not None:  # one that was only frozen has told it long ago
+            step, epoch = max(told.step, self.stage.body(name).step), told.epoch
         self.stage.note(Incident(now_ns, name, what, -1, step, epoch))
 
     def go(self, name: ParticipantId, now_ns: int, speed: float, skew_ns: int) -> None:
