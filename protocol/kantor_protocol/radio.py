@@ -29,8 +29,8 @@ class Radio:
         roster = scenario.roster
         self._me, self._epoch, self._origins = me, epoch, len(roster)
         self._places = {name: i for i, name in enumerate(roster) if name != me}
-        self._supervisor = self._places.get(SUPERVISOR, NOBODY)
-        """The slot of its newest incarnation."""
+        self._supervisor = self._supervisor_slot = self._places.get(SUPERVISOR, NOBODY)
+        """Its place, and the slot of its newest incarnation; NOBODY without one."""
         self._unheard_steps = -patience_steps(me, scenario)  # the first word takes its time
         """Own steps since the supervisor was heard."""
 
@@ -49,15 +49,15 @@ class Radio:
         slot = place + news.epoch * self._origins
         if not learn(slot, news):
             return False
-        if place == self._supervisor % self._origins:
-            self._supervisor = max(self._supervisor, slot)
+        if place == self._supervisor:
+            self._supervisor_slot = max(self._supervisor_slot, slot)
             self._unheard_steps = 0
         return True
 
     def say(self, replica: Replica, step: int, pose: Pose) -> Envelope:
         """What whoever it talks to lacks."""
         alone = self._supervisor == NOBODY or self._unheard_steps > CONTACT_PERIODS
-        slot = NOBODY if alone else self._supervisor
+        slot = NOBODY if alone else self._supervisor_slot
         target = EVERYBODY if alone else SUPERVISOR
         have, logs, claims = replica.compose(slot)
         news = News(

@@ -21,6 +21,7 @@ from kantor_protocol.messages import (
     encode,
     encode_news,
 )
+from kantor_protocol.slots import EPOCHS_MAX
 
 FIRST_SEQUENCE = 2**62
 """Forgeries are numbered from here on; no participant sends so much."""
@@ -72,7 +73,8 @@ def _nothing(_dice: Dice, _body: bytes, _news: News) -> bytes:
 
 
 def _noise(dice: Dice, _body: bytes, _news: News) -> bytes:
-    noise = bytes([dice.below(256) for _ in range(1 + dice.below(_NOISE_BYTES_MAX))])
+    length = 1 + dice.below(_NOISE_BYTES_MAX)
+    noise = b"".join([dice.below(1 << 48).to_bytes(6, "big") for _ in range(0, length, 6)])[:length]
     return b"" if _is_news(noise) else noise
 
 
@@ -91,6 +93,10 @@ def _nowhere(dice: Dice, _body: bytes, news: News) -> bytes:
 
 def _before_the_start(_dice: Dice, _body: bytes, news: News) -> bytes:
     return encode_news(replace(news, step=-1))
+
+
+def _of_no_incarnation(dice: Dice, _body: bytes, news: News) -> bytes:
+    return encode_news(replace(news, epoch=(EPOCHS_MAX + 1, -1, 2**40)[dice.below(3)]))
 
 
 def _another_kind(_dice: Dice, body: bytes, _news: News) -> bytes:
@@ -151,6 +157,7 @@ FORGERS: tuple[Forger, ...] = (
     _another_version,
     _nowhere,
     _before_the_start,
+    _of_no_incarnation,
     _another_kind,
     _vector_of_wrong_length,
     _huge_number_in_vector,

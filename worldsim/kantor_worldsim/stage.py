@@ -103,6 +103,8 @@ class Stage:
                 stage._repeat(record)
             except KeyError as error:
                 raise ForeignRecordError(f"record {number}: {error} is not under way") from None
+            except IndexError:
+                raise ForeignRecordError(f"record {number}: no such fault") from None
             if told != [record]:
                 raise ForeignRecordError(f"record {number}: does not follow from those before it")
             told.clear()
@@ -183,10 +185,10 @@ class Stage:
         ruled, out_of_range = self.channel.transmit(sent)
         verdicts = tuple(ruled)
         acts = tuple([self._act(step) for step in sound])
-        absent = tuple([act.name for act in acts if act.outputs is None])
+        absent = [act.name for act in acts if act.outputs is None] if self._unanswered else ()
         tolls = self._faults.take_tolls() if self._faults else ()
         forged = self._faults.take_forged() if self._faults else ()
-        self._tell(Batch(now_ns, acts, verdicts, out_of_range, absent, tolls, forged))
+        self._tell(Batch(now_ns, acts, verdicts, out_of_range, tuple(absent), tolls, forged))
         return verdicts
 
     def note(self, incident: Incident) -> None:
