@@ -50,6 +50,7 @@ class Purpose(enum.IntEnum):
     FAULT_REPLAY = 22
     FAULT_REORDER = 23
     FAULT_FLAP = 24
+    CAMPAIGN = 25
 
 
 @kernel
