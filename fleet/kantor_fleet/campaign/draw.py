@@ -7,7 +7,7 @@ A mission has two phases. Up to a moment that is drawn everything may go wrong (
 but that who is lost stays lost, and the team has to come to its end (liveness).
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import msgspec
@@ -36,6 +36,8 @@ _A_CLASS = 16
 """Subjects of draws; from the last one on, one for each class of faults."""
 
 _CENTRALIZED = 0.35
+_METRICS_EVERY = 20
+"""Nobody looks at the rows."""
 _TRIES = 6
 """Faults that cannot be there together are drawn anew, so often."""
 _LOST_SHARE = 0.5
@@ -65,6 +67,7 @@ def draw(seed: int) -> Scenario:
         "summary": f"Seed {seed} of a campaign: {sort}, faults up to t = {calm_s:g} s",
         "radio": _radio(seed, tree),
         "publish": _publish(seed),
+        "metrics": {"every": _METRICS_EVERY},
     }
     scenario = from_tree(tree, f"seed {seed}")
     faults = tuple(_faults(seed, scenario, calm_s))
@@ -170,7 +173,10 @@ def _gaussian(dice: Dice, side_m: float) -> Tree:
 
 
 def _clock(seed: int, period_s: float) -> Tree:
+    """Half of the teams step all at once; then one moment is one batch."""
     dice = Dice(seed, _CLOCK)
+    if dice.coin():
+        return {"period_s": period_s, "spread": 0.0}
     spread = dice.between(0.0, 0.4) if dice.coin(0.4) else 0.0
     drift_ppm = dice.scale(1.0, 50_000.0) if dice.coin(0.4) else 0.0
     jitter = dice.between(0.0, 0.8) if dice.coin(0.4) else 0.0
@@ -379,7 +385,7 @@ def _faults(seed: int, scenario: Scenario, calm_s: float) -> Iterable[Fault]:
     return taken
 
 
-def _candidates(at: _Setting, kind: str, taken: list[Fault]) -> Iterable[Fault]:
+def _candidates(at: _Setting, kind: str, taken: list[Fault]) -> Iterator[Fault]:
     """Faults of a class that can be there with the others."""
     for _ in range(_TRIES):
         tree = {"kind": kind, **_DRAWN[kind](at)}

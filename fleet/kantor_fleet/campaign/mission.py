@@ -4,6 +4,9 @@ import tempfile
 import time
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+
+import msgspec
 
 from kantor_fleet.campaign.dice import Dice
 from kantor_fleet.campaign.draw import sort_of
@@ -44,9 +47,9 @@ class Trial(Outcome, frozen=True, kw_only=True):
     digest: str = ""
     complaints: tuple[str, ...] = ()
     """What referees found, at most ten; `rule: when: who: what`."""
-    struck: dict[str, int] = {}
+    struck: dict[str, int] = msgspec.field(default_factory=dict)
     """Copies or processes hit, by class of faults."""
-    seen: dict[str, int] = {}
+    seen: dict[str, int] = msgspec.field(default_factory=dict)
     """Rare situations; see `sightings`."""
     twice: int = 0
     """1: executed twice."""
@@ -73,12 +76,12 @@ def attempt(case: Case) -> Trial:
     """Run a case; whatever goes wrong is in the trial. It needs nothing but the case."""
     started_s, cpu_s = time.monotonic(), time.process_time()
     try:
-        trial = _attempt(case)
+        came = _attempt(case)
     except Exception as error:  # noqa: BLE001  a mission that crashes is a finding like any other
-        trial = {"failed": reason(error)}
+        came = {"failed": reason(error)}
     scenario = case.scenario
     return Trial(
-        **trial,
+        **came,
         sort=sort_of(scenario),
         planner=scenario.planner.name,
         centralized=scenario.centralized,
@@ -95,6 +98,7 @@ class Follower:
         """folder: for the run's files, as `kantor run` leaves them; None keeps nothing."""
         self.recording = Recording(scenario, seed, "in-process", folder)
         self.payloads: list[bytes] = []
+        self._keep()
         self.struck, self.sightings = Struck(), Sightings()
         self.steps = 0
         self._robots = frozenset(scenario.robot_ids)
@@ -102,12 +106,21 @@ class Follower:
     def take(self, record: Record) -> None:
         """Follow one record."""
         self.recording.take(record)
-        self.payloads.append(encode_record(record))
         self.struck.take(record)
         self.sightings.take(record)
         if isinstance(record, Batch):
             for act in record.acts:
                 self.steps += act.outputs is not None and act.name in self._robots
+
+    def _keep(self) -> None:
+        """Note the bytes of every record as the journal takes them."""
+        take = self.recording.journal.take
+
+        def taken(record: Record, payload: bytes = b"") -> None:
+            self.payloads.append(payload or encode_record(record))
+            take(record, payload)
+
+        self.recording.journal.take = taken  # type: ignore[method-assign]
 
     @property
     def broken(self) -> bool:
@@ -120,7 +133,7 @@ class Follower:
         return seen or tuple(_judged(self.payloads)[:10])
 
 
-def _attempt(case: Case) -> dict[str, object]:
+def _attempt(case: Case) -> dict[str, Any]:
     scenario, seed = case.scenario, case.seed
     site = Site.of(scenario, seed)
     follower = Follower(scenario, seed)
@@ -131,7 +144,7 @@ def _attempt(case: Case) -> dict[str, object]:
     if twice and not complaints:
         complaints = tuple(_differing(scenario, seed, result.digest))
     if cut and not complaints:
-        complaints = tuple(_cut_open(scenario, seed, follower.payloads))
+        complaints = tuple(_cut_open(seed, follower.payloads))
     return {
         "ended": ended,
         "steps": follower.steps,
@@ -159,7 +172,7 @@ def _differing(scenario: Scenario, seed: int, digest: str) -> Iterable[str]:
         yield f"digest: executed twice, and {again.hex} is not {digest}"
 
 
-def _cut_open(scenario: Scenario, seed: int, payloads: list[bytes]) -> Iterable[str]:
+def _cut_open(seed: int, payloads: list[bytes]) -> Iterable[str]:
     """The journal as a killed recorder leaves it: every record up to the cut, and nothing wrong in them."""
     dice = Dice(seed, _SUBJECT)
     with tempfile.TemporaryDirectory() as folder:

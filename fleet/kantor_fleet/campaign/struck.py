@@ -94,4 +94,4 @@ def _classes_of(fault: Fault, who: ParticipantId) -> Iterable[str]:
 
 def is_of_processes(name: str) -> bool:
     """Whether a class is about processes, and not about links."""
-    return issubclass(KINDS[name.split()[0]], OnProcesses)
+    return issubclass(KINDS[name.split(maxsplit=1)[0]], OnProcesses)
