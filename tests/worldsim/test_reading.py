@@ -47,6 +47,8 @@ def plain(batch: Batch, roster: tuple[str, ...], samples: int) -> list[Any]:
             place(act.name, roster),
             act.now_ns,
             [[place(source, roster), sequence] for source, sequence in act.heard],
+            act.observation.step,
+            act.skew_ns,
         ]
         if out is not None and ruling is not None:
             refused = {"step", "energy", "units"} & set(ruling.violations)
@@ -56,18 +58,19 @@ def plain(batch: Batch, roster: tuple[str, ...], samples: int) -> list[Any]:
             told += [[ruling.pose.x_m, ruling.pose.y_m]]
             told += [None if out.goal is None else [*out.goal], out.weights]
             told += [pairs(out.spent, samples), pairs(out.lowered, samples)]
-            told += [
-                [
-                    [place(e.source, roster), e.sequence, place(e.target, roster), e.body]
-                    for e in out.outbox
-                ]
-            ]
+            told += [[addressed(e, roster) for e in out.outbox]]
         acts.append(told)
     verdicts = [
         [place(v.source, roster), v.sequence, place(v.target, roster), v.due_ns]
         for v in batch.verdicts
     ]
-    return [acts, verdicts]
+    return [acts, verdicts, [addressed(e, roster) for e in batch.injected]]
+
+
+def addressed(envelope: Envelope, roster: tuple[str, ...]) -> list[Any]:
+    """An envelope, names as places."""
+    source, sequence, target, body = msgspec.structs.astuple(envelope)
+    return [place(source, roster), sequence, place(target, roster), body]
 
 
 def tabled(reading: Reading) -> list[Any]:
@@ -76,11 +79,15 @@ def tabled(reading: Reading) -> list[Any]:
     def rows(table: np.ndarray, first: int, count: int) -> list[list[int]] | None:
         return None if count == of.NOT_DECODED else table[first : first + count].tolist()
 
+    def bodies(sent: list[list[int]] | None) -> list[Any]:
+        return [[*head, reading.payload[at:end]] for *head, at, end in sent or ()]
+
     acts: list[Any] = []
     for row in range(int(reading.sizes[of.ACTS])):
         act = reading.acts[row].tolist()
         heard = rows(reading.heard, act[of.HEARD], act[of.HEARD_COUNT])
         told: list[Any] = [act[of.PLACE], act[of.NOW_NS], heard]
+        told += [act[of.OBSERVED], act[of.SKEW_NS]]
         if act[of.PRESENT]:
             told += [act[of.STEP], act[of.ENERGY], act[of.STATE], act[of.REFUSED], act[of.FINDS]]
             told += [act[of.VIOLATIONS], bool(act[of.VOID]), act[of.WEIGHTS_BYTES]]
@@ -90,10 +97,11 @@ def tabled(reading: Reading) -> list[Any]:
             told += [[goal_x_m, goal_y_m] if act[of.HEADS] else None, reading.payload[begin:end]]
             told += [rows(reading.pairs, act[of.SPENT], act[of.SPENT_COUNT])]
             told += [rows(reading.pairs, act[of.LOWERED], act[of.LOWERED_COUNT])]
-            sent = rows(reading.sent, act[of.SENT], act[of.SENT_COUNT]) or []
-            told += [[[*head, reading.payload[at:end]] for *head, at, end in sent]]
+            told += [bodies(rows(reading.sent, act[of.SENT], act[of.SENT_COUNT]))]
         acts.append(told)
-    return [acts, rows(reading.verdicts, 0, int(reading.sizes[of.VERDICTS]))]
+    verdicts = rows(reading.verdicts, 0, int(reading.sizes[of.VERDICTS]))
+    injected = rows(reading.injected, 0, int(reading.sizes[of.INJECTED]))
+    return [acts, verdicts, bodies(injected)]
 
 
 @pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
@@ -112,7 +120,7 @@ def test_tables_hold_what_the_record_holds(played: Play, coordination: str) -> N
 ODD = Batch(
     1 << 62,
     (
-        Act("r10", -5, Observation(0, Pose(0.0, 0.0)), (("", 1 << 40), ("R1", 3)), None, None),
+        Act("r10", -5, Observation(0, Pose(0.0, 0.0)), (("", 1 << 40), ("R1", 3)), None, None, -7),
         Act(
             "r2",
             -(1 << 62),
@@ -133,6 +141,7 @@ ODD = Batch(
     ),
     (Verdict("r1", 2, "supervisor", DROPPED), Verdict("x" * 40, 1 << 33, "r3", -40_000)),
     out_of_range=3,
+    injected=(Envelope("r1", 1 << 62, "", b"\x98"), Envelope("r1\x00", 3, "r2", bytes(70_000))),
 )
 """Strangers, numbers of every width, a ruling in whole metres, pairs that do not decode."""
 
@@ -213,18 +222,18 @@ def test_noise_never_leads_outside(payload: bytes, at: int, values: int) -> None
 # News.
 
 
-def readable(body: bytes) -> tuple[bytes, bytes] | None:
+def readable(body: bytes) -> tuple[int, bytes, bytes] | None:
     try:
         news = decode_news(body)
     except RefusedError:
         return None
-    return news.have, news.logs
+    return news.epoch, news.have, news.logs
 
 
-def parts(body: bytes) -> tuple[bytes, bytes] | None:
+def parts(body: bytes) -> tuple[int, bytes, bytes] | None:
     framed = b"\xc0\xc0" + body + b"\xc0"
-    have, have_end, logs, logs_end = parts_of_news(framed, 2, 2 + len(body))
-    return None if logs_end < 0 else (framed[have:have_end], framed[logs:logs_end])
+    epoch, have, have_end, logs, logs_end = parts_of_news(framed, 2, 2 + len(body))
+    return None if logs_end < 0 else (epoch, framed[have:have_end], framed[logs:logs_end])
 
 
 _ALL_FIELDS = News(1, 0, 0.0, 0.0, b"", b"", b"\x00", b"\x00")
@@ -245,7 +254,7 @@ def test_news_is_read_as_the_codec_does(news: News, at: int, byte: int, cut: int
     changed = bytearray(body)
     changed[at % len(body)] = byte
 
-    assert parts(body) == (news.have, news.logs)
+    assert parts(body) == (news.epoch, news.have, news.logs)
     assert parts(body[: max(0, len(body) - cut - 1)]) is None
     assert parts(bytes(changed)) in (None, readable(bytes(changed)))
 
@@ -254,7 +263,11 @@ def test_news_is_read_as_the_codec_does(news: News, at: int, byte: int, cut: int
     "tree",
     [
         [1, 1, 7, 1, -2, b"h", b"l", b""],
-        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"more", [1, {"a": 2}]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"more", 3, [1, {"a": 2}]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 1],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"more", "no epoch"],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"more", b"no epoch", [1, {"a": 2}]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", 5, 5],
         [1, 2, 7, 1.5, 2.5, b"h", b"l", b""],
         [2, 1, 7, 1.5, 2.5, b"h", b"l", b""],
         [1, 1, -7, 1.5, 2.5, b"h", b"l", b""],
@@ -279,7 +292,9 @@ def test_record_holds_more_fields_some_day(played: Play) -> None:
     reader = Reader()
     reader.read(played()[0])
     tree = msgspec.msgpack.decode(encode_record(ODD))
+    tree.append({"new": 1})
     for act in tree[2]:
+        act[2].append("new")
         act.append({"new": [1, 2]})
         for part in (act[4], act[5]):
             if part is not None:
@@ -304,11 +319,11 @@ def test_garbled_batch_stays_within_its_tables(changes: list[tuple[int, int]]) -
     for at, byte in changes:
         payload[at % len(payload)] = byte
     rows = len(payload) // 2 + 1
-    around = [np.full((rows + 8, columns), 77, dtype=np.int64) for columns in (20, 2, 5, 4, 2)]
-    acts, heard, sent, verdicts, pairs = (table[:rows] for table in around)
-    poses_m = np.zeros((rows, 2))
-    sizes, bits = np.zeros(5, dtype=np.int64), poses_m.view(np.int64)
-    tables = (sizes, acts, poses_m, heard, sent, verdicts, pairs, bits)
+    around = [np.full((rows + 8, columns), 77, dtype=np.int64) for columns in (24, 2, 5, 4, 2, 5)]
+    acts, heard, sent, verdicts, pairs, injected = (table[:rows] for table in around)
+    poses_m = np.zeros((rows, 4))
+    sizes, bits = np.zeros(6, dtype=np.int64), poses_m.view(np.int64)
+    tables = (sizes, acts, poses_m, heard, sent, verdicts, pairs, injected, bits)
     of._read_batch(bytes(payload), *tables, 3, of.STRANGER, 60)
 
     assert all(bool((table[rows:] == 77).all()) for table in around)

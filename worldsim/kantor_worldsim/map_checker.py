@@ -12,7 +12,7 @@ from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
 from kantor_worldsim import survey as found
 from kantor_worldsim.channel import DROPPED, Verdict
 from kantor_worldsim.faults import LinkFaults
-from kantor_worldsim.records import Act, Batch, Opening
+from kantor_worldsim.records import Act, Batch, Incident, Opening
 from kantor_worldsim.sensors import walls_between
 from kantor_worldsim.survey import NEVER, Survey
 
@@ -69,6 +69,10 @@ class MapRules:
         for name in self._poses_m:
             if not self._is_free(name):
                 self._complain("wall", name, "starts where it is not free")
+
+    def befall(self, incident: Incident) -> None:
+        """Follow what befell a process."""
+        self._survey.take(incident)
 
     def check(self, batch: Batch) -> int:
         """Follow one batch; how many faults went without a complaint, since there are too many."""

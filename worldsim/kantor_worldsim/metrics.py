@@ -278,6 +278,7 @@ def _follow(
     _sent: np.ndarray,
     verdicts: np.ndarray,
     pairs: np.ndarray,
+    _injected: np.ndarray,
     counts: np.ndarray,
     shipped: np.ndarray,
     standing: np.ndarray,

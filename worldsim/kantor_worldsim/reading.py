@@ -32,20 +32,22 @@ FINDS, VIOLATIONS, VOID, WEIGHTS_BYTES, BODY_BYTES = 7, 8, 9, 10, 11
 HEARD, HEARD_COUNT, SENT, SENT_COUNT = 12, 13, 14, 15
 SPENT, SPENT_COUNT, LOWERED, LOWERED_COUNT = 16, 17, 18, 19
 HEADS, WEIGHTS = 20, 21
-_ACT_COLUMNS = 22
-"""PRESENT: it has outputs and a ruling; all columns from STEP on hold only then, but for HEARD.
+OBSERVED, SKEW_NS = 22, 23
+_ACT_COLUMNS = 24
+"""PRESENT: it has outputs and a ruling; all columns from STEP on hold only then, but for HEARD, OBSERVED and
+SKEW_NS. OBSERVED: the step in the observation that it was given.
 VOID: the world refused the step, its energy or its units, so that nothing was shipped. HEADS: it has a
 goal. WEIGHTS: where what it publishes begins in the payload."""
 
-# Columns of Reading.heard, Reading.sent and Reading.verdicts.
+# Columns of Reading.heard, Reading.sent, Reading.injected and Reading.verdicts.
 SOURCE, SEQUENCE, TARGET, DUE_NS = 0, 1, 2, 3
 BODY, BODY_END = 3, 4
 
 # Columns of Reading.pairs.
 SAMPLE, UNITS = 0, 1
 
-# Slots of Reading.sizes: rows of acts, verdicts, heard, sent and pairs.
-ACTS, VERDICTS, ALL_HEARD, ALL_SENT, PAIRS = 0, 1, 2, 3, 4
+# Slots of Reading.sizes: rows of acts, verdicts, heard, sent, pairs and injected.
+ACTS, VERDICTS, ALL_HEARD, ALL_SENT, PAIRS, INJECTED = 0, 1, 2, 3, 4, 5
 
 
 class Reading(NamedTuple):
@@ -54,9 +56,9 @@ class Reading(NamedTuple):
     payload: bytes
     """The encoded record."""
     sizes: npt.NDArray[np.int64]
-    """(5,): how many rows of each table count."""
+    """(6,): how many rows of each table count."""
     acts: npt.NDArray[np.int64]
-    """(rows, 22)"""
+    """(rows, 24)"""
     poses_m: npt.NDArray[np.float64]
     """(rows, 4): x and y of each ruling and of each goal, world frame."""
     heard: npt.NDArray[np.int64]
@@ -67,6 +69,8 @@ class Reading(NamedTuple):
     """(rows, 4): source, sequence, target, due_ns."""
     pairs: npt.NDArray[np.int64]
     """(rows, 2): sample, units."""
+    injected: npt.NDArray[np.int64]
+    """(rows, 5): like sent; what nobody sent."""
 
 
 # Msgpack. Kinds of a value by what its head says; SIMPLE: nil and truth values.
@@ -184,6 +188,7 @@ class Tables(NamedTuple):
     sent: npt.NDArray[np.int64]
     verdicts: npt.NDArray[np.int64]
     pairs: npt.NDArray[np.int64]
+    injected: npt.NDArray[np.int64]
     pose_bits: npt.NDArray[np.int64]
     """The memory of poses_m as integers."""
     robots: int
@@ -274,20 +279,24 @@ def _read_heard(tables: Tables, act: np.ndarray, at: int) -> int:
 
 
 @kernel
+def _read_envelope(tables: Tables, row: np.ndarray, at: int) -> int:
+    _, at = _array(tables.payload, at, _ANY)
+    row[SOURCE], at = _place(tables, at)
+    row[SEQUENCE], at = _number(tables.payload, at)
+    row[TARGET], at = _place(tables, at)
+    _, size, at = head_of(tables.payload, at)
+    row[BODY], row[BODY_END] = at, at + size
+    return at + size
+
+
+@kernel
 def _read_outbox(tables: Tables, act: np.ndarray, at: int) -> int:
     act[SENT] = tables.sizes[ALL_SENT]
     act[BODY_BYTES] = 0
     act[SENT_COUNT], at = _array(tables.payload, at, tables.sent.shape[0] - act[SENT])
     for row in range(act[SENT], act[SENT] + act[SENT_COUNT]):
-        sent = tables.sent[row]
-        _, at = _array(tables.payload, at, _ANY)
-        sent[SOURCE], at = _place(tables, at)
-        sent[SEQUENCE], at = _number(tables.payload, at)
-        sent[TARGET], at = _place(tables, at)
-        _, size, at = head_of(tables.payload, at)
-        sent[BODY], sent[BODY_END] = at, at + size
-        act[BODY_BYTES] += size
-        at += size
+        at = _read_envelope(tables, tables.sent[row], at)
+        act[BODY_BYTES] += tables.sent[row, BODY_END] - tables.sent[row, BODY]
     tables.sizes[ALL_SENT] += act[SENT_COUNT]
     return at
 
@@ -360,12 +369,13 @@ def _read_batch(
     sent: np.ndarray,
     verdicts: np.ndarray,
     pairs: np.ndarray,
+    injected: np.ndarray,
     pose_bits: np.ndarray,
     robots: int,
     supervisor: int,
     samples: int,
 ) -> int:
-    """Fill the tables; the position after the verdicts.
+    """Fill the tables; the position after what is read.
 
     Negative if this is no batch, or if a table has too few rows for it.
     """
@@ -378,12 +388,13 @@ def _read_batch(
         sent,
         verdicts,
         pairs,
+        injected,
         pose_bits,
         robots,
         supervisor,
     )
     sizes[:] = 0
-    fields, at = _array(payload, 0, _ANY)
+    parts, at = _array(payload, 0, _ANY)
     at = skip(payload, at, 2)  # tag, now_ns
     sizes[ACTS], at = _array(payload, at, acts.shape[0])
     for i in range(sizes[ACTS]):
@@ -391,11 +402,16 @@ def _read_batch(
         fields, at = _array(payload, at, _ANY)
         act[PLACE], at = _place(tables, at)
         act[NOW_NS], at = _number(payload, at)
-        at = skip(payload, at, 1)  # observation
+        items, at = _array(payload, at, _ANY)  # the observation
+        act[OBSERVED], at = _number(payload, at)
+        at = skip(payload, at, items - 1)
         at = _read_heard(tables, act, at)
         at = _read_outputs(tables, act, i, at, samples)
         at = _read_ruling(tables, act, i, at)
-        at = skip(payload, at, fields - 6)
+        act[SKEW_NS] = 0
+        if fields > 6:
+            act[SKEW_NS], at = _number(payload, at)
+        at = skip(payload, at, fields - 7)
         if at < 0:
             return _MALFORMED
     sizes[VERDICTS], at = _array(payload, at, verdicts.shape[0])
@@ -406,6 +422,12 @@ def _read_batch(
         verdicts[i, TARGET], at = _place(tables, at)
         verdicts[i, DUE_NS], at = _number(payload, at)
         at = skip(payload, at, fields - 4)
+    if parts < 8:
+        return at
+    at = skip(payload, at, 3)  # out_of_range, absent, tolls
+    sizes[INJECTED], at = _array(payload, at, injected.shape[0])
+    for i in range(sizes[INJECTED]):
+        at = _read_envelope(tables, injected[i], at)
     return at
 
 
@@ -417,12 +439,12 @@ def _is_finite(kind: int, value: int) -> bool:
 
 
 @kernel
-def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int]:
-    """Where `have` and `logs` of the News in payload[at:end] begin and end.
+def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int, int]:
+    """Epoch of the News in payload[at:end], and where its `have` and `logs` begin and end.
 
     The last is negative for what `decode_news` would refuse.
     """
-    refused = (0, 0, 0, _MALFORMED)
+    refused = (0, 0, 0, 0, _MALFORMED)
     if end - at > BODY_BYTES_MAX:
         return refused
     fields, at = _array(payload, at, _ANY)
@@ -442,11 +464,18 @@ def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int
     claims_kind, size, claims = head_of(payload, logs_end if logs > 0 else logs)
     if claims < 0 or not have_kind == logs_kind == claims_kind == BYTES:
         return refused
-    if fields > 8 and head_of(payload, claims + size)[0] != BYTES:  # the registers
+    at = claims + size
+    if fields > 8:
+        kind, size, at = head_of(payload, at)
+        if kind != BYTES or at < 0:  # the registers
+            return refused
+        at += size
+    epoch = 0
+    if fields > 9:
+        epoch, at = _number(payload, at)
+    if skip(payload, at, fields - 10) != end:
         return refused
-    if skip(payload, claims + size, fields - 8) != end:
-        return refused
-    return have, have_end, logs, logs_end
+    return epoch, have, have_end, logs, logs_end
 
 
 @kernel
@@ -504,8 +533,8 @@ class Reader:
         poses_m = np.zeros((rows, 4))
         self._pose_bits = poses_m.view(np.int64)
         self._tables = (
-            np.zeros(5, dtype=np.int64),
+            np.zeros(6, dtype=np.int64),
             np.zeros((rows, _ACT_COLUMNS), dtype=np.int64),
             poses_m,
-            *(np.zeros((rows, columns), dtype=np.int64) for columns in (2, 5, 4, 2)),
+            *(np.zeros((rows, columns), dtype=np.int64) for columns in (2, 5, 4, 2, 5)),
         )

@@ -306,7 +306,7 @@ def _follow_news(books: Books, land: Land, reading: Reading, row: int, item: int
     who = reading.acts[row, of.PLACE]
     sent = reading.sent[reading.acts[row, of.SENT] + item]
     payload = reading.payload
-    have, have_end, at, end = of.parts_of_news(payload, sent[of.BODY], sent[of.BODY_END])
+    _epoch, have, have_end, at, end = of.parts_of_news(payload, sent[of.BODY], sent[of.BODY_END])
     origins, robots = books.have.shape[0], books.held.shape[0]
     after = have
     for _ in range(origins):
@@ -336,6 +336,7 @@ def _follow(
     sent: np.ndarray,
     verdicts: np.ndarray,
     pairs: np.ndarray,
+    injected: np.ndarray,
     first_tick: np.ndarray,
     frontier: np.ndarray,
     held: np.ndarray,
@@ -356,7 +357,7 @@ def _follow(
         first_tick, frontier, held, made, told, have, folded, counts, stood, union, faults
     )
     land = Land(truth, counting, exact)
-    reading = Reading(payload, sizes, acts, poses_m, heard, sent, verdicts, pairs)
+    reading = Reading(payload, sizes, acts, poses_m, heard, sent, verdicts, pairs, injected)
     for row in range(sizes[of.ACTS]):
         who = acts[row, of.PLACE]
         if who >= 0 and acts[row, of.PRESENT]:
