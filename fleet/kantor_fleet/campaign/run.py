@@ -168,13 +168,17 @@ def _report(folder: Path, broken: Broken) -> None:
     place = folder / f"seed-{seed}"
     place.mkdir(parents=True, exist_ok=True)
     (place / SMALLEST).write_text(to_toml(smallest), encoding="utf-8")
-    print(f"  smallest   {_size(case.scenario)} -> {_size(smallest)}: {printable(still.violation or 'none')}")
+    print(
+        f"  smallest   {_size(case.scenario)} -> {_size(smallest)}: {printable(still.violation or 'none')}"
+    )
     print(f"             {_command(place / SMALLEST, seed)}")
 
 
 def _verdict(order: Order, totals: Totals) -> Exit:
     if totals.missions < len(order.seeds):
-        print(f"kantor: {totals.missions} of {len(order.seeds)} missions are done; the same command goes on")
+        print(
+            f"kantor: {totals.missions} of {len(order.seeds)} missions are done; the same command goes on"
+        )
     if totals.missions < ENOUGH or not totals.missing:
         return Exit.DONE
     for name in totals.missing:

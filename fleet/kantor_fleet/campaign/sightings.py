@@ -212,9 +212,7 @@ class _Goals(_Sight):
         if left.get(sample) == 0 and sample not in dict(self._decoded(outputs.spent)):
             self.seen["merge that removes the current goal"] += 1
         elif now is not None and sample not in left and self.scenario.claiming:
-            shared = any(
-                goal == before for name, goal in self._goals.items() if name != act.name
-            )
+            shared = any(goal == before for name, goal in self._goals.items() if name != act.name)
             self.seen["one goal of two, left to one by a claim"] += shared
 
     def _decoded(self, content: bytes) -> Iterator[tuple[int, int]]:
@@ -334,7 +332,10 @@ class Sightings:
     def counts(self) -> dict[str, int]:
         """How often each situation was seen; those that were not are left out."""
         return {
-            name: sight.seen[name] for sight in self._sights for name in sight.names if sight.seen[name]
+            name: sight.seen[name]
+            for sight in self._sights
+            for name in sight.names
+            if sight.seen[name]
         }
 
 

@@ -3,7 +3,16 @@
 from collections import Counter
 from collections.abc import Iterable
 
-from kantor_protocol.faults import KINDS, Fault, Hostile, Kill, OnProcesses, Partition, Pause, kind_of
+from kantor_protocol.faults import (
+    KINDS,
+    Fault,
+    Hostile,
+    Kill,
+    OnProcesses,
+    Partition,
+    Pause,
+    kind_of,
+)
 from kantor_protocol.machine import SUPERVISOR, WORLD_SIM, ParticipantId
 from kantor_worldsim.records import Batch, Incident, Opening, Record
 

@@ -87,9 +87,7 @@ class Totals:
         yield self._table("class of faults", "copies or processes", CLASSES, self.struck)
         yield self._table("sometimes", "times", SIGHTS, self.seen)
 
-    def _table(
-        self, title: str, unit: str, names: tuple[str, ...], counts: Counter[str]
-    ) -> Table:
+    def _table(self, title: str, unit: str, names: tuple[str, ...], counts: Counter[str]) -> Table:
         table = Table(title, "missions", unit, box=None, pad_edge=False)
         for column in table.columns[1:]:
             column.justify = "right"
