@@ -50,7 +50,9 @@ class Purpose(enum.IntEnum):
     FAULT_REPLAY = 22
     FAULT_REORDER = 23
     FAULT_FLAP = 24
-    CAMPAIGN = 25
+    FAULT_HOSTILE = 25
+    FORGERY = 26
+    CAMPAIGN = 27
 
 
 @kernel

@@ -111,6 +111,10 @@ def news(act: Act, change: Callable[[News], News]) -> Change:
     return outputs(outbox=(msgspec.structs.replace(envelope, body=body),))
 
 
+LATE_NS = 1 << 60
+"""After every end: who is to hear something then never does."""
+
+
 def add_verdict(records: Records, batch: Batch, verdict: Verdict) -> list[Record]:
     """The records with one more verdict of the radio."""
     told = msgspec.structs.replace(batch, verdicts=(*batch.verdicts, verdict))
@@ -270,13 +274,13 @@ def breaks(*broken: str, run: tuple[str, ...] = ()) -> Callable[[Break], Break]:
 @breaks("range", run=RADIOS["short"])
 def _delivered_over_the_hills(records: Records) -> list[Record]:
     first = batches(records)[0]
-    return add_verdict(records, first, Verdict("r1", 1, "r2", first.now_ns))
+    return add_verdict(records, first, Verdict("r1", 1, "r2", LATE_NS))
 
 
 @breaks("range", run=("coordination=centralized", "supervisor.range_m=20"))
 def _delivered_to_a_far_supervisor(records: Records) -> list[Record]:
     first = batches(records)[0]
-    return add_verdict(records, first, Verdict("r1", 1, SUPERVISOR, first.now_ns))
+    return add_verdict(records, first, Verdict("r1", 1, SUPERVISOR, LATE_NS))
 
 
 @breaks("range")
@@ -306,7 +310,7 @@ def revived(records: Records) -> list[Record]:
     """The records with one drop, the first, as a delivery."""
     batch = next(b for b in batches(records) if any(v.due_ns == DROPPED for v in b.verdicts))
     lost = next(v for v in batch.verdicts if v.due_ns == DROPPED)
-    found = msgspec.structs.replace(lost, due_ns=batch.now_ns)
+    found = msgspec.structs.replace(lost, due_ns=LATE_NS)
     told = tuple(found if verdict is lost else verdict for verdict in batch.verdicts)
     return put(records, batch, msgspec.structs.replace(batch, verdicts=told))
 
@@ -314,7 +318,7 @@ def revived(records: Records) -> list[Record]:
 @breaks("range", run=SHRUNK)
 def _delivered_beyond_the_shrunk_range(records: Records) -> list[Record]:
     first = batches(records)[0]
-    return add_verdict(records, first, Verdict("r1", 1, "r2", first.now_ns))
+    return add_verdict(records, first, Verdict("r1", 1, "r2", LATE_NS))
 
 
 @breaks("range")
@@ -358,7 +362,7 @@ def _replayed_across_a_partition(records: Records) -> list[Record]:
     sixth = batches(deaf)[5]
     told = tuple(put_heard(act, apart) for act in sixth.acts)
     deaf = put(deaf, sixth, msgspec.structs.replace(sixth, acts=told))
-    return add_verdict(under(deaf, cut), apart, Verdict("r1", 2, "r3", apart.now_ns))
+    return add_verdict(under(deaf, cut), apart, Verdict("r1", 2, "r3", LATE_NS))
 
 
 def put_heard(act: Act, batch: Batch) -> Act:

@@ -32,13 +32,15 @@ from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, Participant
 from kantor_protocol.scenario import Scenario, from_tree, to_tree
 from kantor_worldsim.channel import DROPPED, Channel, Sent, Verdict
 from kantor_worldsim.checkers import check
-from kantor_worldsim.faults import PASS, Fate, LinkFaults, in_burst
+from kantor_worldsim.faults import LinkFaults
 from kantor_worldsim.journal import Journal
 from kantor_worldsim.maps import Ground
 from kantor_worldsim.metrics import FaultCounts, Result
 from kantor_worldsim.recording import metrics_of
 from kantor_worldsim.records import Batch, Ending, Opening, Record
+from kantor_worldsim.rules import in_burst
 from mapping import explored
+from plain_faults import PASS, Fate, PlainFaults
 from strategies import SEEDS, examples, mission
 
 Play = Callable[..., tuple[Record, ...]]
@@ -593,6 +595,42 @@ def _arrivals(verdicts: Sequence[Verdict]) -> dict[tuple[str, int, str], int]:
             key = source, sequence, target
             arrivals[key] = min(due_ns, arrivals.get(key, due_ns))
     return arrivals
+
+
+@examples(100)
+@given(
+    schedule=st.lists(FAULTS | FIXED, max_size=12).map(tuple),
+    seed=SEEDS,
+    overrides=st.sampled_from(
+        [(), LOSSY, (*LOSSY, "coordination=centralized", "supervisor.range_m=55")]
+    ),
+    spots=st.lists(st.tuples(st.floats(0.0, 60.0), st.floats(0.0, 60.0)), min_size=3, max_size=3),
+)
+def test_compiled_rules_are_the_plain_ones(
+    schedule: tuple[AnyFault, ...],
+    seed: int,
+    overrides: tuple[str, ...],
+    spots: list[tuple[float, float]],
+) -> None:
+    """Verdict by verdict, and toll by toll."""
+    at = dict(zip(("r1", "r2", "r3"), spots, strict=True))
+    scenario = mission(*overrides)
+    air = Air(*schedule, scenario=scenario, seed=seed, at=at)
+    plain = PlainFaults(air.scenario, seed)
+    reference = Channel(air.scenario, seed, None, plain.interfere)
+    for name in scenario.roster:
+        reference.place(name, Pose(*at.get(name, (0.0, 0.0))))
+    for i in range(1, 45):
+        now_ns = 100 * MS * i
+        sent = [said(name, i, now_ns, size=20) for name in scenario.roster]
+        sent += [said("r1", 100 + i, now_ns, "r2", size=5)]
+        assert air.channel.transmit(sent) == reference.transmit(sent)
+        assert air.tolls == plain.take_tolls()
+        for name in scenario.roster:
+            assert air.channel.take(name, now_ns) == reference.take(name, now_ns)
+        for one, other in itertools.permutations(scenario.roster, 2):
+            assert air.faults.cuts(now_ns, one, other) == plain.cuts(now_ns, one, other)
+            assert air.faults.reach_m(now_ns, one, other) == plain.reach_m(now_ns, one, other)
 
 
 _DRAWN_ALONE = (Drop, Burst, Delay, Duplicate, Reorder, OneWay, Partition, Clog, Range)

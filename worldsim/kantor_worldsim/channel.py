@@ -7,8 +7,8 @@ nothing that happened before, so one more message or one more robot changes no o
 
 import struct
 from collections.abc import Callable, Iterable, Sequence
-from operator import itemgetter
-from typing import NamedTuple
+from heapq import heappop, heappush
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -28,7 +28,6 @@ _SENT = struct.Struct("=qqqq")
 """A row of what the kernel reads; to write it so costs a fifth of making an array."""
 _RULED = struct.Struct("=qqq")
 """A row of what it writes."""
-_ARRIVAL = itemgetter(0, 1, 2)
 
 
 class Verdict(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -48,17 +47,42 @@ class Sent(NamedTuple):
     envelope: Envelope
 
 
-Ruled = tuple[int, int, int]
-"""Receiver (place in the roster), row of what is sent, due_ns or DROPPED."""
+class Field(NamedTuple):
+    """What decides who can hear whom, for kernels; see `hears`."""
 
-Reaches = Callable[[int, int, float], bool]
-"""Whether one participant hears another (places in the roster) if their range were so many metres."""
+    left_m: float
+    bottom_m: float
+    resolution_m: float
+    line_of_sight: bool
+    loss_m: float
+    cells: np.ndarray
+    xy_m: np.ndarray
+    """(n, 2) where everybody truly is, the unplaced at infinity."""
+    supervisor: int
+    """Its place in the roster, or -1."""
+    supervisor_stands: bool
+    """It has a place on the map, so that walls may stand before it."""
+
+
+class Ruled(NamedTuple):
+    """Verdicts as numbers."""
+
+    rows: np.ndarray
+    """(rows, 3): receiver (place in the roster), row of what is on the air, due_ns or DROPPED."""
+    size: int
+    """How many rows count."""
+
 
 Interference = Callable[
-    [Sequence[Sent], Iterable[Ruled], Reaches], tuple[Sequence[Sent], Iterable[Ruled], int]
+    [Sequence[Sent], np.ndarray, Ruled, Field], tuple[Sequence[Sent], Ruled, int]
 ]
-"""Rules on what the radio has ruled: what is on the air then, which may be more than was sent, the verdicts
-on that, and how many receivers are no longer in range."""
+"""Rules on what the radio has ruled, given what was sent, also as numbers (rows, 4): now_ns, source,
+sequence, target; and where everybody is. It returns what is on the air then, which is what was sent and
+perhaps more; the verdicts on that; and how many receivers are no longer in range."""
+
+
+_Flight = tuple[int, int, int, int, Envelope]
+"""Of an envelope under way: due_ns, place of its source, sequence, number of the flight."""
 
 
 class _Law(NamedTuple):
@@ -73,8 +97,6 @@ class _Law(NamedTuple):
     duplicate: float
     reorder: float
     reorder_ns: int
-    supervisor_stands: bool
-    """It has a place on the map, so that walls may stand before it."""
 
 
 class Walls(NamedTuple):
@@ -139,6 +161,33 @@ def _in_range(
 
 
 @kernel
+def hears(field: Field, one: int, other: int, range_m: float) -> bool:
+    """Whether two participants (places in the roster) hear each other if their range is so many metres."""
+    through = field.supervisor in (one, other) and not field.supervisor_stands
+    return _in_range(
+        field.left_m,
+        field.bottom_m,
+        field.resolution_m,
+        field.line_of_sight,
+        field.loss_m,
+        field.cells,
+        field.xy_m,
+        one,
+        other,
+        range_m,
+        through,
+    )
+
+
+@kernel
+def link_of(source: int, target: int, supervisor: int) -> int:
+    """The number of the link between two places in the roster."""
+    here = LINK_WIDTH - 1 if source == supervisor else source
+    there = LINK_WIDTH - 1 if target == supervisor else target
+    return here * LINK_WIDTH + there
+
+
+@kernel
 def _delay(law: _Law, link: int, sequence: int, copy: int) -> int:
     delay = law.delay_ns
     if law.jitter_ns > 0:
@@ -162,7 +211,6 @@ def _transmit(
     duplicate: float,
     reorder: float,
     reorder_ns: int,
-    supervisor_stands: bool,
     left_m: float,
     bottom_m: float,
     resolution_m: float,
@@ -170,9 +218,10 @@ def _transmit(
     loss_m: float,
     cells: np.ndarray,
     xy_m: np.ndarray,
+    supervisor: int,
+    supervisor_stands: bool,
     sent: np.ndarray,
     envelopes: int,
-    supervisor: int,
     ruled: np.ndarray,
 ) -> tuple[int, int]:
     """Rule on every envelope for every possible receiver.
@@ -190,9 +239,18 @@ def _transmit(
         duplicate,
         reorder,
         reorder_ns,
+    )
+    field = Field(
+        left_m,
+        bottom_m,
+        resolution_m,
+        line_of_sight,
+        loss_m,
+        cells,
+        xy_m,
+        supervisor,
         supervisor_stands,
     )
-    walls = (left_m, bottom_m, resolution_m, line_of_sight, loss_m, cells)
     receiver, which, due_ns = ruled[:, 0], ruled[:, 1], ruled[:, 2]
     count = 0
     out_of_range = 0
@@ -203,13 +261,10 @@ def _transmit(
                 continue
             by_supervisor = supervisor in (other, source)
             range_m = law.supervisor_range_m if by_supervisor else law.range_m
-            through = by_supervisor and not law.supervisor_stands
-            if not _in_range(*walls, xy_m, source, other, range_m, through):
+            if not hears(field, source, other, range_m):
                 out_of_range += 1
                 continue
-            here = LINK_WIDTH - 1 if source == supervisor else source
-            there = LINK_WIDTH - 1 if other == supervisor else other
-            link = here * LINK_WIDTH + there
+            link = link_of(source, other, supervisor)
             copies = 1
             if law.duplicate > 0.0:
                 draw = uniform(law.seed, Purpose.DUPLICATE.value, link, sequence, 0)
@@ -240,11 +295,9 @@ class Channel:
     ) -> None:
         radio = scenario.radio
         self._interference = interference
-        self._walls = Walls.of(radio, ground)
         self._roster = scenario.roster
         self._places = {name: i for i, name in enumerate(scenario.roster)}
         self._targets = {**self._places, EVERYBODY: -1}
-        self._supervisor = self._places.get(SUPERVISOR, -1)
         self._law = _Law(
             seed,
             radio.range_m,
@@ -255,12 +308,18 @@ class Channel:
             radio.duplicate,
             radio.reorder,
             round(radio.reorder_s * 1e9),
-            scenario.supervisor.pose_m is not None,
         )
         self._xy_m = np.full((len(scenario.roster), 2), np.inf)
-        self._under_way: dict[ParticipantId, list[tuple[int, int, int, Envelope]]] = {
-            name: [] for name in scenario.roster
-        }
+        self._field = Field(
+            *Walls.of(radio, ground),
+            self._xy_m,
+            self._places.get(SUPERVISOR, -1),
+            scenario.supervisor.pose_m is not None,
+        )
+        self._arguments: tuple[Any, ...] = (*self._law, *self._field)
+        self._under_way: dict[ParticipantId, list[_Flight]] = {name: [] for name in scenario.roster}
+        self._boxes = list(self._under_way.items())
+        self._flights = 0
         self._sent = np.zeros((0, 4), dtype=np.int64)
         self._make_room(1)
 
@@ -288,43 +347,42 @@ class Channel:
             source, sequence = places[envelope.source], envelope.sequence
             target = targets.get(envelope.target, nowhere)
             _SENT.pack_into(self._sent_bytes, _SENT.size * i, now_ns, source, sequence, target)
-        count, out_of_range = _transmit(
-            *self._law,
-            *self._walls,
-            self._xy_m,
-            self._sent,
-            len(sent),
-            self._supervisor,
-            self._ruled,
-        )
-        ruled: Iterable[Ruled] = _RULED.iter_unpack(self._ruled_bytes[: _RULED.size * count])
+        count, out_of_range = _transmit(*self._arguments, self._sent, len(sent), self._ruled)
+        ruled = Ruled(self._ruled, count)
         if self._interference is not None:
-            sent, ruled, lost = self._interference(sent, ruled, self._reaches)
+            sent, ruled, lost = self._interference(sent, self._sent, ruled, self._field)
             out_of_range += lost
+        return self._send(sent, ruled), out_of_range
+
+    def _send(self, on_air: Sequence[Sent], ruled: Ruled) -> list[Verdict]:
+        """Let what arrives be under way; the verdicts."""
+        places, boxes, flights, nowhere = (
+            self._places,
+            self._boxes,
+            self._flights,
+            len(self._roster),
+        )
         verdicts = []
-        for to, row, due_ns in ruled:
-            envelope, receiver = sent[row].envelope, self._roster[to]
+        told = ruled.rows.data.cast("B")[: _RULED.size * ruled.size]
+        for to, row, due_ns in _RULED.iter_unpack(told):
+            envelope = on_air[row][1]
             speaker, sequence = envelope.source, envelope.sequence
+            receiver, box = boxes[to]
             verdicts.append(Verdict(speaker, sequence, receiver, due_ns))
             if due_ns != DROPPED:
-                self._under_way[receiver].append((due_ns, places[speaker], sequence, envelope))
-        return verdicts, out_of_range
-
-    def _reaches(self, one: int, other: int, range_m: float) -> bool:
-        through = self._supervisor in {one, other} and not self._law.supervisor_stands
-        return bool(_in_range(*self._walls, self._xy_m, one, other, range_m, through))
+                flights += 1
+                place = places.get(speaker, nowhere)
+                heappush(box, (due_ns, place, sequence, flights, envelope))
+        self._flights = flights
+        return verdicts
 
     def take(self, name: ParticipantId, now_ns: int) -> tuple[Envelope, ...]:
         """What has arrived at a participant by now, in order of (arrival, source, sequence)."""
         waiting = self._under_way[name]
-        if not waiting:
-            return ()
-        waiting.sort(key=_ARRIVAL)
-        arrived = len(waiting)
-        while arrived and waiting[arrived - 1][0] > now_ns:
-            arrived -= 1
-        self._under_way[name] = waiting[arrived:]
-        return tuple([item[3] for item in waiting[:arrived]])
+        arrived = []
+        while waiting and waiting[0][0] <= now_ns:
+            arrived.append(heappop(waiting)[4])
+        return tuple(arrived)
 
     def take_heard(
         self, name: ParticipantId, heard: Iterable[tuple[ParticipantId, int]]
@@ -333,41 +391,41 @@ class Channel:
 
         Raises KeyError for what is not under way.
         """
-        waiting = self._under_way[name]
-        waiting.sort(key=_ARRIVAL)
+        waiting = sorted(self._under_way[name])
         taken = []
         for reference in heard:
-            places = (i for i, item in enumerate(waiting) if (item[3].source, item[2]) == reference)
+            places = (i for i, item in enumerate(waiting) if (item[4].source, item[2]) == reference)
             place = next(places, None)
             if place is None:
                 raise KeyError(reference)
-            taken.append(waiting.pop(place)[3])
+            taken.append(waiting.pop(place)[4])
+        self._under_way[name][:] = waiting  # in order, it is a heap
         return tuple(taken)
 
     def lose(self, name: ParticipantId, from_ns: int, until_ns: int) -> None:
         """Throw away what arrives at a participant within a window, its end excluded."""
-        self._under_way[name] = [
-            item for item in self._under_way[name] if not from_ns <= item[0] < until_ns
-        ]
+        box = self._under_way[name]
+        box[:] = sorted(item for item in box if not from_ns <= item[0] < until_ns)
 
     def clear(self) -> None:
         """Throw away all that is under way."""
-        self._under_way = {name: [] for name in self._under_way}
+        for box in self._under_way.values():
+            box.clear()
 
     def waits(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether something has arrived at a participant that was not taken."""
-        return any(item[0] <= now_ns for item in self._under_way[name])
+        waiting = self._under_way[name]
+        return bool(waiting) and waiting[0][0] <= now_ns
 
     def next_due_ns(self) -> int | None:
         """When the next delivery is due at anybody."""
-        return min((item[0] for box in self._under_way.values() for item in box), default=None)
+        return min((box[0][0] for box in self._under_way.values() if box), default=None)
 
     def _make_room(self, envelopes: int) -> None:
         if self._sent.shape[0] < envelopes:
             self._sent = np.zeros((2 * envelopes, 4), dtype=np.int64)
             self._sent_bytes = self._sent.data
             self._ruled = np.zeros((4 * envelopes * len(self._roster), 3), dtype=np.int64)
-            self._ruled_bytes = self._ruled.data.cast("B")
 
 
 def links(xy_m: np.ndarray, range_m: float, walls: Walls = OPEN) -> int:

@@ -92,7 +92,7 @@ _WORDS = {
 """Rule and text of each fault."""
 
 # Columns of State.book.
-_STEPS, _SLOT, _MOVED_NS, _POINTS, _GIVEN_NS, _POSTED, _FLYING, _TOLD = 0, 1, 2, 3, 4, 5, 6, 7
+_STEPS, _SLOT, _MOVED_NS, _POINTS, _OPEN, _POSTED, _FLYING, _TOLD = 0, 1, 2, 3, 4, 5, 6, 7
 _SEQUENCE, _DIFFERING, _COMING, _KEYFRAME, _STOPPED_NS = 8, 9, 10, 13, 14
 _REFUSALS_SO_FAR, _NUMBER = 15, 16
 _BOOK_COLUMNS = 17
@@ -105,7 +105,7 @@ FORGED_FIRST = 1 << 62
 """What is forged has numbers from there on."""
 
 _NOT = -1
-"""In the book: not stopped; no turn is open."""
+"""In the book: not stopped."""
 
 _STOPS = {"kill": "start", "pause": "resume", "fill": "free", "leave": "join"}
 """What stops a process, and what has it go on."""
@@ -117,7 +117,7 @@ class State(NamedTuple):
 
     book: npt.NDArray[np.int64]
     """(n, 17): last step; origin slot; time of the last move; points shipped by all its incarnations;
-    when the turn was that it has not answered, or _NOT; rows used of posted and flights; whether this
+    whether it has a turn that it has not answered; rows used of posted and flights; whether this
     incarnation has sent a version vector; sequence of what it published last, entries in which that
     differs from its view; rows that this batch brings to logs, posted and flights; 1 + the act with which
     it publishes a keyframe in this batch; since when it is stopped, or _NOT; messages it has refused;
@@ -137,7 +137,8 @@ class State(NamedTuple):
     posted: npt.NDArray[np.int64]
     """(n, rows, 2): sequence, target of what each has sent."""
     flights: npt.NDArray[np.int64]
-    """(n, rows, 3): source, sequence, due_ns of what is on its way to each."""
+    """(n, rows, 4): source, sequence, due_ns of what is on its way to each; whether it was handed over with
+    the turn that is open."""
     forged: npt.NDArray[np.int64]
     """(1, rows, 3): source, sequence, target of what faults have put on the air."""
     have: npt.NDArray[np.int64]
@@ -223,7 +224,7 @@ def _land(state: State, who: int, row: int) -> None:
     flights = state.flights[who]
     state.book[who, _FLYING] -= 1
     last = state.book[who, _FLYING]
-    for column in range(3):
+    for column in range(4):
         flights[row, column] = flights[last, column]
 
 
@@ -233,7 +234,11 @@ def _check_inbox(state: State, law: Law, reading: Reading, row: int, now_ns: int
     act = reading.acts[row]
     who = act[of.PLACE]
     flights = state.flights[who]
-    by_ns = act[of.NOW_NS] if law.virtual else now_ns
+    if state.book[who, _OPEN] == 0:
+        by_ns = act[of.NOW_NS] if law.virtual else now_ns
+        for i in range(state.book[who, _FLYING]):
+            flights[i, 3] = flights[i, 2] <= by_ns
+    state.book[who, _OPEN] = law.virtual and not act[of.PRESENT]
     before_ns, before_source, before_sequence = 0, 0, 0
     for item in range(act[of.HEARD_COUNT]):
         heard = reading.heard[act[of.HEARD] + item]
@@ -242,7 +247,7 @@ def _check_inbox(state: State, law: Law, reading: Reading, row: int, now_ns: int
             if (
                 flights[i, 0] == heard[of.SOURCE]
                 and flights[i, 1] == heard[of.SEQUENCE]
-                and flights[i, 2] <= by_ns
+                and flights[i, 3]
                 and (first < 0 or flights[i, 2] < flights[first, 2])
             ):
                 first = i
@@ -260,7 +265,7 @@ def _check_inbox(state: State, law: Law, reading: Reading, row: int, now_ns: int
         before_ns, before_source, before_sequence = due_ns, source, sequence
     if law.virtual and act[of.PRESENT]:
         for i in range(state.book[who, _FLYING] - 1, -1, -1):
-            if flights[i, 2] <= by_ns:
+            if flights[i, 3]:
                 _note(state, _WITHHELD, row, 0, flights[i, 0], flights[i, 1], 0.0, 0.0)
                 _land(state, who, i)
 
@@ -338,7 +343,7 @@ def _check_verdict(state: State, law: Law, reading: Reading, row: int) -> None:
     if source >= 0:  # nobody knows where a stranger is
         _check_range(state, law, row, source, receiver)
     flight = state.flights[receiver, state.book[receiver, _FLYING]]
-    flight[0], flight[1], flight[2] = source, sequence, due_ns
+    flight[0], flight[1], flight[2], flight[3] = source, sequence, due_ns, 0
     state.book[receiver, _FLYING] += 1
 
 
@@ -686,9 +691,7 @@ def _check(
             _note(state, _STRANGER, row, 0, 0, 0, 0.0, 0.0)
             continue
         if not acts[row, of.PRESENT]:
-            book[who, _GIVEN_NS] = max(book[who, _GIVEN_NS], acts[row, of.NOW_NS])
             continue
-        book[who, _GIVEN_NS] = _NOT
         _check_life(state, law, reading, row)
         _check_order(state, reading, row)
         _check_refusals(state, reading, row)
@@ -843,7 +846,7 @@ class Checker:
             shipped=np.zeros((len(names), 2), dtype=np.int64),
             logs=np.zeros((len(names), 256, 2), dtype=np.int64),
             posted=np.zeros((len(names), 256, 2), dtype=np.int64),
-            flights=np.zeros((len(names), 64, 3), dtype=np.int64),
+            flights=np.zeros((len(names), 64, 4), dtype=np.int64),
             forged=np.zeros((1, 64, 3), dtype=np.int64),
             have=np.zeros((len(names), len(names)), dtype=np.int64),
             faults=np.zeros((_COMPLAINTS_MAX, 5), dtype=np.int64),
@@ -853,7 +856,7 @@ class Checker:
             by_x=np.argsort(site.samples_m[:, 0]),
         )
         self._state.book[:, _SLOT] = np.arange(len(names))
-        self._state.book[:, [_GIVEN_NS, _STOPPED_NS]] = _NOT
+        self._state.book[:, _STOPPED_NS] = _NOT
         self._arguments = (*self._state, *self._law)
         self._visiting = scenario.planner.name == "spectral"
         self._registers = np.zeros((len(names), scenario.register_width), dtype=np.int64)
@@ -914,6 +917,7 @@ class Checker:
         clocks = [clock for clock in self._clocks if name in clock.who]
         if self._virtual:
             skew_ns = sum(clock.skew_ns(now_ns) for clock in clocks if _within(clock, now_ns))
+            skew_ns = max(skew_ns, -now_ns)  # no clock shows a time before 0
             return skew_ns, skew_ns
         least_ns = most_ns = 0
         for clock in clocks:
@@ -995,13 +999,16 @@ class Checker:
         return known.disk if isinstance(known, Kill) else "kept"
 
     def _lose_flights(self, place: int, now_ns: int) -> None:
-        """What has arrived where nobody lived is lost, but for what was given with an open turn."""
+        """What has arrived where nobody lived is lost, but for what came with a turn that is open."""
         book = self._state.book[place]
-        given_ns, stopped_ns = book.item(_GIVEN_NS), book.item(_STOPPED_NS)
-        kept_ns = given_ns if self._virtual else stopped_ns
+        if not self._stopped[self._names[place]]:
+            return
         flights = self._state.flights[place]
         under_way = flights[: book[_FLYING]]
-        kept = under_way[(under_way[:, 2] <= kept_ns) | (under_way[:, 2] > now_ns)]
+        due_ns = under_way[:, 2]
+        kept = under_way[
+            (due_ns < book[_STOPPED_NS]) | (due_ns >= now_ns) | (book[_OPEN] & under_way[:, 3] > 0)
+        ]
         flights[: kept.shape[0]] = kept
         book[_FLYING] = kept.shape[0]
 

@@ -161,7 +161,9 @@ class Mailbag:
         return Inputs(act.now_ns + act.skew_ns, act.observation, inbox)
 
     def post(self, batch: Batch) -> None:
-        """Note what was sent in a batch."""
+        """Note what was sent in a batch, and what nobody sent."""
+        for envelope in batch.injected:
+            self._envelopes[envelope.source, envelope.sequence] = envelope
         for act in batch.acts:
             for envelope in act.outputs.outbox if act.outputs else ():
                 self._envelopes[envelope.source, envelope.sequence] = envelope

@@ -169,7 +169,8 @@ class Stage:
         acts = tuple([self._act(step) for step in sound])
         absent = tuple([act.name for act in acts if act.outputs is None])
         tolls = self._faults.take_tolls() if self._faults else ()
-        self._tell(Batch(now_ns, acts, verdicts, out_of_range, absent, tolls))
+        forged = self._faults.take_forged() if self._faults else ()
+        self._tell(Batch(now_ns, acts, verdicts, out_of_range, absent, tolls, forged))
         return verdicts
 
     def note(self, incident: Incident) -> None:
