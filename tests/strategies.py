@@ -13,6 +13,7 @@ from kantor_agent.core import Agent
 from kantor_protocol.keyed import Purpose, generator
 from kantor_protocol.machine import (
     SUPERVISOR,
+    Body,
     Envelope,
     Inputs,
     Observation,
@@ -86,9 +87,11 @@ def cast(scenario: Scenario, samples_m: Points, seed: int = 1) -> dict[Participa
     """All participants of a mission, robots first."""
     made: dict[ParticipantId, StateMachine] = {}
     for name, start_m in zip(scenario.robot_ids, scenario.starts.poses_m, strict=True):
-        made[name] = Agent(name, scenario, seed, start_m, samples_m)
+        made[name] = Agent(name, scenario, seed, Body(Pose(*start_m)), samples_m)
     if scenario.centralized:
-        made[SUPERVISOR] = Supervisor(SUPERVISOR, scenario, samples_m.shape[0])
+        made[SUPERVISOR] = Supervisor(
+            SUPERVISOR, scenario, Body(Pose(*scenario.supervisor_m)), samples_m.shape[0]
+        )
     return made
 
 

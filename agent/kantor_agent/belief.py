@@ -95,7 +95,7 @@ def _ship_packed(
         counters,
     )
     # Of the manner, spending reads only whose log it is and what an entry means.
-    manner = Manner(me, ledger != 0, False, False, False, 0, 0, 0)
+    manner = Manner(me, ledger != 0, False, False, False, 0, 0, 0, 0)
     count = ship(grid, store, manner, x, y, point, _Room(best, near, sample, units))
     used: int = pack_pairs(sample, units, count, out)
     return used
@@ -141,19 +141,27 @@ class Belief:
             units=np.zeros(most, dtype=np.int64),
         )
         self._packed = np.zeros(20 * most, dtype=np.uint8)
-        store, manner = replica.store, replica.manner
+        store = replica.store
+        self._to_drop = (*self.grid, store.weights, store.lowered, store.counters)
+        self._follow_store()
+
+    def _follow_store(self) -> None:
+        """Have kernels work on the store as it is: it moves when logs grow or origins come."""
+        store, manner = self.replica.store, self.replica.manner
+        self._store = store
+        self._to_ship: tuple[Any, ...] = (
+            *(*self.grid, *store, *self._room, self._packed),
+            *(manner.me, int(manner.ledger), self._units.point),
+        )
         self.to_choose: tuple[Any, ...] = (
             *self.grid,
             store.weights,
             store.claims,
             store.counters,
-            np.zeros(store.length.shape[0], dtype=np.int64),
+            np.zeros(self.replica.slots, dtype=np.int64),
             manner.me if manner.claims else NOBODY,
         )
         """Grid, weights and claims as arguments of a planner's kernel; see `kernels.kernel`."""
-        self._to_drop = (*self.grid, store.weights, store.lowered, store.counters)
-        self._store = replica.store
-        self._to_ship = self._arguments()
 
     @property
     def weights(self) -> Weights:
@@ -183,7 +191,10 @@ class Belief:
 
     def learn(self, source: int, news: News) -> bool:
         """Take in what another participant sent; False when it is malformed."""
-        return self.replica.learn(source, news.have, news.logs, news.claims, news.registers)
+        taken = self.replica.learn(source, news.have, news.logs, news.claims, news.registers)
+        if self._store is not self.replica.store:
+            self._follow_store()
+        return taken
 
     def advance(self, now_ns: int) -> None:
         """Bring walking samples to `now_ns` and drop those that messages have emptied."""
@@ -194,23 +205,12 @@ class Belief:
 
     def spend(self, x_m: float, y_m: float) -> bytes:
         """Ship one robot point from here (Prop. 1); packed pairs (sample, units), nearest first."""
-        used = self._ship(x_m, y_m)
+        used = _ship_packed(*self._to_ship, x_m, y_m)
         if used < 0:
             self.replica.reserve(self._room.sample.shape[0])
-            used = self._ship(x_m, y_m)
+            self._follow_store()
+            used = _ship_packed(*self._to_ship, x_m, y_m)
         return self._packed[:used].tobytes()
-
-    def _ship(self, x_m: float, y_m: float) -> int:
-        if self._store is not self.replica.store:
-            self._store = self.replica.store
-            self._to_ship = self._arguments()
-        used: int = _ship_packed(*self._to_ship, x_m, y_m)
-        return used
-
-    def _arguments(self) -> tuple[Any, ...]:
-        manner = self.replica.manner
-        law = (manner.me, int(manner.ledger), self._units.point)
-        return (*self.grid, *self._store, *self._room, self._packed, *law)
 
     def lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""

@@ -1,6 +1,6 @@
 """The map that a participant has of the unknown: everybody's layers, fused (Burgard et al., eq. 1-3).
 
-Every origin has a layer of its own, folded from its log alone (`evidence.py`). The fused log odds of a
+Every origin (an incarnation of a robot) has a layer of its own, folded from its log alone (`evidence.py`). The fused log odds of a
 cell are the sum over the layers, each counted as certain as evidence gets, and the sum is clamped once
 more. A cell is explored once any layer knows it, whatever its probability.
 """
@@ -71,7 +71,7 @@ class Chart:
     """The fused map of one participant."""
 
     def __init__(self, frame: Frame, origins: int) -> None:
-        """origins: participants that may have a layer."""
+        """origins: incarnations that may have a layer; there may come more."""
         self.frame = frame
         self.cells = np.zeros(frame.cells, dtype=np.uint8)
         """(cells,) UNKNOWN, FREE or OCCUPIED."""
@@ -90,6 +90,8 @@ class Chart:
 
     def fold(self, replica: Replica) -> bool:
         """Take in what the logs hold by now; whether a cell may have changed."""
+        if replica.slots > self._folded.shape[0]:
+            self._widen(replica.slots)
         lengths = replica.store.length
         before = self.revision
         for origin in np.flatnonzero(lengths > self._folded).tolist():
@@ -106,6 +108,14 @@ class Chart:
             self._folded[origin] = lengths[origin]
             self.revision = before + 1 if news else self.revision
         return self.revision > before
+
+    def _widen(self, origins: int) -> None:
+        """Make room for the layers of new incarnations."""
+        layers, folded = self._layers, self._folded
+        self._layers = np.zeros((origins, self.frame.cells), dtype=np.uint8)
+        self._layers[: layers.shape[0]] = layers
+        self._folded = np.zeros(origins, dtype=np.int64)
+        self._folded[: folded.shape[0]] = folded
 
     @property
     def frontiers(self) -> npt.NDArray[np.int64]:

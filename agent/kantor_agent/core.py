@@ -4,17 +4,16 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_agent.belief import Belief
+from kantor_agent.pace import Pace
 from kantor_agent.planners import PLANNERS, Goal
 from kantor_agent.vehicles import VEHICLES
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import (
-    EVERYBODY,
-    SUPERVISOR,
+    Body,
     Inputs,
     Observation,
     Outputs,
     ParticipantId,
-    Pose,
     State,
 )
 from kantor_protocol.radio import Radio, replica_of
@@ -22,6 +21,10 @@ from kantor_protocol.replica import NOBODY
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, WeightsPublisher
+
+_WALK_PERIODS = 32
+"""Samples walk at most so many of their steps in one of the robot's, and never back. Who joins late, or has
+a clock that was behind, catches up within a few steps; who had a clock that was ahead waits until it is time."""
 
 
 class Agent:
@@ -36,12 +39,12 @@ class Agent:
         me: ParticipantId,
         scenario: Scenario,
         seed: int,
-        start_m: tuple[float, float],
+        body: Body,
         samples_m: npt.NDArray[np.float64],
     ) -> None:
-        """start_m, samples_m (N, 2): world frame, at time 0."""
+        """body: what it takes over. samples_m: (N, 2), world frame, at time 0."""
         units = Units.of(scenario.energy.points, samples_m.shape[0])
-        replica = replica_of(me, scenario, units, samples_m.shape[0])
+        replica = replica_of(me, scenario, units, samples_m.shape[0], body.epoch)
         walk = Walk(
             samples_m,
             scenario.samples.diffusion_m,
@@ -49,32 +52,34 @@ class Agent:
             seed,
             Purpose.SAMPLE_WALK,
         )
-        self._me = me
         self._belief = Belief(walk, units, replica)
-        self._radio = Radio(me, scenario.roster)
+        self._radio = Radio(me, scenario, body.epoch)
         self._planner = PLANNERS[scenario.planner.name](scenario)
         self._vehicle = VEHICLES[scenario.vehicle.name](scenario.vehicle)
         self._publisher = WeightsPublisher(
             replica.weights, scenario.publish.weights_every, scenario.publish.keyframe_every
         )
-        self._target = SUPERVISOR if scenario.centralized else EVERYBODY
         self._budget = scenario.steps_per_robot
         self._period_ns = scenario.period_ns
+        self._pace = Pace(scenario.period_ns, body)
         self._now_ns = 0
-        self._step = 0
-        self._energy_spent = 0
-        self._pose = Pose(*start_m)
+        self._step, self._pose, self._energy_spent = body.step, body.pose, body.energy_spent
         self._goal: Goal | None = None
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the class."""
         self._radio.hear(inputs.inbox, self._belief.learn)
         self._locate(inputs.observation)
-        self._belief.advance(inputs.now_ns)
-        elapsed_ns = min(inputs.now_ns - self._now_ns, self._period_ns)
         self._now_ns, self._step = inputs.now_ns, self._step + 1
-        spent = self._explore(elapsed_ns * 1e-9) if self._state is State.EXPLORING else b""
+        self._belief.advance(min(self._now_ns, self._walkable_ns))
+        elapsed_s = self._pace.elapsed_s(self._now_ns)
+        spent = self._explore(elapsed_s) if self._state is State.EXPLORING else b""
         return self._publish(spent)
+
+    @property
+    def _walkable_ns(self) -> int:
+        """How far samples may walk in one step: one that was away, or whose clock jumps, must still answer."""
+        return (self._belief.walked + _WALK_PERIODS) * self._period_ns
 
     @property
     def _state(self) -> State:
@@ -104,7 +109,7 @@ class Agent:
         weights = self._publisher.step(
             self._belief.replica.lowered(), last=state is not State.EXPLORING
         )
-        envelope = self._radio.say(self._belief.replica, self._target, self._step, self._pose)
+        envelope = self._radio.say(self._belief.replica, self._step, self._pose)
         self._belief.replica.end_step()
         return Outputs(
             step=self._step,

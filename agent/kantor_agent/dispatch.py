@@ -16,11 +16,12 @@ from kantor_agent.planners.allocators import ALLOCATORS
 from kantor_agent.planners.team import Member, Situation, Task
 from kantor_agent.terrain import Terrain
 from kantor_protocol.grid import NOWHERE, Frame
+from kantor_protocol.radio import CONTACT_PERIODS
 from kantor_protocol.registers import Registers
 from kantor_protocol.scenario import Scenario
 
 ARRIVED, RESTING = 1, 2
-_CONTACT_PERIODS = 8
+_LONG_AGO = -(1 << 40)
 CELL, FLAGS, TARGET, SINCE, MEMO = 0, 1, 2, 3, 4
 
 
@@ -36,9 +37,14 @@ class Patience(NamedTuple):
     def of(cls, scenario: Scenario, period_ns: int) -> "Patience":
         """For a participant that steps once in period_ns."""
         return cls(
-            _CONTACT_PERIODS * scenario.period_ns // period_ns,
+            CONTACT_PERIODS * scenario.period_ns // period_ns,
             round(scenario.planner.remember_s * 1e9) // period_ns,
         )
+
+
+def past(since: int, tick: int) -> int:
+    """A tick that has been. One to come is of a clock that runs wrong: nobody must wait for it."""
+    return since if since <= tick else _LONG_AGO
 
 
 def register_of(member: Member, *, resting: bool) -> list[int]:
@@ -52,10 +58,11 @@ def member_of(robot: int, register: npt.NDArray[np.int64], cells: int, tick: int
     cell, flags, target, since = register[:MEMO].tolist()
     if not (1 <= cell <= cells and 0 <= target <= cells) or flags & RESTING:
         return None
-    since = min(since, tick)
     used = register.nonzero()[0]
     memo = tuple(register[MEMO : used[-1] + 1].tolist())  # registers lose zeros at the end too
-    return Member(robot, cell - 1, Task(target - 1, memo), since, arrived=bool(flags & ARRIVED))
+    return Member(
+        robot, cell - 1, Task(target - 1, memo), past(since, tick), arrived=bool(flags & ARRIVED)
+    )
 
 
 def roll_call(
@@ -64,10 +71,11 @@ def roll_call(
     """Who is in contact, by place, as all others know them; and where those were heading who are not."""
     group, absent = [], []
     for robot in range(robots):
-        member = member_of(robot, registers.values[robot], frame.cells, tick)
+        slot = registers.newest(robot)
+        member = member_of(robot, registers.values[slot], frame.cells, tick)
         if member is None:
             continue
-        age = 0 if robot == registers.me else registers.age_steps(robot)
+        age = 0 if slot == registers.me else registers.age_steps(slot)
         if age <= patience.contact_steps:
             group.append(member)
         elif age <= patience.remember_steps and member.task.target != NOWHERE:

@@ -12,21 +12,13 @@ import numpy as np
 from kantor_agent.chart import Chart
 from kantor_agent.dispatch import CELL, TARGET, Dispatch, Patience, order_in, register_of, roll_call
 from kantor_agent.navigation import Navigator
+from kantor_agent.pace import Pace
 from kantor_agent.planners.team import Member, Task
 from kantor_agent.terrain import Terrain
 from kantor_agent.vehicles import VEHICLES
 from kantor_protocol.evidence import Evidence, entries, void
 from kantor_protocol.grid import NOWHERE, Frame
-from kantor_protocol.machine import (
-    EVERYBODY,
-    SUPERVISOR,
-    Inputs,
-    Observation,
-    Outputs,
-    ParticipantId,
-    Pose,
-    State,
-)
+from kantor_protocol.machine import Body, Inputs, Observation, Outputs, ParticipantId, Pose, State
 from kantor_protocol.messages import News
 from kantor_protocol.radio import Radio, replica_of
 from kantor_protocol.scenario import Scenario
@@ -45,34 +37,34 @@ class Mapper:
         me: ParticipantId,
         scenario: Scenario,
         seed: int,
-        start_m: tuple[float, float],
+        body: Body,
         frame: Frame,
     ) -> None:
-        """start_m: world frame, at time 0. frame: how the cells lie, not what is in them."""
+        """body: what it takes over. frame: how the cells lie, not what is in them."""
         self._me = scenario.roster.index(me)
         self._frame = frame
         self._robots = scenario.robots.count
-        self._replica = replica_of(me, scenario, None, entries(frame))
-        self._radio = Radio(me, scenario.roster)
-        self._chart = Chart(frame, len(scenario.roster))
+        self._replica = replica_of(me, scenario, None, entries(frame), body.epoch)
+        self._radio = Radio(me, scenario, body.epoch)
+        self._chart = Chart(frame, self._replica.slots)
         self._terrain = Terrain(scenario, self._chart)
         self._evidence = Evidence(frame, scenario.sensor, ranges=scenario.learns_ranges)
         self._dispatch = Dispatch(scenario, self._terrain, seed, self._me)
         self._navigator = Navigator(self._terrain)
         self._vehicle = VEHICLES[scenario.vehicle.name](scenario.vehicle)
         self._clearance_cells = 2.0 * scenario.vehicle.radius_m / frame.resolution_m
-        self._target = SUPERVISOR if scenario.centralized else EVERYBODY
-        self._centralized = scenario.centralized
+        self._supervisor = scenario.robots.count if scenario.centralized else None
         self._period_ns = scenario.period_ns
         self._counting_on = Patience.of(scenario, scenario.period_ns)
         self._patience = scenario.planner.patience
+        self._pace = Pace(scenario.period_ns, body)
         self._now_ns = 0
-        self._step = 0
-        self._pose = Pose(*start_m)
+        self._step, self._pose = body.step, body.pose
+        self._unsure_until = body.step + _SURE_STEPS
         self._scanned_step = -1
         self._scanned_pose: Pose | None = None
         self._task, self._since, self._arrived = Task(), 0, False
-        self._progressed, self._left_cells = 0, math.inf
+        self._progressed, self._left_cells = body.step, math.inf
         self._without = 0
         self._resting = False
 
@@ -80,15 +72,15 @@ class Mapper:
         """One step; see the module."""
         self._radio.hear(inputs.inbox, self._learn)
         self._locate(inputs.observation)
-        elapsed_ns = min(inputs.now_ns - self._now_ns, self._period_ns)
         self._now_ns, self._step = inputs.now_ns, self._step + 1
+        elapsed_s = self._pace.elapsed_s(self._now_ns)
         self._chart.fold(self._replica)
         self._give_up()
         if not self._resting:
             self._decide()
         self._look(inputs.observation)
         if not self._resting:
-            self._move(elapsed_ns * 1e-9)
+            self._move(elapsed_s)
         return self._publish()
 
     @property
@@ -117,13 +109,13 @@ class Mapper:
     def _decide(self) -> None:
         """Take a new task, if there is one; rest when no frontier can be reached."""
         registers = self._replica.registers
-        supervisor = registers.values.shape[0] - 1
+        supervisor = None if self._supervisor is None else registers.newest(self._supervisor)
         if (
-            self._centralized
+            supervisor is not None
             and 0 <= registers.age_steps(supervisor) <= self._counting_on.contact_steps
         ):
             self._obey(order_in(registers.values[supervisor], self._me, self._frame.cells))
-        elif registers.stamps[self._me] > 0:
+        elif registers.stamps[registers.me] > 0:
             self._choose()
         self._without = 0 if self._may_go_on() else self._without + 1
         self._resting = self._without >= _SURE_STEPS
@@ -149,7 +141,7 @@ class Mapper:
 
     def _may_go_on(self) -> bool:
         """Whether there may still be something for this robot to do."""
-        if self._step <= _SURE_STEPS:
+        if self._step <= self._unsure_until:
             return True
         frontiers = self._chart.frontiers
         if not frontiers.size:
@@ -193,13 +185,13 @@ class Mapper:
         """
         if self._clearance_cells == 0.0:
             return False
-        told = self._replica.registers.values
-        here = int(told[self._me, CELL]) - 1
+        registers = self._replica.registers
+        here = int(registers.values[registers.me, CELL]) - 1
+        lower = [registers.values[registers.newest(robot)] for robot in range(self._me)]
         return any(
-            told[robot, TARGET] == self._task.target + 1
-            and self._terrain.cells_between(int(told[robot, CELL]) - 1, here)
-            <= self._clearance_cells
-            for robot in range(self._me)
+            told[TARGET] == self._task.target + 1
+            and self._terrain.cells_between(int(told[CELL]) - 1, here) <= self._clearance_cells
+            for told in lower
         )
 
     def _publish(self) -> Outputs:
@@ -208,7 +200,7 @@ class Mapper:
         cell = self._frame.cell_of(self._pose.x_m, self._pose.y_m)
         me = Member(self._me, cell, self._task, self._since, self._arrived)
         self._replica.registers.write(register_of(me, resting=self._resting))
-        envelope = self._radio.say(self._replica, self._target, self._step, self._pose)
+        envelope = self._radio.say(self._replica, self._step, self._pose)
         self._replica.end_step()
         target = self._task.target
         return Outputs(

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from kantor_agent.core import Agent
 from kantor_protocol.credentials import Identity
-from kantor_protocol.machine import StateMachine
+from kantor_protocol.machine import Body, StateMachine
 from kantor_protocol.messages import Mission
 from kantor_protocol.process import participate
 
@@ -15,14 +15,12 @@ def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str]
     Raises BusError and NotWantedError.
     """
 
-    def build(mission: Mission) -> StateMachine:
-        starts_m = mission.starts.open("<f8", 2)
-        x_m, y_m = starts_m[mission.scenario.robot_ids.index(identity.user)].tolist()
+    def build(mission: Mission, body: Body) -> StateMachine:
+        me, scenario, seed = identity.user, mission.scenario, mission.seed
         if mission.frame is not None:
             from kantor_agent.mapper import Mapper  # noqa: PLC0415  only where there is a map
 
-            return Mapper(identity.user, mission.scenario, mission.seed, (x_m, y_m), mission.frame)
-        samples_m = mission.samples.open("<f8", 2)
-        return Agent(identity.user, mission.scenario, mission.seed, (x_m, y_m), samples_m)
+            return Mapper(me, scenario, seed, body, mission.frame)
+        return Agent(me, scenario, seed, body, mission.samples.open("<f8", 2))
 
     return participate(connect, identity, build, patience_s, say)

@@ -22,31 +22,30 @@ def team(scenario: Scenario, seed: int, site: Site) -> dict[ParticipantId, State
     made: dict[ParticipantId, StateMachine] = {}
     for name in scenario.roster:
         build = partial(participant, name, scenario, seed, site)
-        made[name] = Mortal(build, _birth(name, scenario, site)) if name in killed else build()
+        made[name] = Mortal(build, _at_start(name, scenario, site)) if name in killed else build()
     return made
-
-
-def _birth(name: ParticipantId, scenario: Scenario, site: Site) -> Body:
-    if name == SUPERVISOR:
-        return Body(Pose(*scenario.supervisor_m))
-    return Body(Pose(*site.starts_m[scenario.robot_ids.index(name)].tolist()))
 
 
 def participant(
     name: ParticipantId, scenario: Scenario, seed: int, site: Site, body: Body | None = None
 ) -> StateMachine:
-    """One participant as it is at time 0."""
-    if body is not None and (body.step or body.epoch):
-        raise NotImplementedError("a new incarnation")
+    """One participant as it takes over a body, by default its own at time 0."""
+    body = body or _at_start(name, scenario, site)
     frame = site.ground.frame if site.ground is not None else None
     if name == SUPERVISOR:
         if frame is not None:
-            return Allocation(name, scenario, seed, frame)
-        return Supervisor(name, scenario, site.samples_m.shape[0])
-    x_m, y_m = site.starts_m[scenario.robot_ids.index(name)].tolist()
+            return Allocation(name, scenario, seed, body, frame)
+        return Supervisor(name, scenario, body, site.samples_m.shape[0])
     if frame is not None:
-        return Mapper(name, scenario, seed, (x_m, y_m), frame)
-    return Agent(name, scenario, seed, (x_m, y_m), site.samples_m)
+        return Mapper(name, scenario, seed, body, frame)
+    return Agent(name, scenario, seed, body, site.samples_m)
+
+
+def _at_start(name: ParticipantId, scenario: Scenario, site: Site) -> Body:
+    if name == SUPERVISOR:
+        return Body(Pose(*scenario.supervisor_m))
+    x_m, y_m = site.starts_m[scenario.robot_ids.index(name)].tolist()
+    return Body(Pose(x_m, y_m))
 
 
 def play(

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from kantor_protocol.grid import Frame
 from kantor_protocol.machine import Body, Inputs, Observation, Outputs, ParticipantId, Pose
 from kantor_protocol.scenario import Scenario
+from kantor_protocol.slots import EPOCHS_MAX
 
 VERSION = 1
 BODY_BYTES_MAX = 262_144
@@ -68,14 +69,14 @@ class News(_Message, frozen=True, array_like=True, tag=1, gc=False):
     y_m: float
     """Where the sender says it is, world frame."""
     have: bytes
-    """Version vector: for every origin of the roster, how many log entries the sender holds; then,
-    with claims, the newest claim stamp it holds. LEB128."""
+    """Version vector: for every slot that the sender knows (`slots.py`), how many log entries it holds;
+    then, with claims, the newest claim stamp it holds. LEB128."""
     logs: bytes
     """Suffixes: origin, start, span, count, then count packed pairs. LEB128."""
     claims: bytes
     """Registers: origin, stamp, sample + 1 (0: none), since_ns. LEB128."""
     registers: bytes = b""
-    """For every origin the stamp of the register that the sender holds; then registers: origin, stamp,
+    """For every such slot the stamp of the register that the sender holds; then registers: origin, stamp,
     numbers. LEB128, the numbers zigzag-folded. Empty in a mission whose planner has none."""
     epoch: int = 0
     """The sender's incarnation."""
@@ -230,6 +231,8 @@ def decode_news(body: bytes) -> News:
         raise RefusedError(f"version {news.version}, this is {VERSION}")
     if not (math.isfinite(news.x_m) and math.isfinite(news.y_m)) or news.step < 0:
         raise RefusedError("news without a finite place")
+    if not 0 <= news.epoch <= EPOCHS_MAX:
+        raise RefusedError(f"news of incarnation {news.epoch}, the last is {EPOCHS_MAX}")
     return news
 
 

@@ -11,7 +11,16 @@ from collections.abc import Callable
 from kantor_protocol import bus
 from kantor_protocol.clock import clocks
 from kantor_protocol.credentials import Identity
-from kantor_protocol.machine import Envelope, Inputs, Outputs, StateMachine
+from kantor_protocol.machine import (
+    SUPERVISOR,
+    Body,
+    Envelope,
+    Inputs,
+    Outputs,
+    ParticipantId,
+    Pose,
+    StateMachine,
+)
 from kantor_protocol.messages import (
     VERSION,
     Go,
@@ -28,8 +37,8 @@ from kantor_protocol.messages import (
     encode,
 )
 
-Build = Callable[[Mission], StateMachine]
-"""Makes the machine for a mission."""
+Build = Callable[[Mission, Body], StateMachine]
+"""Makes the machine for a mission, as it is when it takes a body over."""
 
 
 class NotWantedError(RuntimeError):
@@ -95,7 +104,7 @@ class _Participant:
 
     def _prepare(self, mission: Mission) -> None:
         self._mission = mission
-        self._machine = self._build(mission)
+        self._machine = self._build(mission, mission.body or _at_start(mission, self._me))
         self._say(f"{self._me}: mission {mission.scenario.name}, seed {mission.seed}")
         self._line.send(encode(Ready(VERSION, self._line.nonce)))
 
@@ -146,3 +155,11 @@ class _Participant:
         return Report(
             VERSION, self._line.nonce, outputs, inputs.now_ns, heard, inputs.observation.step
         )
+
+
+def _at_start(mission: Mission, me: ParticipantId) -> Body:
+    scenario = mission.scenario
+    if me == SUPERVISOR:
+        return Body(Pose(*scenario.supervisor_m))
+    x_m, y_m = mission.starts.open("<f8", 2)[scenario.robot_ids.index(me)].tolist()
+    return Body(Pose(x_m, y_m))

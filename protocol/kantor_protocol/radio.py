@@ -4,37 +4,64 @@ import math
 from collections.abc import Callable, Iterable
 
 from kantor_protocol.clock import clocks
-from kantor_protocol.machine import SUPERVISOR, Envelope, ParticipantId, Pose
+from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.messages import VERSION, News, RefusedError, decode_news, encode_news
 from kantor_protocol.registers import Registers
 from kantor_protocol.replica import NOBODY, Replica
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.weights import Units
 
+CONTACT_PERIODS = 8
+"""Whoever was not heard for more of the own steps is out of contact."""
+
 
 class Radio:
-    """Turns what a replica has to say into envelopes, and envelopes into what it learns."""
+    """Turns what a replica has to say into envelopes, and envelopes into what it learns.
 
-    def __init__(self, me: ParticipantId, roster: tuple[ParticipantId, ...]) -> None:
+    A robot with a supervisor talks to it alone. When it has not heard it for a while it talks to everybody,
+    until it hears it again: what a supervisor missed meanwhile it gets as any neighbour does.
+    """
+
+    def __init__(self, me: ParticipantId, scenario: Scenario, epoch: int = 0) -> None:
+        """epoch: which incarnation speaks."""
         self.refused = 0
         """Messages that were malformed, too old or from nobody in the roster."""
-        self._me = me
-        self._places = {name: i for i, name in enumerate(roster) if name != me}
+        roster = scenario.roster
+        self._me, self._epoch, self._origins = me, epoch, len(roster)
+        self._slots = {name: i for i, name in enumerate(roster) if name != me}
+        self._supervised = scenario.centralized and me != SUPERVISOR
+        self._unheard_steps = -patience_steps(me, scenario)  # the first word takes its time
+        """Own steps since the supervisor was heard."""
 
     def hear(self, inbox: Iterable[Envelope], learn: Callable[[int, News], bool]) -> None:
-        """Pass every sound message on to `learn(place in the roster, news)`; count the others."""
+        """Pass every sound message of a step on to `learn(slot of the sender, news)`; count the others."""
+        self._unheard_steps += 1
         for envelope in inbox:
-            source = self._places.get(envelope.source)
             try:
-                taken = source is not None and learn(source, decode_news(envelope.body))
+                taken = self._take(envelope, learn)
             except RefusedError:
                 taken = False
             self.refused += not taken
 
-    def say(self, replica: Replica, target: ParticipantId, step: int, pose: Pose) -> Envelope:
-        """What the target, or everybody in range, lacks."""
-        place = self._places.get(target, NOBODY)
-        have, logs, claims = replica.compose(place)
+    def _take(self, envelope: Envelope, learn: Callable[[int, News], bool]) -> bool:
+        newest = self._slots.get(envelope.source)
+        if newest is None:
+            return False
+        news = decode_news(envelope.body)
+        slot = newest % self._origins + news.epoch * self._origins
+        if not learn(slot, news):
+            return False
+        self._slots[envelope.source] = max(newest, slot)
+        if envelope.source == SUPERVISOR:
+            self._unheard_steps = 0
+        return True
+
+    def say(self, replica: Replica, step: int, pose: Pose) -> Envelope:
+        """What whoever it talks to lacks."""
+        alone = not self._supervised or self._unheard_steps > CONTACT_PERIODS
+        target = EVERYBODY if alone else SUPERVISOR
+        slot = NOBODY if alone else self._slots[SUPERVISOR]
+        have, logs, claims = replica.compose(slot)
         news = News(
             version=VERSION,
             step=step,
@@ -43,18 +70,22 @@ class Radio:
             have=have,
             logs=logs,
             claims=claims,
-            registers=replica.registers.compose(place),
+            registers=replica.registers.compose(slot),
+            epoch=self._epoch,
         )
         return Envelope(source=self._me, sequence=step, target=target, body=encode_news(news))
 
 
-def replica_of(me: ParticipantId, scenario: Scenario, units: Units | None, samples: int) -> Replica:
-    """An empty replica for a participant of a scenario; see Replica."""
-    place, origins = scenario.roster.index(me), len(scenario.roster)
+def replica_of(
+    me: ParticipantId, scenario: Scenario, units: Units | None, samples: int, epoch: int = 0
+) -> Replica:
+    """An empty replica for an incarnation of a participant of a scenario; see Replica."""
+    origins = len(scenario.roster)
+    slot = epoch * origins + scenario.roster.index(me)
     relay, beacon = me == SUPERVISOR, scenario.radio.beacon == "state"
     patience = patience_steps(me, scenario)
     return Replica(
-        place,
+        slot,
         origins,
         samples,
         units,
@@ -64,7 +95,7 @@ def replica_of(me: ParticipantId, scenario: Scenario, units: Units | None, sampl
         beacon=beacon,
         patience_steps=patience,
         registers=Registers(
-            place,
+            slot,
             origins,
             scenario.register_width,
             sums=not scenario.mapping,

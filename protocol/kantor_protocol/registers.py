@@ -2,12 +2,14 @@
 
 An origin writes its own register, or adds to it, and nobody else does. Everywhere else the newest value
 wins, by the origin's stamp, which counts its writes. The sum over all origins is kept: integers make it
-exact, so that it is the same wherever the same registers are held, whatever came first.
+exact, so that it is the same wherever the same registers are held, whatever came first. An origin is one
+incarnation of a participant (`slots.py`): what a dead one has added is not lost, and counts once.
 
 Talking
 -------
-1. Every message carries the stamps of all registers that its sender holds, at once an
-   acknowledgement. While nobody is heard that is all, or, with `beacon`, every register as well.
+1. Every message carries a stamp for every slot that its sender knows, as many as its version vector
+   has (`replica.py`), at once an acknowledgement. While nobody is heard that is all, or, with `beacon`,
+   every register as well.
 2. A register goes to neighbours of which one lacks it: its stamp once, and again only when the
    acknowledgement has not come within `patience` steps. Its origin and a relay send it at once. Others
    forward it when a neighbour lacks several writes, or has lacked the last one for several steps: most
@@ -24,6 +26,7 @@ import numpy.typing as npt
 
 from kantor_protocol.kernels import kernel
 from kantor_protocol.packing import MALFORMED, put_int, put_uint, take_int, take_uint
+from kantor_protocol.slots import known_to
 
 Register = npt.NDArray[np.int64]
 
@@ -51,7 +54,9 @@ def add(
 
 
 @kernel
-def _take_head(content: np.ndarray, at: int, origins: int, width: int) -> tuple[int, int, int, int]:
+def _take_head(
+    content: bytes | np.ndarray, at: int, origins: int, width: int
+) -> tuple[int, int, int, int]:
     """Read what precedes the numbers of a register: (origin, stamp, numbers, position), or MALFORMED."""
     origin, at = take_uint(content, at)
     stamp, at = take_uint(content, at)
@@ -62,19 +67,19 @@ def _take_head(content: np.ndarray, at: int, origins: int, width: int) -> tuple[
 
 
 @kernel
-def _sound(content: np.ndarray, origins: int, width: int, sums: bool) -> bool:
-    """Whether content is stamps and then whole registers.
+def _sound(content: bytes, told: int, width: int, sums: bool) -> bool:
+    """Whether content is stamps of as many origins as told, and then whole registers of theirs.
 
     sums: the first number of a register bounds the others, as the number of visits bounds every sum over
     visits of something within [-1, 1].
     """
     at = 0
-    for _ in range(origins):
+    for _ in range(told):
         stamp, at = take_uint(content, at)
         if at < 0 or stamp > STAMP_MAX:
             return False
-    while at < content.shape[0]:
-        _origin, _stamp, numbers, at = _take_head(content, at, origins, width)
+    while at < len(content):
+        _origin, _stamp, numbers, at = _take_head(content, at, told, width)
         bound = NUMBER_MAX
         for i in range(numbers):
             number, at = take_int(content, at)
@@ -95,17 +100,18 @@ def _learn(
     learnt: np.ndarray,
     me: int,
     source: int,
-    content: np.ndarray,
+    content: bytes,
+    told: int,
     step: int,
 ) -> None:
-    """Take in sound content."""
-    origins, width = values.shape
+    """Take in sound content of as many origins as told."""
+    width = values.shape[1]
     at = 0
-    for origin in range(origins):
+    for origin in range(told):
         stamp, at = take_uint(content, at)
         known[source, origin] = max(known[source, origin], stamp)
-    while 0 <= at < content.shape[0]:
-        origin, stamp, numbers, at = _take_head(content, at, origins, width)
+    while 0 <= at < len(content):
+        origin, stamp, numbers, at = _take_head(content, at, told, width)
         news = at >= 0 and origin != me and stamp > stamps[origin]
         for i in range(width if at >= 0 else 0):
             number = 0
@@ -201,27 +207,49 @@ class Registers:
         beacon: bool = False,
         patience_steps: int = 2,
     ) -> None:
-        """me: place in the roster of `origins` participants. width: integers in a register, or 0.
+        """width: integers in a register, or 0. origins: participants in the roster.
 
-        sums: registers are sums, the first number of which is the largest in size.
+        me: its slot, which is its place in the roster unless it is a later incarnation. sums: registers
+        are sums, the first number of which is the largest in size.
         """
-        self.values = np.zeros((origins, width), dtype=np.int64)
-        """(n, width) the newest known of each origin."""
-        self.total = np.zeros(width, dtype=np.int64)
-        """(width,) the sum over origins."""
-        self.stamps = np.zeros(origins, dtype=np.int64)
-        """(n,) writes of each origin that `values` includes."""
         self.me = me
+        self._roster = origins
         self._sums = sums
-        self._known = np.zeros((origins, origins), dtype=np.int64)
-        self._heard = np.full(origins, -1, dtype=np.int64)
-        self._learnt = np.zeros(origins, dtype=np.int64)
-        self._sent = np.zeros((2, origins), dtype=np.int64)
         self._law = np.array([me, relay, beacon, max(1, patience_steps)], dtype=np.int64)
         self._step = 0
+        self.total = np.zeros(width, dtype=np.int64)
+        """(width,) the sum over origins."""
+        self.values: Register
+        """(slots, width) the newest known of each origin."""
+        self.stamps: Register
+        """(slots,) writes of each origin that `values` includes."""
+        self._make_room(known_to(me, origins))
+
+    def _make_room(self, slots: int) -> None:
+        """Begin with registers of this many origins, of which nothing is known."""
+        width = self.total.shape[0]
+        self.values = np.zeros((slots, width), dtype=np.int64)
+        self.stamps = np.zeros(slots, dtype=np.int64)
+        self._known = np.zeros((slots, slots), dtype=np.int64)
+        self._heard = np.full(slots, -1, dtype=np.int64)
+        self._learnt = np.zeros(slots, dtype=np.int64)
+        self._sent = np.zeros((2, slots), dtype=np.int64)
         longest = _HEAD_BYTES + _NUMBER_BYTES * width
-        room = min(_BYTES_MAX, origins * (_STAMP_BYTES + longest))
+        stamps = _STAMP_BYTES * slots
+        room = max(stamps + longest, min(_BYTES_MAX, stamps + slots * longest))
         self._out = np.zeros(room if width else 0, dtype=np.uint8)
+
+    def widen(self, slots: int) -> None:
+        """Make room for this many origins: another incarnation was heard of."""
+        if not self._out.size:
+            return
+        before = self.stamps.shape[0]
+        old = (self.values, self.stamps, self._known, self._heard, self._learnt, self._sent)
+        self._make_room(slots)
+        self.values[:before], self.stamps[:before] = old[0], old[1]
+        self._known[:before, :before] = old[2]
+        self._heard[:before], self._learnt[:before] = old[3], old[4]
+        self._sent[:, :before] = old[5]
 
     def add(self, amounts: Register) -> None:
         """Add (width,) integers to the own register; the first sum is the largest in size."""
@@ -240,14 +268,24 @@ class Registers:
         """Own steps since the register of an origin was last learnt anew; negative if never."""
         return self._step - int(self._learnt[origin]) if self.stamps[origin] else -1
 
-    def sound(self, content: bytes) -> bool:
-        """Whether content is well-formed, whole; without registers none is."""
-        origins, width = self.values.shape
-        payload = np.frombuffer(content, dtype=np.uint8)
-        return width > 0 and bool(_sound(payload, origins, width, self._sums))
+    def newest(self, place: int) -> int:
+        """The slot of the last incarnation of a participant that has written, as far as is known."""
+        roster = self._roster
+        if place == self.me % roster:
+            return self.me
+        written = range(self.stamps.shape[0] - roster + place, place, -roster)
+        return next((slot for slot in written if self.stamps[slot]), place)
 
-    def learn(self, source: int, content: bytes) -> None:
-        """Take in sound content from a participant."""
+    def sound(self, content: bytes, told: int) -> bool:
+        """Whether content is well-formed, whole; without registers none is.
+
+        told: slots that its sender knows.
+        """
+        width = self.total.shape[0]
+        return width > 0 and bool(_sound(content, told, width, self._sums))
+
+    def learn(self, source: int, content: bytes, told: int) -> None:
+        """Take in sound content from an origin. There must be room for as many origins as told."""
         self._heard[source] = self._step
         _learn(
             self.values,
@@ -257,7 +295,8 @@ class Registers:
             self._learnt,
             self.me,
             source,
-            np.frombuffer(content, dtype=np.uint8),
+            content,
+            told,
             self._step,
         )
 

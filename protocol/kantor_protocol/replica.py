@@ -28,6 +28,12 @@ min
 
 In a mission with a map there is no weight: an entry is a number alone (`evidence.py` says what it
 means), logs are replicated as with a ledger, and whoever holds them makes of them what it wants.
+
+Incarnations
+------------
+An origin is one incarnation of a participant (`slots.py`). A version vector is for the slots that its
+sender knows. Of slots beyond it the sender holds nothing; whoever hears of more slots than it knows makes
+room for them. The log of a dead incarnation counts on, and travels as any other; its claim expires.
 """
 
 from typing import NamedTuple
@@ -38,6 +44,7 @@ import numpy.typing as npt
 from kantor_protocol.kernels import kernel
 from kantor_protocol.packing import Pairs, put_int, put_uint, skip_numbers, take_int, take_uint
 from kantor_protocol.registers import FRESH_STEPS, Registers
+from kantor_protocol.slots import count_slots, known_to
 from kantor_protocol.weights import Units, Weights
 
 NOBODY = -1
@@ -64,7 +71,7 @@ LOWERED, _STEP, _HOLDING = 0, 1, 2
 
 
 class Store(NamedTuple):
-    """All that a participant holds, for the kernels. n origins, N samples.
+    """All that a participant holds, for the kernels. n origins (slots), N samples.
 
     A crowd does not fit into a cache: what is touched here and there is kept small, and side by side.
     """
@@ -95,6 +102,7 @@ class Manner(NamedTuple):
     """How a participant merges and talks; it never changes."""
 
     me: int
+    """Its slot."""
     ledger: bool
     claims: bool
     relay: bool
@@ -107,6 +115,8 @@ class Manner(NamedTuple):
     """The largest value of a log entry; 0: entries have no value and weigh nothing."""
     bound: int
     """Every index in a log is below it."""
+    roster: int
+    """Participants; slots come in blocks of so many."""
 
 
 @kernel
@@ -148,12 +158,15 @@ def _merge_entry(store: Store, manner: Manner, origin: int, index: int, value: i
 
 
 @kernel
-def _walk_suffixes(store: Store, manner: Manner, suffixes: bytes, source: int, apply: bool) -> int:
-    """Read all suffixes; apply what is new, or only check.
+def _walk_suffixes(
+    store: Store, manner: Manner, suffixes: bytes, source: int, told: int, apply: bool
+) -> int:
+    """Read all suffixes, of `told` origins; apply what is new, or only check.
 
     Returns how many entries some log may then hold, or a negative number when malformed.
     """
     ledger = manner.ledger
+    origins = store.length.shape[0]
     at = 0
     entries = 0
     longest = 0
@@ -162,13 +175,13 @@ def _walk_suffixes(store: Store, manner: Manner, suffixes: bytes, source: int, a
         start, at = take_uint(suffixes, at)
         span, at = take_uint(suffixes, at)
         count, at = take_uint(suffixes, at)
-        if at < 0 or origin >= store.length.shape[0] or count > span or count > len(suffixes):
+        if at < 0 or origin >= told or count > span or count > len(suffixes):
             return -1
         if start > LENGTH_MAX or span > LENGTH_MAX:
             return -1
         if (ledger and count != span) or (not ledger and origin != source):
             return -1
-        held = store.length[origin]
+        held = store.length[origin] if origin < origins else 0
         entries += count
         if not ledger:
             longest = store.length[manner.me] + entries
@@ -195,14 +208,14 @@ def _walk_suffixes(store: Store, manner: Manner, suffixes: bytes, source: int, a
 
 
 @kernel
-def _walk_claims(store: Store, manner: Manner, claims: bytes, apply: bool) -> int:
+def _walk_claims(store: Store, manner: Manner, claims: bytes, told: int, apply: bool) -> int:
     at = 0
     while at < len(claims):
         origin, at = take_uint(claims, at)
         stamp, at = take_uint(claims, at)
         sample, at = take_uint(claims, at)
         since, at = take_uint(claims, at)
-        if at < 0 or origin >= store.length.shape[0] or sample > store.weights.shape[0]:
+        if at < 0 or origin >= told or sample > store.weights.shape[0]:
             return -1
         if apply and origin != manner.me and stamp > store.claims[_STAMP, origin]:
             store.claims[_SAMPLE, origin] = sample - 1
@@ -213,38 +226,26 @@ def _walk_claims(store: Store, manner: Manner, claims: bytes, apply: bool) -> in
 
 
 @kernel
-def _is_vector(store: Store, manner: Manner, have: bytes) -> bool:
-    """Whether these are as many numbers as a version vector has, told by their last bytes."""
-    numbers = 0
-    length = 0
-    for i in range(len(have)):
-        length += 1
-        if have[i] < 128:
-            numbers += 1
-            length = 0
-        elif length >= 9:  # see `take_uint`
-            return False
-    return length == 0 and numbers == store.length.shape[0] * (2 if manner.claims else 1)
-
-
-@kernel
-def _apply_have(store: Store, manner: Manner, have: bytes, source: int) -> None:
+def _apply_have(store: Store, manner: Manner, have: bytes, source: int, told: int) -> None:
     known = store.known[source]
-    slots = store.length.shape[0] * (2 if manner.claims else 1)
-    if len(have) == slots:  # a byte for each: the processor takes many at once
-        for slot in range(slots):
+    origins = store.length.shape[0]
+    parts = 2 if manner.claims else 1
+    if told == origins and len(have) == parts * told:
+        # A byte for each: the processor takes many at once.
+        for slot in range(parts * told):
             known[slot] = max(known[slot], np.int32(have[slot]))
         return
     at = 0
-    for slot in range(slots):
-        held, at = take_uint(have, at)
-        known[slot] = max(known[slot], min(held, KNOWN_MAX))
+    for part in range(parts):
+        for slot in range(part * origins, part * origins + told):
+            held, at = take_uint(have, at)
+            known[slot] = max(known[slot], min(held, KNOWN_MAX))
 
 
 @kernel
 def _manner(law: np.ndarray) -> Manner:
     return Manner(
-        law[0], law[1] != 0, law[2] != 0, law[3] != 0, law[4] != 0, law[5], law[6], law[7]
+        law[0], law[1] != 0, law[2] != 0, law[3] != 0, law[4] != 0, law[5], law[6], law[7], law[8]
     )
 
 
@@ -267,8 +268,9 @@ def _learn(
 ) -> int:
     """Check a message whole, then apply it whole.
 
-    Returns _LEARNT; or _MALFORMED or the length that logs must have room for, and nothing changed.
-    Store and Manner come field by field, see `kernels`.
+    Returns _LEARNT; or, and nothing changed, _MALFORMED, the length that logs must have room for, or
+    the negative of the slots that there must be room for. Store and Manner come field by field, see
+    `kernels`.
     """
     store = Store(
         weights,
@@ -282,19 +284,20 @@ def _learn(
         counters,
     )
     manner = _manner(law)
-    longest = _walk_suffixes(store, manner, suffixes, source, False)
-    if (
-        longest < 0
-        or not _is_vector(store, manner, have)
-        or _walk_claims(store, manner, registers, False) < 0
-    ):
+    told = count_slots(have, manner.roster, 2 if manner.claims else 1)
+    if not 0 <= source < told or source == manner.me:
         return _MALFORMED
+    longest = _walk_suffixes(store, manner, suffixes, source, told, False)
+    if longest < 0 or _walk_claims(store, manner, registers, told, False) < 0:
+        return _MALFORMED
+    if told > length.shape[0]:
+        return -told
     if longest > logs.shape[1]:
         return longest
-    _apply_have(store, manner, have, source)
-    _walk_suffixes(store, manner, suffixes, source, True)
+    _apply_have(store, manner, have, source, told)
+    _walk_suffixes(store, manner, suffixes, source, told, True)
     if manner.claims:
-        _walk_claims(store, manner, registers, True)
+        _walk_claims(store, manner, registers, told, True)
     store.sending[2, source] = store.counters[_STEP]
     return _LEARNT
 
@@ -482,7 +485,9 @@ def claim(claims: np.ndarray, counters: np.ndarray, me: int, sample: int, now_ns
     """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
     if claims[_SAMPLE, me] != sample:
         claims[_SAMPLE, me] = sample
-        claims[_SINCE, me] = now_ns
+        claims[_SINCE, me] = max(
+            0, now_ns
+        )  # a clock may run wrong; a message holds no time before 0
     claims[_STAMP, me] = counters[_STEP]
 
 
@@ -531,11 +536,13 @@ class Replica:
         patience_steps: int = 2,
         registers: Registers | None = None,
     ) -> None:
-        """me: this participant's place in the roster of `origins` participants. The rest: Manner.
+        """origins: participants in the roster. The rest: Manner. Raises ValueError for an incarnation too many.
 
-        units: None for logs of bare indices below `samples`, with a ledger. registers: what the planner
-        shares beside the logs, by default nothing.
+        me: its slot, which is its place in the roster unless it is a later incarnation. units: None for logs of
+        bare indices below `samples`, with a ledger. registers: what the planner shares beside the logs, by
+        default nothing.
         """
+        slots = known_to(me, origins)
         weighed = samples if units else 0
         units = units or Units(whole=0, sample=0, point=0)
         self.registers = Registers(me, origins, 0) if registers is None else registers
@@ -548,26 +555,35 @@ class Replica:
             patience=max(1, patience_steps),
             value_max=units.point if ledger else units.sample,
             bound=samples,
+            roster=origins,
         )
-        rows = origins if ledger else 1
+        rows = slots if ledger else 1
         self.store = Store(
             weights=np.full(weighed, units.sample, dtype=np.int32),
             logs=np.zeros((rows, 256, 2), dtype=np.int32),
-            length=np.zeros(origins, dtype=np.int64),
-            known=np.zeros((origins, 2 * origins), dtype=np.int32),
-            sending=np.zeros((3 + self.manner.patience, origins), dtype=np.int64),
-            claims=np.zeros((4, origins), dtype=np.int64),
+            length=np.zeros(slots, dtype=np.int64),
+            known=np.zeros((slots, 2 * slots), dtype=np.int32),
+            sending=_unsent(slots, self.manner.patience),
+            claims=_unclaimed(slots),
             lowered=np.zeros(weighed, dtype=np.int32),
             mark=np.zeros(weighed, dtype=np.int32),
             counters=np.array([0, 1, weighed], dtype=np.int64),
         )
-        self.store.sending[1:3] = -1 - self.manner.patience
-        self.store.claims[_SAMPLE] = NOBODY
-        self._out = np.zeros(20 * _ENTRIES_MAX + 120 * origins + 64, dtype=np.uint8)
-        self._taken = np.zeros(origins, dtype=np.int64)
-        self._least = np.zeros(2 * origins, dtype=np.int32)
         self._law = np.array(self.manner, dtype=np.int64)
+        self._fit_rooms()
+
+    def _fit_rooms(self) -> None:
+        """Have kernels work on the store as it is, with scratch for as many slots."""
+        slots = self.slots
+        self._out = np.zeros(20 * _ENTRIES_MAX + 120 * slots + 64, dtype=np.uint8)
+        self._taken = np.zeros(slots, dtype=np.int64)
+        self._least = np.zeros(2 * slots, dtype=np.int32)
         self._fields = (*self.store, self._law)
+
+    @property
+    def slots(self) -> int:
+        """Origins that it knows of: the roster once for each incarnation heard of."""
+        return self.store.length.shape[0]
 
     @property
     def weights(self) -> Weights:
@@ -588,15 +604,27 @@ class Replica:
         self, source: int, have: bytes, logs: bytes, claims: bytes, registers: bytes = b""
     ) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
-        if registers and not self.registers.sound(registers):
+        told = self._told(have) if registers else 0
+        if registers and not self.registers.sound(registers, told):
             return False
         outcome = _learn(*self._fields, have, logs, claims, source)
-        if outcome > _LEARNT:
-            self._lengthen(outcome)
+        while outcome not in (_LEARNT, _MALFORMED):
+            self._make_room(outcome)
             outcome = _learn(*self._fields, have, logs, claims, source)
         if outcome == _LEARNT and registers:
-            self.registers.learn(source, registers)
+            self.registers.learn(source, registers, told)
         return bool(outcome == _LEARNT)
+
+    def _told(self, have: bytes) -> int:
+        told: int = count_slots(have, self.manner.roster, 2 if self.manner.claims else 1)
+        return told
+
+    def _make_room(self, outcome: int) -> None:
+        """What `_learn` asks for."""
+        if outcome > 0:
+            self._lengthen(outcome)
+        else:
+            self._widen(-outcome)
 
     def append(self, indices: npt.NDArray[np.int64]) -> None:
         """Put (k,) bare indices, each below the bound, behind the own log."""
@@ -621,6 +649,26 @@ class Replica:
         logs[:, : self.store.logs.shape[1]] = self.store.logs
         self.store = self.store._replace(logs=logs)
         self._fields = (*self.store, self._law)
+
+    def _widen(self, slots: int) -> None:
+        """Make room for this many origins: another incarnation was heard of."""
+        old, before = self.store, self.slots
+        known = np.zeros((slots, 2 * slots), dtype=np.int32)
+        known[:before, :before] = old.known[:, :before]
+        known[:before, slots : slots + before] = old.known[:, before:]
+        length = np.zeros(slots, dtype=np.int64)
+        length[:before] = old.length
+        sending, claims = _unsent(slots, self.manner.patience), _unclaimed(slots)
+        sending[:, :before], claims[:, :before] = old.sending, old.claims
+        logs = old.logs
+        if self.manner.ledger:
+            logs = np.zeros((slots, *old.logs.shape[1:]), dtype=np.int32)
+            logs[:before] = old.logs
+        self.store = old._replace(
+            logs=logs, length=length, known=known, sending=sending, claims=claims
+        )
+        self._fit_rooms()
+        self.registers.widen(slots)
 
     def claim(self, sample: int, now_ns: int) -> None:
         """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
@@ -656,6 +704,20 @@ class Replica:
         """Begin the next step."""
         _end_step(self.store.counters)
         self.registers.end_step()
+
+
+def _unsent(slots: int, patience: int) -> npt.NDArray[np.int64]:
+    """`Store.sending` of who has heard and sent nothing."""
+    sending = np.zeros((3 + patience, slots), dtype=np.int64)
+    sending[1:3] = -1 - patience
+    return sending
+
+
+def _unclaimed(slots: int) -> npt.NDArray[np.int64]:
+    """`Store.claims` while nobody has a claim."""
+    claims = np.zeros((4, slots), dtype=np.int64)
+    claims[_SAMPLE] = NOBODY
+    return claims
 
 
 @kernel
@@ -702,7 +764,7 @@ def _read_have(have: np.ndarray, lengths: np.ndarray) -> int:
 
 
 def read_have(have: bytes, origins: int) -> list[int] | None:
-    """The log lengths in a version vector, in roster order; None if malformed."""
+    """The log lengths in a version vector, by slot; origins: see `slots.slots_told`. None if malformed."""
     lengths = np.zeros(origins, dtype=np.int64)
     at = _read_have(np.frombuffer(have, dtype=np.uint8), lengths)
     return None if at < 0 else lengths.tolist()

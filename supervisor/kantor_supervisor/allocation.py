@@ -4,13 +4,13 @@ It is one more participant. Robots hear of one another's layers through it, and 
 """
 
 from kantor_agent.chart import Chart
-from kantor_agent.dispatch import Dispatch, Patience, orders_of, roll_call
+from kantor_agent.dispatch import Dispatch, Patience, orders_of, past, roll_call
 from kantor_agent.planners.team import Member, Task
 from kantor_agent.terrain import Terrain
 from kantor_protocol.clock import clocks
 from kantor_protocol.evidence import entries
 from kantor_protocol.grid import Frame
-from kantor_protocol.machine import EVERYBODY, Inputs, Outputs, ParticipantId, Pose, State
+from kantor_protocol.machine import Body, Inputs, Outputs, ParticipantId, State
 from kantor_protocol.messages import News
 from kantor_protocol.radio import Radio, replica_of
 from kantor_protocol.scenario import Scenario
@@ -19,20 +19,21 @@ from kantor_protocol.scenario import Scenario
 class Allocation:
     """The supervisor of a scenario with a map. `step` is its only entrance."""
 
-    def __init__(self, me: ParticipantId, scenario: Scenario, seed: int, frame: Frame) -> None:
-        """frame: how the cells lie, not what is in them."""
+    def __init__(
+        self, me: ParticipantId, scenario: Scenario, seed: int, body: Body, frame: Frame
+    ) -> None:
+        """body: what it takes over. frame: how the cells lie, not what is in them."""
         self._frame = frame
         self._robots = scenario.robots.count
-        self._replica = replica_of(me, scenario, None, entries(frame))
-        self._radio = Radio(me, scenario.roster)
-        self._chart = Chart(frame, len(scenario.roster))
+        self._replica = replica_of(me, scenario, None, entries(frame), body.epoch)
+        self._radio = Radio(me, scenario, body.epoch)
+        self._chart = Chart(frame, self._replica.slots)
         self._dispatch = Dispatch(scenario, Terrain(scenario, self._chart), seed, None)
         self._tasks: dict[int, Task] = {}
         self._since: dict[int, int] = {}
-        self._pose = Pose(*scenario.supervisor_m)
+        self._step, self._pose = body.step, body.pose
         self._period_ns = scenario.period_ns
         self._counting_on = Patience.of(scenario, clocks(scenario, seed)[me].period_ns)
-        self._step = 0
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """Take in what the robots sent, give targets, tell everybody what they lack."""
@@ -46,7 +47,7 @@ class Allocation:
         outputs = Outputs(
             step=self._step,
             pose=self._pose,
-            outbox=(self._radio.say(self._replica, EVERYBODY, self._step, self._pose),),
+            outbox=(self._radio.say(self._replica, self._step, self._pose),),
             state=State.EXPLORING,
             refused=self._radio.refused,
         )
@@ -62,9 +63,10 @@ class Allocation:
             self._replica.registers, self._robots, self._frame, tick, self._counting_on
         )
         self._tasks = {member.robot: self._tasks.get(member.robot, Task()) for member in told}
-        return [self._as_ordered(member) for member in told], absent
+        return [self._as_ordered(member, tick) for member in told], absent
 
-    def _as_ordered(self, told: Member) -> Member:
+    def _as_ordered(self, told: Member, tick: int) -> Member:
         task = self._tasks[told.robot]
+        since = past(self._since.get(told.robot, 0), tick)
         arrived = told.arrived and told.task.target == task.target
-        return told._replace(task=task, since=self._since.get(told.robot, 0), arrived=arrived)
+        return told._replace(task=task, since=since, arrived=arrived)

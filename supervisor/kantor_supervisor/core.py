@@ -4,14 +4,7 @@ It hears every robot, merges what they know by the mission's rule (eq. 8), and t
 (eq. 9). It is a relay with a place of its own; a robot cannot tell its word from a neighbour's.
 """
 
-from kantor_protocol.machine import (
-    EVERYBODY,
-    Inputs,
-    Outputs,
-    ParticipantId,
-    Pose,
-    State,
-)
+from kantor_protocol.machine import Body, Inputs, Outputs, ParticipantId, State
 from kantor_protocol.messages import News
 from kantor_protocol.radio import Radio, replica_of
 from kantor_protocol.scenario import Scenario
@@ -21,18 +14,17 @@ from kantor_protocol.weights import Units, WeightsPublisher
 class Supervisor:
     """The supervisor of a scenario. `step` is its only entrance."""
 
-    def __init__(self, me: ParticipantId, scenario: Scenario, samples: int) -> None:
-        """samples: N."""
+    def __init__(self, me: ParticipantId, scenario: Scenario, body: Body, samples: int) -> None:
+        """body: what it takes over. samples: N."""
         units = Units.of(scenario.energy.points, samples)
-        self._replica = replica_of(me, scenario, units, samples)
-        self._radio = Radio(me, scenario.roster)
+        self._replica = replica_of(me, scenario, units, samples, body.epoch)
+        self._radio = Radio(me, scenario, body.epoch)
         self._publisher = WeightsPublisher(
             self._replica.weights,
             scenario.publish.weights_every,
             scenario.publish.keyframe_every,
         )
-        self._pose = Pose(*scenario.supervisor_m)
-        self._step = 0
+        self._step, self._pose = body.step, body.pose
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """Take in what the robots sent, tell everybody what they lack."""
@@ -44,7 +36,7 @@ class Supervisor:
             pose=self._pose,
             lowered=self._replica.packed_lowered(),
             weights=self._publisher.step(self._replica.lowered(), last=finished),
-            outbox=(self._radio.say(self._replica, EVERYBODY, self._step, self._pose),),
+            outbox=(self._radio.say(self._replica, self._step, self._pose),),
             state=State.FINISHED if finished else State.EXPLORING,
             refused=self._radio.refused,
         )

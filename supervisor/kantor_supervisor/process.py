@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from kantor_protocol.credentials import Identity
-from kantor_protocol.machine import StateMachine
+from kantor_protocol.machine import Body, StateMachine
 from kantor_protocol.messages import Mission
 from kantor_protocol.process import participate
 from kantor_supervisor.core import Supervisor
@@ -15,11 +15,12 @@ def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str]
     Raises BusError and NotWantedError.
     """
 
-    def build(mission: Mission) -> StateMachine:
+    def build(mission: Mission, body: Body) -> StateMachine:
+        me, scenario = identity.user, mission.scenario
         if mission.frame is not None:
             from kantor_supervisor.allocation import Allocation  # noqa: PLC0415  only on a map
 
-            return Allocation(identity.user, mission.scenario, mission.seed, mission.frame)
-        return Supervisor(identity.user, mission.scenario, mission.samples.shape[0])
+            return Allocation(me, scenario, mission.seed, body, mission.frame)
+        return Supervisor(me, scenario, body, mission.samples.shape[0])
 
     return participate(connect, identity, build, patience_s, say)

@@ -13,7 +13,7 @@ from kantor_agent.planners.team import Member, Task
 from kantor_fleet.team import play, team
 from kantor_protocol.evidence import entries
 from kantor_protocol.grid import FREE, UNKNOWN
-from kantor_protocol.machine import SUPERVISOR, Inputs, Observation, Pose, State, StateMachine
+from kantor_protocol.machine import SUPERVISOR, Body, Inputs, Observation, Pose, State, StateMachine
 from kantor_protocol.scenario import MAP_PLANNERS, Scenario, parse
 from kantor_supervisor.allocation import Allocation
 from kantor_worldsim.maps import Ground
@@ -267,7 +267,7 @@ def test_rest_is_final() -> None:
 def test_a_late_word_moves_nobody() -> None:
     """An observation of an older step is no news, neither of the place nor of the walls."""
     scenario = mission("robots.count=1")
-    robot = Mapper("r1", scenario, 0, (2.5, 2.5), ROOMS.frame)
+    robot = Mapper("r1", scenario, 0, Body(Pose(2.5, 2.5)), ROOMS.frame)
     scan = np.full(scenario.sensor.beams, 65535, dtype="<u2").tobytes()
     robot.step(Inputs(1, Observation(0, Pose(2.5, 2.5), (), scan)))
     held = robot._replica.store.length[0]
@@ -281,7 +281,7 @@ def test_a_late_word_moves_nobody() -> None:
 def test_a_supervisor_is_light_on_what_it_does_not_know() -> None:
     """Before anybody has spoken it has nobody to send anywhere."""
     scenario = mission("coordination=centralized")
-    supervisor = Allocation(SUPERVISOR, scenario, 0, ROOMS.frame)
+    supervisor = Allocation(SUPERVISOR, scenario, 0, Body(Pose(0.0, 0.0)), ROOMS.frame)
     outputs = supervisor.step(Inputs(1, Observation(0, Pose(0.0, 0.0))))
 
     assert outputs.state is State.EXPLORING

@@ -12,6 +12,7 @@ from kantor_agent.core import Agent
 from kantor_protocol.machine import (
     EVERYBODY,
     SUPERVISOR,
+    Body,
     Envelope,
     Inputs,
     Observation,
@@ -54,7 +55,7 @@ EVERY_MISSION = pytest.mark.parametrize("name", list(MISSIONS))
 def robot(scenario: Scenario, name: str = "r1") -> Agent:
     """A robot at its start."""
     start_m = scenario.starts.poses_m[scenario.robot_ids.index(name)]
-    return Agent(name, scenario, 1, start_m, SAMPLES_M)
+    return Agent(name, scenario, 1, Body(Pose(*start_m)), SAMPLES_M)
 
 
 def transcripts(name: str, rounds: int = 40) -> dict[str, Transcript]:
@@ -211,7 +212,7 @@ def test_robot_plans_then_moves_then_spends() -> None:
     """Algorithm 1: the goal is chosen from where the robot was, the point ships from where it is."""
     far_m = np.array([[10.0, 10.0], [10.0, 95.0]])
     scenario = mission("robots.count=1", "starts.poses_m=[[10.0, 60.0]]", "energy.points=2")
-    machine = Agent("r1", scenario, 1, (10.0, 60.0), far_m)
+    machine = Agent("r1", scenario, 1, Body(Pose(10.0, 60.0)), far_m)
     outputs = machine.step(Inputs(scenario.period_ns, Observation(0, Pose(10.0, 60.0))))
 
     assert outputs.goal == (10.0, 95.0)
@@ -351,7 +352,7 @@ def test_robot_does_not_depend_on_how_it_was_built(name: str) -> None:
     scenario = MISSIONS[name]
     by_columns = np.asfortranarray(SAMPLES_M)
     by_columns.flags.writeable = False
-    machine = Agent("r1", scenario, 1, scenario.starts.poses_m[0], by_columns)
+    machine = Agent("r1", scenario, 1, Body(Pose(*scenario.starts.poses_m[0])), by_columns)
     inputs = [one for one, _ in transcripts(name)["r1"]]
 
     assert [encode(machine.step(one)) for one in inputs] == replay(scenario, "r1", inputs)

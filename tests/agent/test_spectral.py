@@ -14,7 +14,7 @@ from kantor_agent.core import Agent
 from kantor_agent.planners import PLANNERS, Goal
 from kantor_agent.planners.spectral import mean_over_mixture, way_out
 from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import Inputs, Observation, Pose
+from kantor_protocol.machine import Body, Inputs, Observation, Pose
 from kantor_protocol.messages import decode_news, encode_news
 from kantor_protocol.modes import VISIT, rectangle_of, visit_at
 from kantor_protocol.radio import replica_of
@@ -275,7 +275,7 @@ def test_goal_does_not_depend_on_the_vehicle(vehicle: str) -> None:
     moving = (f"vehicle={vehicle}", "vehicle.speed_m_s=20.0", "energy.points=60")
     scenario = mission(*WIDE, *moving)
     reference = mission(*WIDE)
-    machine = Agent("r1", scenario, 1, (10.0, 10.0), scattered(12))
+    machine = Agent("r1", scenario, 1, Body(Pose(10.0, 10.0)), scattered(12))
     planner, belief = PLANNERS["spectral"](reference), belief_of(reference, scattered(12))
     place = Pose(10.0, 10.0)
     for step in range(10):

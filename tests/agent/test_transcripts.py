@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from kantor_agent.core import Agent
-from kantor_protocol.machine import Envelope, Inputs, Observation, Outputs, Pose
+from kantor_protocol.machine import Body, Envelope, Inputs, Observation, Outputs, Pose
 from kantor_protocol.messages import News, decode_news
 from kantor_protocol.modes import VISIT
 from kantor_protocol.packing import Pairs
@@ -67,7 +67,7 @@ class Stage:
         """> samples"""
         self.points = np.array([[float(v) for v in point.split(",")] for point in points])
         for name in self.scenario.robot_ids:
-            self.robots[name] = Agent(name, self.scenario, 0, (0.0, 0.0), self.points)
+            self.robots[name] = Agent(name, self.scenario, 0, Body(Pose(0.0, 0.0)), self.points)
             self.now_ns[name], self.inbox[name], self.sent[name] = 0, [], []
             self.observed[name] = Observation(0, Pose(0.0, 0.0))
 

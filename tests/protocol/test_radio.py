@@ -8,13 +8,13 @@ from kantor_protocol.radio import Radio, patience_steps, replica_of
 from kantor_protocol.weights import Units
 from strategies import mission
 
-ROSTER = ("r1", "r2", "r3")
+TEAM = mission()
 SOUND = encode(News(version=1, step=1, x_m=0.0, y_m=0.0, have=b"", logs=b"", claims=b""))
 
 
 def heard(*envelopes: Envelope, taken: bool = True) -> tuple[list[int], int]:
     """Which places in the roster r2 learns from, and how many envelopes it refuses."""
-    radio = Radio("r2", ROSTER)
+    radio = Radio("r2", TEAM)
     places: list[int] = []
 
     def learn(source: int, _news: News) -> bool:
@@ -53,14 +53,13 @@ def test_what_the_replica_refuses_is_counted() -> None:
     assert heard(Envelope("r1", 1, "", SOUND), taken=False) == ([0], 1)
 
 
-@pytest.mark.parametrize("target", ["", "r3"])
-def test_word_carries_what_the_replica_composes(target: str) -> None:
+@pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
+def test_word_carries_what_the_replica_composes(coordination: str) -> None:
     """An envelope is from the speaker, numbered by its step, and holds its place and its state."""
-    scenario = mission()
+    scenario = mission(f"coordination={coordination}")
+    target = SUPERVISOR if scenario.centralized else ""
     units = Units.of(30, 12)
-    envelope = Radio("r2", scenario.roster).say(
-        replica_of("r2", scenario, units, 12), target, 7, Pose(1.0, 2.0)
-    )
+    envelope = Radio("r2", scenario).say(replica_of("r2", scenario, units, 12), 7, Pose(1.0, 2.0))
     have, logs, claims = replica_of("r2", scenario, units, 12).compose()
 
     assert envelope == Envelope("r2", 7, target, envelope.body)
@@ -74,7 +73,7 @@ def test_word_carries_registers_where_the_planner_has_them() -> None:
         units = Units.of(30, 12)
         for name in scenario.roster:
             held = replica_of(name, scenario, units, 12)
-            word = Radio(name, scenario.roster).say(held, "", 1, Pose(1.0, 2.0))
+            word = Radio(name, scenario).say(held, 1, Pose(1.0, 2.0))
 
             assert held.registers.values.shape == (4, width)
             assert decode_news(word.body).registers == bytes(4 if width else 0)

@@ -39,8 +39,9 @@ def add(held: Registers, *amounts: int) -> None:
 
 def hear(held: Registers, source: int, said: bytes) -> None:
     """Take in what must be sound."""
-    assert held.sound(said)
-    held.learn(source, said)
+    told = held.stamps.shape[0]
+    assert held.sound(said, told)
+    held.learn(source, said, told)
 
 
 def leb128(value: int) -> bytes:
@@ -215,7 +216,7 @@ def test_what_does_not_fit_follows_with_the_next_message() -> None:
         said = one.compose()
         one.end_step()
         assert len(said) <= 48 * 1024
-        assert one.sound(said)
+        assert one.sound(said, origins)
         seen |= {o for o in range(origins) if read_register(said, origins, width, o)[0]}  # type: ignore[index]
 
     assert seen == set(range(1, origins))
@@ -226,7 +227,7 @@ def test_without_registers_nothing_is_said_and_nothing_heard() -> None:
     held = Registers(0, 3, 0)
 
     assert held.compose() == b""
-    assert not held.sound(content([0, 0, 0]))
+    assert not held.sound(content([0, 0, 0]), 3)
 
 
 @examples(80)
@@ -309,7 +310,7 @@ def test_malformed_content_is_unsound(name: str) -> None:
     """The whole is refused, also what was sound in it."""
     one, _ = team(2)
 
-    assert not one.sound(MALFORMED[name])
+    assert not one.sound(MALFORMED[name], 2)
 
 
 @examples(300)
@@ -320,11 +321,11 @@ def test_any_bytes_are_sound_or_refused(*, noise: bytes, whole: bool) -> None:
     add(one, 1, 0, 0)
     said = content([0, 3], noise) if whole else noise
     before = snapshot(one)
-    sound = one.sound(said)
+    sound = one.sound(said, 2)
 
     assert snapshot(one) == before
     if sound:
-        one.learn(1, said)
+        one.learn(1, said, 2)
         assert one.total.tolist() == one.values.sum(axis=0).tolist()
         assert one.values[0].tolist() == [1, 0, 0]
     assert read_register(noise, 2, WIDTH, 1) is None or len(noise) >= 2
@@ -392,5 +393,5 @@ def test_more_numbers_than_a_register_has_are_refused() -> None:
     """Whoever writes too much is not understood."""
     held = Registers(0, 2, WIDTH, sums=False)
 
-    assert not held.sound(content([0, 1], register(1, 1, 1, 2, 3, 4)))
-    assert held.sound(content([0, 1], register(1, 1, 1, -2, 3)))
+    assert not held.sound(content([0, 1], register(1, 1, 1, 2, 3, 4)), 2)
+    assert held.sound(content([0, 1], register(1, 1, 1, -2, 3)), 2)

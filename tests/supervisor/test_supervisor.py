@@ -6,6 +6,7 @@ import pytest
 from kantor_protocol.machine import (
     EVERYBODY,
     SUPERVISOR,
+    Body,
     Envelope,
     Inputs,
     Observation,
@@ -39,7 +40,7 @@ def transcripts(name: str, rounds: int = 30) -> dict[str, Transcript]:
 
 def supervisor(scenario: Scenario) -> Supervisor:
     """A supervisor that has heard nobody."""
-    return Supervisor(SUPERVISOR, scenario, N)
+    return Supervisor(SUPERVISOR, scenario, Body(Pose(*scenario.supervisor_m)), N)
 
 
 def vector_after(outputs: list[Outputs]) -> list[int]:
