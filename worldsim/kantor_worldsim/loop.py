@@ -24,7 +24,7 @@ from kantor_protocol.machine import (
 from kantor_protocol.messages import decode_inputs, encode
 from kantor_worldsim.outages import Deed, Outages
 from kantor_worldsim.records import Incident
-from kantor_worldsim.stage import Stage, Step
+from kantor_worldsim.stage import Stage
 
 _NEVER_NS = 2**63 - 1
 _STEPS = range(1, 2**40)
@@ -165,15 +165,15 @@ class _Mission:
     def run(self) -> str:
         while True:
             step_ns, deed_ns = self._agenda.next_ns, self._outages.next_ns
-            if deed_ns is None:
-                deed_ns = _NEVER_NS
-            if reason := self._reason(min(step_ns, deed_ns)):
+            if reason := self._reason(step_ns if deed_ns is None else min(step_ns, deed_ns)):
                 self._stage.end(reason)
                 return reason
-            if deed_ns <= step_ns:
-                self._do(self._outages.pop())
-            else:
+            if deed_ns is None:
+                self._step(self._agenda.batch(self._stage.channel.lookahead_ns))
+            elif deed_ns > step_ns:
                 self._step(self._agenda.batch(self._stage.channel.lookahead_ns, deed_ns))
+            else:
+                self._do(self._outages.pop())
 
     def _reason(self, next_ns: int) -> str | None:
         if over := self._stage.over:
@@ -183,32 +183,39 @@ class _Mission:
         return "interrupted" if self._stopped() else None
 
     def _step(self, batch: list[tuple[int, ParticipantId]]) -> None:
-        """Let everybody in a batch step who can, then let it happen moment by moment."""
-        outages, stage = self._outages, self._stage
-        turns: list[tuple[int, Step]] = []
-        dying: list[ParticipantId] = []
-        for due_ns, name in batch:
-            if outages.idle(name, due_ns):
-                if not self._dies(name, due_ns):
-                    continue
-                dying.append(name)
-            turns.append((due_ns, stage.turn(name, due_ns, outages.skew_ns(name, due_ns))))
-        if not turns:
-            return
-        outputs = dict(self._exchange({turn.name: turn.inputs for _, turn in turns}))
-        for name in dying:
-            outputs.pop(name, None)
-            self._crew.kill(name)
-        for moment_ns, due in groupby(turns, key=itemgetter(0)):
-            if self._reason(moment_ns):  # what was looked ahead to does not happen
-                break
-            stage.settle(
-                moment_ns, [turn._replace(outputs=outputs.get(turn.name)) for _, turn in due]
-            )
+        """Let everybody in a batch step who can, then let it happen moment by moment.
 
-    def _dies(self, name: ParticipantId, now_ns: int) -> bool:
-        """Whether a participant is to die in its next step. Who has a turn to answer is dead."""
-        return self._outages.dies(name, now_ns) and self._stage.unanswered(name) is None
+        There is no reason yet to end before its first moment.
+        """
+        outages, stage = self._outages, self._stage
+        due = [event for event in batch if self._is_asked(*event)] if outages.some else batch
+        turns = {
+            name: stage.turn(name, due_ns, outages.skew_ns(name, due_ns)) for due_ns, name in due
+        }
+        outputs = self._exchange({name: turn.inputs for name, turn in turns.items()})
+        if outages.some:
+            outputs = self._cut_short(due, outputs)
+        for moment_ns, acting in groupby(due, key=itemgetter(0)):
+            if moment_ns > batch[0][0] and self._reason(moment_ns):
+                break  # what was looked ahead to does not happen
+            stage.settle(moment_ns, [turns[name].answered(outputs.get(name)) for _, name in acting])
+
+    def _is_asked(self, due_ns: int, name: ParticipantId) -> bool:
+        return not self._outages.idle(name, due_ns) or self._dies(due_ns, name)
+
+    def _dies(self, due_ns: int, name: ParticipantId) -> bool:
+        """Whether a participant dies in this step. Who has a turn to answer is dead already."""
+        return self._outages.dies(name, due_ns) and not self._stage.unanswered(name)
+
+    def _cut_short(
+        self, due: list[tuple[int, ParticipantId]], outputs: Mapping[ParticipantId, Outputs]
+    ) -> Mapping[ParticipantId, Outputs]:
+        """Kill whoever dies in its step, before anybody hears of that."""
+        dying = {name for due_ns, name in due if self._dies(due_ns, name)}
+        for name in self._clocks:
+            if name in dying:
+                self._crew.kill(name)
+        return {name: told for name, told in outputs.items() if name not in dying}
 
     def _do(self, deed: Deed) -> None:
         if deed.what == "kill":
@@ -237,7 +244,7 @@ class _Mission:
         stage.note(Incident(deed.at_ns, who, "start", deed.fault, step, epoch))
         if asked := stage.unanswered(who):
             outputs = self._exchange({who: asked.inputs}).get(who)
-            stage.settle(deed.at_ns, [asked._replace(outputs=outputs)])
+            stage.settle(deed.at_ns, [asked.answered(outputs)])
 
     def _note(self, deed: Deed, what: str) -> None:
         self._stage.note(Incident(deed.at_ns, deed.who, what, deed.fault))

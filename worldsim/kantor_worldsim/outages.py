@@ -86,6 +86,8 @@ class Outages:
         self._deeds = [deed for deed in deeds_of(scenario)[done:] if deed.at_ns > after_ns]
         self._period_ns = scenario.period_ns
         faults = [fault for fault in scenario.faults if isinstance(fault, OnProcesses)]
+        self.some = bool(faults)
+        """Whether anybody ever fails."""
         self._faults = {
             name: [fault for fault in faults if name in fault.who]
             for name in (*scenario.roster, WORLD_SIM)
@@ -116,8 +118,7 @@ class Outages:
 
     def idle(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether a participant takes no step now, because of its own or of world-sim's state."""
-        stops = self._stops[name]
-        return bool(stops) and any(self._holds(fault, now_ns) for fault in stops)
+        return any(self._holds(fault, now_ns) for fault in self._stops[name])
 
     def dies(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether the next step of a participant is the one in which it dies, or was."""

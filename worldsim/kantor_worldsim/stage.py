@@ -7,7 +7,6 @@ So world-sim needs no snapshot beside its journal.
 """
 
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
 
 import msgspec
 
@@ -24,7 +23,7 @@ Listener = Callable[[Record], None]
 """Takes each record as it comes into being: journal, metrics, checker, progress."""
 
 
-class Step(NamedTuple):
+class Step(msgspec.Struct, frozen=True, gc=False):
     """What a participant was given and what it returned; None if it returned nothing."""
 
     name: ParticipantId
@@ -32,6 +31,10 @@ class Step(NamedTuple):
     outputs: Outputs | None
     skew_ns: int = 0
     """How far the clock in the inputs is ahead."""
+
+    def answered(self, outputs: Outputs | None) -> "Step":
+        """The same step with what was returned."""
+        return Step(self.name, self.inputs, outputs, self.skew_ns)
 
 
 class ForeignRecordError(ValueError):
@@ -111,7 +114,7 @@ class Stage:
     def _recalled(self, act: Act) -> Step:
         """The step that an act is the record of."""
         if act.outputs is None or act.name in self._unanswered:
-            return self.turn(act.name, act.now_ns, act.skew_ns)._replace(outputs=act.outputs)
+            return self.turn(act.name, act.now_ns, act.skew_ns).answered(act.outputs)
         inbox = self.channel.take_heard(act.name, act.heard)
         inputs = Inputs(act.now_ns + act.skew_ns, self._world.observe(act.name), inbox)
         return Step(act.name, inputs, act.outputs, act.skew_ns)
@@ -162,7 +165,7 @@ class Stage:
         """
         self.now_ns = max(self.now_ns, now_ns)
         self.done_ns = now_ns + 1
-        sound = [step if self._is_sound(step) else step._replace(outputs=None) for step in steps]
+        sound = [step if _is_sound(step) else step.answered(None) for step in steps]
         sent = [Sent(now_ns, e) for step in sound if step.outputs for e in step.outputs.outbox]
         ruled, out_of_range = self.channel.transmit(sent)
         verdicts = tuple(ruled)
@@ -193,7 +196,7 @@ class Stage:
         self._tell(Ending(self.now_ns, reason))
 
     def _act(self, step: Step) -> Act:
-        name, inputs, outputs, skew_ns = step
+        name, inputs, outputs, skew_ns = step.name, step.inputs, step.outputs, step.skew_ns
         now_ns = inputs.now_ns - skew_ns
         if outputs is None:
             self._unanswered[name] = step
@@ -208,21 +211,26 @@ class Stage:
             self._resting.add(name)
         return Act(name, now_ns, inputs.observation, heard, outputs, ruling, skew_ns)
 
-    def _is_sound(self, step: Step) -> bool:
-        """Whether its outputs, if any, have a place on the stage: no bad numbers, no false sender."""
-        if step.outputs is None:
-            return True
-        try:
-            check_outputs(step.outputs)
-        except RefusedError:
-            return False
-        return not any(envelope.source != step.name for envelope in step.outputs.outbox)
-
     def _tell(self, record: Record) -> None:
         if self._kept is not None:
             self._kept.append(record)
         for listener in self._listeners:
             listener(record)
+
+
+def _is_sound(step: Step) -> bool:
+    """Whether its outputs, if any, have a place on the stage: no bad numbers, no false sender."""
+    outputs = step.outputs
+    if outputs is None:
+        return True
+    try:
+        check_outputs(outputs)
+    except RefusedError:
+        return False
+    for envelope in outputs.outbox:  # noqa: SIM110  a generator for one envelope costs as much as the rest
+        if envelope.source != step.name:
+            return False
+    return True
 
 
 def _may_be_killed(scenario: Scenario) -> bool:
