@@ -14,11 +14,10 @@ from kantor_protocol.messages import RefusedError, decode_news
 from kantor_protocol.packing import Pairs
 from kantor_protocol.replica import read_have
 from kantor_protocol.scenario import Scenario
+from kantor_protocol.slots import slots_told
 from kantor_worldsim.channel import DROPPED
+from kantor_worldsim.hostile import FIRST_SEQUENCE
 from kantor_worldsim.records import Act, Batch, Incident, Opening, Record
-
-FORGED = 2**62
-"""Sequences of hostile messages begin here."""
 
 Pair = tuple[float, float]
 
@@ -64,7 +63,7 @@ class _Ears(_Sight):
     def act(self, act: Act, outputs: Outputs) -> None:
         name = act.name
         for source, sequence in act.heard:
-            if sequence >= FORGED:
+            if sequence >= FIRST_SEQUENCE:
                 continue
             link = (name, source)
             newest = self._newest.get(link, -1)
@@ -80,7 +79,7 @@ class _Ears(_Sight):
                 self.seen["word of a former incarnation"] += 1
             self._heard.setdefault(link, set()).add(sequence)
         if outputs.refused > self._refused.get(name, 0) and act.heard:
-            forged = any(sequence >= FORGED for _, sequence in act.heard)
+            forged = any(sequence >= FIRST_SEQUENCE for _, sequence in act.heard)
             self.seen["hostile message refused"] += forged
         self._refused[name] = outputs.refused
 
@@ -182,8 +181,8 @@ class _Memory(_Sight):
             have = decode_news(body).have
         except RefusedError:
             return []
-        numbers = sum(byte < 128 for byte in have)
-        return read_have(have, numbers // (2 if self.scenario.claiming else 1)) or []
+        slots = slots_told(have, len(self._names), claims=self.scenario.claiming)
+        return (slots and read_have(have, slots)) or []
 
 
 class _Goals(_Sight):
