@@ -17,12 +17,13 @@ import numpy.typing as npt
 
 from kantor_protocol.faults import Clock, Fault, Hostile, Kill, Late
 from kantor_protocol.kernels import kernel
-from kantor_protocol.machine import WORLD_SIM, Outputs, ParticipantId
-from kantor_protocol.messages import News, RefusedError, decode_news
+from kantor_protocol.machine import WORLD_SIM, Envelope, Outputs, ParticipantId
+from kantor_protocol.messages import RefusedError, decode_news
 from kantor_protocol.modes import rectangle_of, visit_at
 from kantor_protocol.packing import take_int, take_uint
 from kantor_protocol.registers import read_register
 from kantor_protocol.replica import LENGTH_MAX
+from kantor_protocol.slots import slots_told
 from kantor_protocol.weights import WeightsSubscriber
 from kantor_worldsim import reading as of
 from kantor_worldsim.channel import DROPPED
@@ -33,6 +34,7 @@ from kantor_worldsim.metrics import Row
 from kantor_worldsim.outages import deeds_of
 from kantor_worldsim.reading import Reader, Reading
 from kantor_worldsim.records import Act, Batch, Ending, Incident, Opening, Record
+from kantor_worldsim.rules import Table, reach_m, severs
 from kantor_worldsim.survey import Survey
 from kantor_worldsim.world import SPEED_TOLERANCE
 
@@ -45,8 +47,8 @@ _STEP, _SPEED, _GARBLED_SPENT, _POINT, _BUDGET, _MISCOUNT = 4, 5, 6, 7, 8, 9
 _GARBLED_LOWERED, _RISE, _BELOW, _UNREADABLE, _LOG = 10, 11, 12, 13, 14
 _STRANGER, _REFUSED, _NOT_REBUILT, _NOT_ITS_OWN, _NO_SAMPLE, _NO_WEIGHT = 15, 16, 17, 18, 19, 20
 _WITHHELD, _OUT_OF_TURN, _AGAIN, _STOPPED, _STALE, _REFUSALS = 21, 22, 23, 24, 25, 26
-_EPOCH, _FOREIGN_LOG, _FORGETS, _NOBODYS, _SKEW = 27, 28, 29, 30, 31
-_OF_VERDICTS = (_NEVER_SENT, _FOR_ANOTHER, _TOO_FAR)
+_EPOCH, _FOREIGN_LOG, _FORGETS, _NOBODYS, _SKEW, _CUT = 27, 28, 29, 30, 31, 32
+_OF_VERDICTS = (_NEVER_SENT, _FOR_ANOTHER, _TOO_FAR, _CUT)
 _NO_LOGS, _NO_POSTED, _NO_FLIGHTS, _NO_FORGED = -1, -2, -3, -4
 _GROWING = {
     _NO_LOGS: "logs",
@@ -59,7 +61,8 @@ _WORDS = {
     _UNHEARD: ("delivery", "heard {what}, which was not delivered"),
     _NEVER_SENT: ("delivery", "{what} was never sent"),
     _FOR_ANOTHER: ("delivery", "delivered what was for somebody else"),
-    _TOO_FAR: ("range", "{what} over {x:.6g} m"),
+    _TOO_FAR: ("range", "{what} over {x:.6g} m, allowed {y:.6g} m"),
+    _CUT: ("cut", "{what} over a link that is cut"),
     _STEP: ("order", "step {a}, expected {b}"),
     _SPEED: ("speed", "moved {x:.6g} m, allowed {y:.6g} m"),
     _GARBLED_SPENT: ("energy", "spending that does not decode"),
@@ -318,17 +321,25 @@ def _target_of(state: State, source: int, sequence: int) -> int:
 
 
 @kernel
-def _check_range(state: State, law: Law, row: int, source: int, receiver: int) -> None:
-    by_supervisor = law.supervisor in (source, receiver)
-    range_m = law.supervisor_range_m if by_supervisor else law.range_m
+def _check_link(
+    state: State, law: Law, links: Table, row: int, now_ns: int, source: int, receiver: int
+) -> None:
+    """By the places that both had at the time of sending, before the batch moves them."""
+    range_m = law.supervisor_range_m if law.supervisor in (source, receiver) else law.range_m
+    if links.rules.shape[0] > 0:
+        if severs(links, now_ns, source, receiver):
+            _note(state, _CUT, row, 0, 0, 0, 0.0, 0.0)
+        range_m = reach_m(links, now_ns, source, receiver, range_m)
     dx = state.poses_m[receiver, 0] - state.poses_m[source, 0]
     dy = state.poses_m[receiver, 1] - state.poses_m[source, 1]
     if not dx * dx + dy * dy <= range_m * range_m:
-        _note(state, _TOO_FAR, row, 0, 0, 0, math.hypot(dx, dy), 0.0)
+        _note(state, _TOO_FAR, row, 0, 0, 0, math.hypot(dx, dy), range_m)
 
 
 @kernel
-def _check_verdict(state: State, law: Law, reading: Reading, row: int) -> None:
+def _check_verdict(
+    state: State, law: Law, links: Table, reading: Reading, row: int, now_ns: int
+) -> None:
     verdict = reading.verdicts[row]
     source, sequence = verdict[of.SOURCE], verdict[of.SEQUENCE]
     receiver, due_ns = verdict[of.TARGET], verdict[of.DUE_NS]
@@ -341,7 +352,7 @@ def _check_verdict(state: State, law: Law, reading: Reading, row: int) -> None:
     if due_ns == DROPPED:
         return
     if source >= 0:  # nobody knows where a stranger is
-        _check_range(state, law, row, source, receiver)
+        _check_link(state, law, links, row, now_ns, source, receiver)
     flight = state.flights[receiver, state.book[receiver, _FLYING]]
     flight[0], flight[1], flight[2], flight[3] = source, sequence, due_ns, 0
     state.book[receiver, _FLYING] += 1
@@ -634,6 +645,11 @@ def _check(
     virtual: bool,
     clocks: bool,
     patience_ns: int,
+    seed: int,
+    link_rules: np.ndarray,
+    link_numbers: np.ndarray,
+    link_names: np.ndarray,
+    severed: np.ndarray,
     now_ns: int,
 ) -> int:
     """Follow one batch; how many faults and keyframes it has.
@@ -674,6 +690,7 @@ def _check(
         clocks,
         patience_ns,
     )
+    links = Table(seed, link_rules, link_numbers, link_names, severed)
     lacking = _lacking(state, reading)
     if lacking < 0:
         return lacking
@@ -684,7 +701,7 @@ def _check(
             _post(state, reading, row)
     _post_forged(state, reading)
     for row in range(sizes[of.VERDICTS]):
-        _check_verdict(state, law, reading, row)
+        _check_verdict(state, law, links, reading, row, now_ns)
     for row in range(sizes[of.ACTS]):
         who = acts[row, of.PLACE]
         if who < 0:
@@ -812,7 +829,7 @@ class Checker:
         self._names = names
         self._places = {name: i for i, name in enumerate(names)}
         self._subscriber = WeightsSubscriber()
-        self._faults = LinkFaults.of(scenario, opening.seed)
+        self._links = LinkFaults(scenario, opening.seed).table
         self._hostile = [fault for fault in scenario.faults if isinstance(fault, Hostile)]
         self._clocks = [fault for fault in scenario.faults if isinstance(fault, Clock)]
         self._deeds = {(d.fault, d.who, d.what): d for d in deeds_of(scenario)}
@@ -857,7 +874,7 @@ class Checker:
         )
         self._state.book[:, _SLOT] = np.arange(len(names))
         self._state.book[:, _STOPPED_NS] = _NOT
-        self._arguments = (*self._state, *self._law)
+        self._arguments = (*self._state, *self._law, *self._links)
         self._visiting = scenario.planner.name == "spectral"
         self._registers = np.zeros((len(names), scenario.register_width), dtype=np.int64)
         self._rectangle = rectangle_of(scenario.domain)
@@ -872,8 +889,6 @@ class Checker:
         self._pass_time(batch.now_ns)
         if self._stopped[WORLD_SIM]:
             self._complain("dead", WORLD_SIM, "judges what is done, and is stopped")
-        if self._faults is not None:
-            self._check_links(batch, self._faults)
         if batch.injected:
             self._check_injected(batch)
         if self._clocks:
@@ -1036,29 +1051,14 @@ class Checker:
             have=np.pad(state.have, ((0, 0), (0, more))),
         )
         self._registers = np.pad(self._registers, ((0, more), (0, 0)))
-        self._arguments = (*self._state, *self._law)
-
-    def _check_links(self, batch: Batch, faults: LinkFaults) -> None:
-        """By the places that everybody had at the time of sending, before the batch moves them."""
-        for source, sequence, target, due_ns in map(msgspec.structs.astuple, batch.verdicts):
-            here, there = self._places.get(source), self._places.get(target)
-            if due_ns == DROPPED or here is None or there is None:
-                continue
-            if faults.cuts(batch.now_ns, source, target):
-                self._complain("cut", target, f"{source}#{sequence} over a link that is cut")
-            reach_m = faults.reach_m(batch.now_ns, source, target)
-            dx, dy = (self._state.poses_m[there] - self._state.poses_m[here]).tolist()
-            if not dx * dx + dy * dy <= reach_m * reach_m:
-                way_m = math.hypot(dx, dy)
-                what = f"{source}#{sequence} over {way_m:.6g} m, a fault leaves {reach_m:.6g} m"
-                self._complain("range", target, what)
+        self._arguments = (*self._state, *self._law, *self._links)
 
     def _lengthen(self, name: str) -> None:
         """Double one of the arrays that grow with the run."""
         rows = getattr(self._state, name)
         longer = np.concatenate((rows, np.zeros_like(rows)), axis=1)
         self._state = self._state._replace(**{name: longer})
-        self._arguments = (*self._state, *self._law)
+        self._arguments = (*self._state, *self._law, *self._links)
 
     def _put_into_words(self, batch: Batch, faults: int) -> None:
         noted = min(faults, _COMPLAINTS_MAX)
@@ -1092,20 +1092,14 @@ class Checker:
 
     def _check_register(self, act: Act, outputs: Outputs) -> None:
         """It chooses where it was observed last."""
-        name, width = act.name, self._scenario.register_width
+        name = act.name
         slot = self._state.book.item(self._places[name], _SLOT)
         if outputs.spent:
             pose, modes = act.observation.pose, self._scenario.planner.modes
             self._registers[slot] += visit_at(pose.x_m, pose.y_m, self._rectangle, modes)
         points = self._state.shipped.item(slot, _WRITES)
         for envelope in outputs.outbox:
-            sent = None
-            try:
-                news = decode_news(envelope.body)
-                slots = max(len(self._names), self._slots_of(news))
-                sent = read_register(news.registers, slots, width, slot)
-            except RefusedError:
-                pass
+            sent = self._sent_register(envelope, slot)
             if sent is None:
                 self._complain("register", name, "sends what nobody can read")
             elif sent[0] and not np.array_equal(sent[1], self._registers[slot]):
@@ -1113,10 +1107,18 @@ class Checker:
             elif sent[0] and sent[0] != points:
                 self._complain("register", name, f"writes {sent[0]} of {points}")
 
-    def _slots_of(self, news: News) -> int:
-        """How many origins its sender knows."""
-        numbers = sum(byte < 0x80 for byte in news.have)
-        return numbers // 2 if self._law.claims else numbers
+    def _sent_register(
+        self, envelope: Envelope, slot: int
+    ) -> tuple[int, npt.NDArray[np.int64]] | None:
+        """Stamp and numbers of a register in a message; stamp 0 if absent, None if malformed."""
+        try:
+            news = decode_news(envelope.body)
+        except RefusedError:
+            return None
+        slots = slots_told(news.have, len(self._names), claims=self._law.claims)
+        if slots is None:
+            return None
+        return read_register(news.registers, slots, self._scenario.register_width, slot)
 
     def _end(self, ending: Ending) -> None:
         if self._law.ledger:

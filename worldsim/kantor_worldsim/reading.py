@@ -16,6 +16,7 @@ from kantor_protocol.kernels import kernel
 from kantor_protocol.machine import SUPERVISOR
 from kantor_protocol.messages import BODY_BYTES_MAX, VERSION, News
 from kantor_protocol.packing import take_int, take_uint
+from kantor_protocol.slots import EPOCHS_MAX
 from kantor_protocol.weights import WeightsMessage
 from kantor_worldsim.records import Batch, Opening, Record, encode_record
 
@@ -473,7 +474,7 @@ def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int
     epoch = 0
     if fields > 9:
         epoch, at = _number(payload, at)
-    if skip(payload, at, fields - 10) != end:
+    if not 0 <= epoch <= EPOCHS_MAX or skip(payload, at, fields - 10) != end:
         return refused
     return epoch, have, have_end, logs, logs_end
 

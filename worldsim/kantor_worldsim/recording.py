@@ -74,7 +74,7 @@ class Recording:
         self._reader = Reader()
         survey = Survey(self._reader) if scenario.mapping else None
         self.metrics = metrics_of(scenario, exact_every, self._reader, survey)
-        self.checker = Checker(self._reader, survey)
+        self.checker = Checker(self._reader, survey, virtual=exchange != "wall")
         self.refused_at_door = 0
         """Messages to world-sim that it could not take in; whoever runs the bus counts them."""
         self._scenario = scenario
