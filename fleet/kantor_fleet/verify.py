@@ -7,14 +7,24 @@ from typing import Any
 
 from kantor_fleet.exits import Exit, fail
 from kantor_fleet.team import participant, play
-from kantor_protocol.machine import StateMachine
+from kantor_protocol.machine import WORLD_SIM, Outputs, ParticipantId, StateMachine
 from kantor_protocol.messages import RefusedError
-from kantor_protocol.scenario import ScenarioError
+from kantor_protocol.scenario import Scenario, ScenarioError
 from kantor_worldsim.checkers import check
 from kantor_worldsim.journal import Digest, file_digest, read
+from kantor_worldsim.outages import Outages
 from kantor_worldsim.recording import JOURNAL, MANIFEST
-from kantor_worldsim.records import Batch, Ending, Mailbag, Opening, Record, encode_record
-from kantor_worldsim.world import Site
+from kantor_worldsim.records import (
+    Act,
+    Batch,
+    Ending,
+    Incident,
+    Mailbag,
+    Opening,
+    Record,
+    encode_record,
+)
+from kantor_worldsim.world import Site, World
 
 
 def verify(folder: Path) -> Exit:
@@ -91,10 +101,19 @@ def _verdict_of_execution(
 ) -> _Verdict:
     opening = records[0][1]
     assert isinstance(opening, Opening)
-    absent = any(isinstance(record, Batch) and record.absent for _, record in records)
-    if manifest.get("exchange") == "wall" or absent:
+    if manifest.get("exchange") == "wall" or any(_chance(opening.scenario, records)):
         return _replayed(opening, records)
     return _executed(opening, records)
+
+
+def _chance(scenario: Scenario, records: list[tuple[bytes, Record]]) -> Iterator[bool]:
+    """Of every record whether something happened that no scenario orders."""
+    outages = Outages(scenario)
+    for _, record in records:
+        if isinstance(record, Incident):
+            yield record.fault < 0
+        elif isinstance(record, Batch) and record.absent:
+            yield not all(outages.dies(name, record.now_ns) for name in record.absent)
 
 
 def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict:
@@ -127,23 +146,58 @@ def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict
 
 def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict:
     """Every participant anew, each from the inbox that it had."""
-    scenario, seed, site = opening.scenario, opening.seed, opening.site
-    machines: dict[str, StateMachine] = {}
-    mailbag, steps = Mailbag(), 0
+    team = _Team(opening)
+    steps = 0
     for _, record in records:
-        if not isinstance(record, Batch):
-            continue
-        for act in record.acts:
-            if act.outputs is None:
-                continue
-            if act.name not in machines:
-                machines[act.name] = participant(act.name, scenario, seed, site)
-            try:
-                outputs = machines[act.name].step(mailbag.inputs(act))
-            except (KeyError, RefusedError):
-                return False, f"replayed: {act.name} heard at t={act.now_ns} what nobody sent"
-            if outputs != act.outputs:
-                return False, f"replayed: {act.name} differs at its step {act.outputs.step}"
-            steps += 1
-        mailbag.post(record)
-    return True, f"replayed: {steps} steps of {len(machines)} participants, all the same"
+        if isinstance(record, Incident):
+            team.follow(record)
+        elif isinstance(record, Batch):
+            for act in record.acts:
+                if act.outputs is None:
+                    continue
+                try:
+                    outputs = team.step(act)
+                except (KeyError, RefusedError):
+                    return False, f"replayed: {act.name} heard at t={act.now_ns} what nobody sent"
+                if outputs != act.outputs:
+                    return False, f"replayed: {act.name} differs at its step {act.outputs.step}"
+                steps += 1
+            team.mailbag.post(record)
+    return True, f"replayed: {steps} steps of {team.count} participants, all the same"
+
+
+class _Team:
+    """The participants of a record. A new incarnation takes over the body as the world then knows it."""
+
+    def __init__(self, opening: Opening) -> None:
+        self.mailbag = Mailbag()
+        self._opening = opening
+        self._site = opening.site
+        self._world = World(opening.scenario, opening.seed, self._site)
+        self._machines: dict[ParticipantId, StateMachine] = {}
+
+    @property
+    def count(self) -> int:
+        """How many have acted, incarnations aside."""
+        return len(self._machines)
+
+    def follow(self, incident: Incident) -> None:
+        """A process that comes back goes on, unless it is another incarnation."""
+        who = incident.who
+        if incident.what not in {"start", "join"} or who == WORLD_SIM:
+            return
+        if self._world.begin(who, incident.epoch):
+            self._machines[who] = self._participant(who)
+
+    def step(self, act: Act) -> Outputs:
+        """What comes of an act's inputs. Raises KeyError for what nobody sent."""
+        name = act.name
+        if name not in self._machines:
+            self._machines[name] = self._participant(name)
+        outputs = self._machines[name].step(self.mailbag.inputs(act))
+        self._world.accept(name, act.now_ns, outputs)
+        return outputs
+
+    def _participant(self, name: ParticipantId) -> StateMachine:
+        opening, body = self._opening, self._world.body(name)
+        return participant(name, opening.scenario, opening.seed, self._site, body)

@@ -1,0 +1,126 @@
+"""Process faults as time goes by: what is done when, and who is idle meanwhile."""
+
+import itertools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kantor_protocol.scenario import Scenario, parse
+from kantor_worldsim.outages import Deed, Outages, deeds_of
+from strategies import SMALL, examples
+
+MS = 1_000_000
+
+
+def troubled(*faults: str) -> Scenario:
+    """The small mission with these faults, a line each."""
+    tables = "".join(f"\n[[faults]]\n{fault.replace('; ', chr(10))}\n" for fault in faults)
+    return parse(SMALL + tables, "troubled")
+
+
+KILL = 'kind = "kill"; who = ["r1"]; from_s = 1.0; until_s = 2.0; disk = "torn"; mid_step = true'
+FOR_GOOD = 'kind = "kill"; who = ["r2"]; from_s = 2.0'
+PAUSE = 'kind = "pause"; who = ["r1", "r3"]; from_s = 2.0; until_s = 3.0'
+DARK = 'kind = "pause"; who = ["worldsim"]; from_s = 4.0; until_s = 5.0'
+SLOW = 'kind = "slow"; who = ["r3"]; from_s = 6.0; until_s = 8.0; every = 3'
+AHEAD = (
+    'kind = "clock"; who = ["r3"]; from_s = 1.0; until_s = 3.0; offset_s = 5.0; rate_ppm = 100.0'
+)
+BEHIND = 'kind = "clock"; who = ["r3"]; from_s = 2.0; offset_s = -2.5'
+ASKS = 'kind = "impostor"; who = ["r1"]; from_s = 2.0'
+
+
+def test_what_ends_comes_before_what_begins() -> None:
+    """In order of time, then ends, then of the list: a robot can be started and paused at once."""
+    deeds = deeds_of(troubled(PAUSE, FOR_GOOD, ASKS, KILL))
+
+    assert deeds == [
+        Deed(1000 * MS, 3, "r1", "kill", "torn", mid_step=True),
+        Deed(2000 * MS, 3, "r1", "start", "torn", mid_step=True),
+        Deed(2000 * MS, 0, "r1", "pause"),
+        Deed(2000 * MS, 0, "r3", "pause"),
+        Deed(2000 * MS, 1, "r2", "kill"),
+        Deed(2000 * MS, 2, "r1", "pretend"),
+        Deed(3000 * MS, 0, "r1", "resume"),
+        Deed(3000 * MS, 0, "r3", "resume"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("who", "at_ms", "idle"),
+    [
+        ("r1", 999, False),
+        ("r1", 1000, True),
+        ("r1", 1999, True),
+        ("r1", 2000, True),
+        ("r1", 3000, False),
+        ("r2", 1999, False),
+        ("r2", 10**6, True),
+        ("r3", 1500, False),
+        ("r3", 2000, True),
+        ("r1", 4000, True),
+        ("r3", 4999, True),
+        ("r3", 5000, False),
+        ("r3", 6000, False),
+        ("r3", 6100, True),
+        ("r3", 6299, True),
+        ("r3", 6300, False),
+        ("r3", 8000, False),
+    ],
+)
+def test_who_is_idle_when(who: str, at_ms: int, idle: bool) -> None:  # noqa: FBT001
+    """From the beginning of a window up to its end; everybody is while world-sim is."""
+    faults = (KILL, PAUSE, SLOW, FOR_GOOD if who == "r2" else DARK)
+    outages = Outages(troubled(*faults))
+
+    assert outages.idle(who, at_ms * MS) == idle
+
+
+@pytest.mark.parametrize(
+    ("at_ms", "skew_ns"),
+    [
+        (999, 0),
+        (1000, 5000 * MS),
+        (1500, 5000 * MS + 50_000),
+        (2000, 2500 * MS + 100_000),
+        (3000, -2500 * MS),
+    ],
+)
+def test_faults_of_a_clock_add_up(at_ms: int, skew_ns: int) -> None:
+    """It jumps, runs wrong, and jumps back."""
+    assert Outages(troubled(AHEAD, BEHIND)).skew_ns("r3", at_ms * MS) == skew_ns
+
+
+def test_no_clock_shows_a_time_before_the_start() -> None:
+    """Messages carry times that are not negative."""
+    early = 'kind = "clock"; who = ["r3"]; offset_s = -2.5'
+
+    assert Outages(troubled(early)).skew_ns("r3", 1000 * MS) == -1000 * MS
+
+
+def test_who_is_lost_and_who_dies_in_a_step() -> None:
+    """Lost is who will not be started; a step to die in is any within the window."""
+    outages = Outages(troubled(KILL, FOR_GOOD))
+
+    assert [outages.lost("r2", at_ms * MS) for at_ms in (1999, 2000, 9000)] == [False, True, True]
+    assert not outages.lost("r1", 1500 * MS)
+    assert [outages.dies("r1", at_ms * MS) for at_ms in (999, 1000, 2000)] == [False, True, False]
+    assert not outages.dies("r2", 2500 * MS)
+
+
+@examples(50)
+@given(done=st.integers(0, 9), times_ms=st.lists(st.integers(0, 5000), max_size=5).map(sorted))
+def test_every_deed_is_handed_out_once(done: int, times_ms: list[int]) -> None:
+    """One by one or all that are due, from the beginning or from where somebody left off."""
+    scenario = troubled(KILL, ASKS, PAUSE, DARK)
+    deeds = deeds_of(scenario)
+    outages, one_by_one = Outages(scenario, done=done), Outages(scenario, done=done)
+    taken = list(itertools.chain.from_iterable(outages.take(t * MS) for t in times_ms))
+    last_ns = times_ms[-1] * MS if times_ms else -1
+
+    assert taken == [deed for deed in deeds[done:] if deed.at_ns <= last_ns]
+    assert [one_by_one.pop() for _ in deeds[done:]] == deeds[done:]
+    assert one_by_one.next_ns is None
+    rest = deeds[done + len(taken) :]
+    assert outages.next_ns == (rest[0].at_ns if rest else None)
