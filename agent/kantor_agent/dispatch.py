@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_agent.planners.allocators import ALLOCATORS
-from kantor_agent.planners.team import Member, Situation, Task
+from kantor_agent.planners.team import Member, Situation, Task, past
 from kantor_agent.terrain import Terrain
 from kantor_protocol.grid import NOWHERE, Frame
 from kantor_protocol.radio import CONTACT_PERIODS
@@ -21,7 +21,6 @@ from kantor_protocol.registers import Registers
 from kantor_protocol.scenario import Scenario
 
 ARRIVED, RESTING = 1, 2
-_LONG_AGO = -(1 << 40)
 CELL, FLAGS, TARGET, SINCE, MEMO = 0, 1, 2, 3, 4
 
 
@@ -40,11 +39,6 @@ class Patience(NamedTuple):
             CONTACT_PERIODS * scenario.period_ns // period_ns,
             round(scenario.planner.remember_s * 1e9) // period_ns,
         )
-
-
-def past(since: int, tick: int) -> int:
-    """A tick that has been. One to come is of a clock that runs wrong: nobody must wait for it."""
-    return since if since <= tick else _LONG_AGO
 
 
 def register_of(member: Member, *, resting: bool) -> list[int]:

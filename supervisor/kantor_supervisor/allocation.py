@@ -4,8 +4,8 @@ It is one more participant. Robots hear of one another's layers through it, and 
 """
 
 from kantor_agent.chart import Chart
-from kantor_agent.dispatch import Dispatch, Patience, orders_of, past, roll_call
-from kantor_agent.planners.team import Member, Task
+from kantor_agent.dispatch import Dispatch, Patience, orders_of, roll_call
+from kantor_agent.planners.team import Member, Task, past
 from kantor_agent.terrain import Terrain
 from kantor_protocol.clock import clocks
 from kantor_protocol.evidence import entries

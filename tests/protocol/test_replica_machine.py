@@ -1,8 +1,9 @@
 """Replication under an arbitrary radio, as a state machine.
 
-Robots spend, claim and speak; the radio drops, repeats, delays, reorders and damages what they say.
-After every event the invariants hold; whenever the radio is good for a while, all weights come to
-the plain sum (ledger) or the plain minimum (min) of what was spent.
+Robots spend, claim and speak; some lose all that they held and are born again; the radio drops, repeats,
+delays, reorders and damages what they say. After every event the invariants hold; whenever the radio is
+good for a while, all weights come to the plain sum (ledger) or the plain minimum (min) of what was spent,
+but for what nobody alive has heard of.
 """
 
 from collections import Counter
@@ -20,21 +21,28 @@ N = 6
 UNITS = Units.of(8, N)
 """Four units a sample, three a point."""
 
+BIRTHS_MAX = 3
+"""In a run; any robot's, at any moment."""
+
 Message = tuple[bytes, bytes, bytes]
 
 
 class Replicas(RuleBasedStateMachine):
-    """Two to four replicas and everything that is on the air between them."""
+    """Two to four participants and everything that is on the air between them.
+
+    Slots are counted here by hand: incarnation e of place i of n is e n + i.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.made: list[Replica] = []
+        """The living, by place."""
+        self.authors: dict[int, Replica] = {}
+        """Everybody there ever was, by slot; the dead as they were in the end."""
         self.air: list[tuple[int, int, Message]] = []
-        """(source, target, message): said and not yet heard or lost."""
-        self.bought: list[list[tuple[int, int]]] = []
-        """By origin: (sample, units), in order. Written here, never by the code under test."""
-        self.least: dict[int, int] = {}
-        """By sample: the least weight after anybody's spending, in that robot's view."""
+        """(slot of the source, place of the target, message): said and not yet heard or lost."""
+        self.bought: dict[int, list[tuple[int, int]]] = {}
+        """By slot: (sample, units), in order. Written here, never by the code under test."""
         self.seen: list[list[int]] = []
         """The weights after the event before."""
 
@@ -50,21 +58,24 @@ class Replicas(RuleBasedStateMachine):
         self, *, count: int, ledger: bool, claims: bool, relay: bool, beacon: bool, patience: int
     ) -> None:
         """One mission's manner for all; the last of the team may be a relay."""
-        self.made = [
-            Replica(
-                me,
+
+        def born(slot: int) -> Replica:
+            held = Replica(
+                slot,
                 count,
                 N,
                 UNITS,
                 ledger=ledger,
                 claims=claims,
-                relay=relay and me == count - 1,
+                relay=relay and slot % count == count - 1,
                 beacon=beacon,
                 patience_steps=patience,
             )
-            for me in range(count)
-        ]
-        self.bought = [[] for _ in range(count)]
+            self.authors[slot], self.bought[slot] = held, []
+            return held
+
+        self.born = born
+        self.made = [born(place) for place in range(count)]
         self.seen = [[UNITS.sample] * N for _ in range(count)]
 
     # Events.
@@ -78,9 +89,15 @@ class Replicas(RuleBasedStateMachine):
         if units > 0:
             held.reserve(1)
             spend(held.store, held.manner, sample, units)
-            self.bought[who].append((sample, units))
-            left = int(held.weights[sample])
-            self.least[sample] = min(left, self.least.get(sample, UNITS.sample))
+            self.bought[held.manner.me].append((sample, units))
+
+    @precondition(lambda self: len(self.authors) < len(self.made) + BIRTHS_MAX)
+    @rule(who=st.integers(0, 3))
+    def lose_all(self, who: int) -> None:
+        """A robot has lost its disk, and goes on as its next incarnation."""
+        who %= len(self.made)
+        self.made[who] = self.born(self.made[who].manner.me + len(self.made))
+        self.seen[who] = [UNITS.sample] * N
 
     @rule(who=st.integers(0, 3), sample=st.integers(NOBODY, N - 1))
     def head_for(self, who: int, sample: int) -> None:
@@ -92,17 +109,21 @@ class Replicas(RuleBasedStateMachine):
     def speak(self, who: int) -> None:
         """A robot ends its step with a message to everybody."""
         who %= len(self.made)
-        message = self.made[who].compose()
-        self.made[who].end_step()
-        self.air += [(who, other, message) for other in range(len(self.made)) if other != who]
+        held = self.made[who]
+        message = held.compose()
+        held.end_step()
+        others = [other for other in range(len(self.made)) if other != who]
+        self.air += [(held.manner.me, other, message) for other in others]
 
     @rule(who=st.integers(0, 3), whom=st.integers(0, 3))
     def speak_to(self, who: int, whom: int) -> None:
         """A robot ends its step with a message to one participant, as to a supervisor."""
         who, whom = who % len(self.made), whom % len(self.made)
         if who != whom:
-            self.air.append((who, whom, self.made[who].compose(whom)))
-            self.made[who].end_step()
+            held, theirs = self.made[who], self.made[whom].manner.me
+            slot = theirs if theirs < held.slots else whom  # it may not have heard of it yet
+            self.air.append((held.manner.me, whom, held.compose(slot)))
+            held.end_step()
 
     @precondition(lambda self: self.air)
     @rule(which=st.integers(0, 1000), again=st.booleans())
@@ -137,12 +158,12 @@ class Replicas(RuleBasedStateMachine):
         """The radio is good for a while: everybody comes to the same weights, the true ones."""
         self.air = []
         made, expected = self.made, self._truth()
-        for _ in range(2 * made[0].manner.patience + 4):
+        for _ in range(2 * made[0].manner.patience + 6):
             words = [held.compose() for held in made]
             for i, held in enumerate(made):
                 held.end_step()
                 for j, word in enumerate(words):
-                    assert i == j or held.learn(j, *word)
+                    assert i == j or held.learn(made[j].manner.me, *word)
 
         assert [held.weights.tolist() for held in made] == [expected] * len(made)
 
@@ -162,12 +183,21 @@ class Replicas(RuleBasedStateMachine):
         self.seen = now
 
     @invariant()
+    def views_are_not_below_what_is_left(self) -> None:
+        """Whatever is lost or heard twice: nobody believes that more was spent than was."""
+        spent = Counter[int]()
+        for sample, units in (entry for bought in self.bought.values() for entry in bought):
+            spent[sample] += units
+        for held in self.made:
+            assert all(held.weights[j] >= UNITS.sample - spent[j] for j in range(N))
+
+    @invariant()
     def logs_are_prefixes_of_what_was_spent(self) -> None:
         """ledger: whoever holds anything of a log holds its beginning, and weighs exactly that."""
         for held in self.made if self.made and self.made[0].manner.ledger else []:
             spent: Counter[int] = Counter()
-            for origin, bought in enumerate(self.bought):
-                entries = held.entries(origin)
+            for origin in range(held.slots):
+                entries, bought = held.entries(origin), self.bought.get(origin, [])
                 assert entries == bought[: len(entries)]
                 assert origin != held.manner.me or len(entries) == len(bought)
                 for sample, units in entries:
@@ -179,23 +209,30 @@ class Replicas(RuleBasedStateMachine):
     def acknowledged_minima_were_merged(self) -> None:
         """min: who says that it holds a log up to some length weighs no more than it says there."""
         for held in self.made if self.made and not self.made[0].manner.ledger else []:
-            for author in self.made:
-                length = int(held.store.length[author.manner.me])
-                assert length <= len(author.entries(author.manner.me))
-                for sample, value in author.entries(author.manner.me)[:length]:
+            for slot, author in self.authors.items():
+                length = int(held.store.length[slot]) if slot < held.slots else 0
+                assert length <= len(author.entries(slot))
+                for sample, value in author.entries(slot)[:length]:
                     assert held.weights[sample] <= value
 
     @invariant()
     def nobody_is_thought_to_hold_more_than_it_does(self) -> None:
         """An acknowledgement is never ahead of the truth, so nothing is ever held back for good."""
-        count = len(self.made)
         for held in self.made:
-            for other in self.made:
-                known = held.store.known[other.manner.me].tolist()
-                truly = other.store.length.tolist() + other.store.claims[2].tolist()
-                if other is not held:
-                    assert all(x <= y for x, y in zip(known, truly, strict=True))
-                assert len(known) == 2 * count
+            for slot, other in self.authors.items():
+                if other is held or slot >= held.slots:
+                    continue
+                for part, truly in enumerate((other.store.length, other.store.claims[2])):
+                    known = held.store.known[slot, part * held.slots : (part + 1) * held.slots]
+                    holds = [*truly.tolist(), *[0] * held.slots]
+                    assert all(x <= y for x, y in zip(known.tolist(), holds, strict=False))
+
+    @invariant()
+    def room_is_for_whole_rosters(self) -> None:
+        """Slots come in blocks, one for each incarnation of somebody that was heard of."""
+        for held in self.made:
+            assert held.slots % len(self.made) == 0
+            assert held.manner.me < held.slots <= max(self.authors) + len(self.made)
 
     @invariant()
     def fallen_samples_are_named_once(self) -> None:
@@ -206,16 +243,19 @@ class Replicas(RuleBasedStateMachine):
             assert all(held.weights[sample] < UNITS.sample for sample in fallen)
 
     def _truth(self) -> list[int]:
+        """What the living know between them."""
         if not self.made[0].manner.ledger:
-            return [self.least.get(sample, UNITS.sample) for sample in range(N)]
+            return [min(int(held.weights[sample]) for held in self.made) for sample in range(N)]
         spent = Counter[int]()
-        for sample, units in (entry for bought in self.bought for entry in bought):
-            spent[sample] += units
+        for slot, bought in self.bought.items():
+            heard = max(int(h.store.length[slot]) if slot < h.slots else 0 for h in self.made)
+            for sample, units in bought[:heard]:
+                spent[sample] += units
         return [max(0, UNITS.sample - spent[sample]) for sample in range(N)]
 
     def _snapshot(self, who: int) -> list[Any]:
         return [(array.shape, array.tolist()) for array in self.made[who].store]
 
 
-Replicas.TestCase.settings = settings(examples(80), stateful_step_count=40)
+Replicas.TestCase.settings = settings(examples(120), stateful_step_count=50)
 TestReplicas = Replicas.TestCase

@@ -34,7 +34,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kantor_agent.planners.team import Member, Situation, Task
+from kantor_agent.planners.team import Member, Situation, Task, past
 from kantor_agent.terrain import Terrain
 from kantor_protocol.grid import NOWHERE, UNKNOWN
 from kantor_protocol.kernels import kernel
@@ -440,6 +440,10 @@ class _Trader:
         target = self._drive(situation)
         return [Task(target, packed(self._memo()))]
 
+    def _runs(self, until: int) -> bool:
+        """Whether a lease that ends then still runs; one with too long to go is of a clock that ran wrong."""
+        return self._tick < until <= self._tick + self._lease
+
     # What is known.
 
     def _heard(self, others: Sequence[Member]) -> dict[int, Memo]:
@@ -482,7 +486,7 @@ class _Trader:
             return _Holding(held.goal)
         if memo.seen[self._me] >= held.named:
             return None if self._near(held.goal, memo.firm) else _Holding(held.goal)
-        return held if self._tick < held.until else _Holding(held.goal)
+        return held if self._runs(held.until) else _Holding(held.goal)
 
     def _take_up(self) -> None:
         """Take up what others want this robot to hold, unless something near is in its tour."""
@@ -537,7 +541,7 @@ class _Trader:
             if memo.seen[self._me] >= offer.opened
         ]
         void = offer.goal not in self._firm
-        if not void and len(answers) < len(self._mates) and self._tick < offer.until:
+        if not void and len(answers) < len(self._mates) and self._runs(offer.until):
             return
         self._offer = None
         bids = [answer for answer in answers if 1 <= answer[0] <= offer.price]
@@ -548,7 +552,11 @@ class _Trader:
     def _open(self) -> None:
         """Offer the next goal of this pass that is held once; begin a pass when this robot has moved."""
         tick, cell = self._passed
-        if not self._agenda and self._tick >= tick + self._gap and cell != self._member.cell:
+        if (
+            not self._agenda
+            and self._tick >= past(tick, self._tick) + self._gap
+            and cell != self._member.cell
+        ):
             self._agenda, self._passed = self._goals, (self._tick, self._member.cell)
         told = self._held_by_mates()
         while self._agenda and self._offer is None:
@@ -584,7 +592,10 @@ class _Trader:
         task, stale = self._member.task, task_is_stale(situation, self._member)
         changed = next(iter(self._goals), NOWHERE) != self._towards
         due = self._member.arrived or (self._on_events and (stale or changed))
-        if not (due or task.target == NOWHERE) or self._tick < self._turned + self._gap:
+        if (
+            not (due or task.target == NOWHERE)
+            or self._tick < past(self._turned, self._tick) + self._gap
+        ):
             return task.target
         self._turned = self._tick
         self._tour = [held for held in self._tour if _is_reachable(self._field, held.goal)]

@@ -14,6 +14,13 @@ import numpy.typing as npt
 from kantor_agent.terrain import Terrain
 from kantor_protocol.grid import NOWHERE
 
+_LONG_AGO = -(1 << 40)
+
+
+def past(since: int, tick: int) -> int:
+    """A tick that has been. One to come is of a clock that runs wrong: nobody must wait for it."""
+    return since if since <= tick else _LONG_AGO
+
 
 class Task(NamedTuple):
     """What a robot is to do."""
