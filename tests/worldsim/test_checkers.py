@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.faults import AnyFault, Partition, Range
-from kantor_protocol.machine import SUPERVISOR, ParticipantId, Pose
+from kantor_protocol.faults import AnyFault, Kill, Partition, Range
+from kantor_protocol.machine import SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.messages import News, decode_news, encode
 from kantor_protocol.modes import VISIT
 from kantor_protocol.packing import Pairs, put_uint
@@ -22,7 +22,7 @@ from kantor_protocol.replica import read_have, read_logs
 from kantor_protocol.weights import WeightsMessage, WeightsSubscriber
 from kantor_worldsim.channel import DROPPED, Verdict
 from kantor_worldsim.checkers import Checker, check
-from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
+from kantor_worldsim.records import Act, Batch, Ending, Incident, Opening, Record
 from strategies import SEEDS, examples
 
 Play = Callable[..., tuple[Record, ...]]
@@ -154,10 +154,10 @@ def uints(*values: int) -> bytes:
     return buffer[:at].tobytes()
 
 
-def own_register(act: Act, origins: int = 3) -> int:
-    """How many writes the own register has that r1 sends along; 0 if it sends none."""
+def own_register(act: Act, origins: int = 3, slot: int = 0) -> int:
+    """How many writes the register of a slot has that is sent along; 0 if there is none."""
     content = decode_news(act.outputs.outbox[0].body).registers
-    found = read_register(content, origins, 9, 0)
+    found = read_register(content, origins, 9, slot)
     assert found is not None
     return found[0]
 
@@ -733,6 +733,314 @@ def _stranger_acts(records: Records) -> list[Record]:
 @breaks("ruling")
 def _world_refused_something(records: Records) -> list[Record]:
     return put_act(records, acts(records, "r1")[3], ruling(violations=("speed",)))
+
+
+# What befalls processes.
+
+PAUSED = ("faults=[{kind = 'pause', who = ['r2'], from_s = 0.5, until_s = 1.1}]",)
+FULL = ("faults=[{kind = 'full-disk', who = ['r2'], from_s = 0.5, until_s = 1.1}]",)
+LATE = ("faults=[{kind = 'late', who = ['r2'], until_s = 1.1}]",)
+KILLED = ("faults=[{kind = 'kill', who = ['r2'], from_s = 0.5, until_s = 1.1}]",)
+FORGETFUL = ("faults=[{kind = 'kill', who = ['r2'], from_s = 0.5, until_s = 1.1, disk = 'lost'}]",)
+TORN = (FORGETFUL[0].replace("lost", "torn"),)
+MID_STEP = (FORGETFUL[0].replace("disk = 'lost'", "mid_step = true"),)
+WORLDLESS = ("faults=[{kind = 'kill', who = ['worldsim'], from_s = 0.5, until_s = 1.1}]",)
+SKEWED = ("faults=[{kind = 'clock', who = ['r2'], from_s = 0.5, until_s = 1.1, offset_s = 3.0}]",)
+HOSTILE = ("faults=[{kind = 'hostile', probability = 0.5, from_s = 0.5, until_s = 1.1}]",)
+COPIED = ("faults=[{kind = 'impostor', who = ['r2'], from_s = 0.5}]",)
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [PAUSED, FULL, LATE, KILLED, FORGETFUL, TORN, MID_STEP, WORLDLESS, SKEWED, HOSTILE, COPIED],
+    ids=lambda faults: faults[0].split("'")[1],
+)
+@pytest.mark.parametrize("merge", MERGES)
+@pytest.mark.parametrize("planner", [(), SPECTRAL, ("coordination=centralized",)])
+def test_no_complaint_whatever_befalls_processes(
+    played: Play, faults: tuple[str, ...], merge: str, planner: tuple[str, ...]
+) -> None:
+    """Sound robots break no rule when their processes are struck."""
+    records = played(*faults, *MERGES[merge], *planner)
+
+    assert check(records).complaints == []
+    assert befell(records)
+
+
+def befell(records: Records, what: str = "") -> list[Incident]:
+    """The incidents of a kind, or all but those of links."""
+    found = [record for record in records if isinstance(record, Incident)]
+    return [each for each in found if what in {"", each.what}] or [
+        Incident(0, "record", "injected") for batch in batches(records) if batch.injected
+    ]
+
+
+def changed(records: Records, kind: str, **values: Any) -> list[Record]:
+    """The records with the first incident of a kind changed."""
+    incident = befell(records, kind)[0]
+    return put(records, incident, msgspec.structs.replace(incident, **values))
+
+
+def delayed(records: Records, what: str) -> list[Record]:
+    """The records with an incident that comes only after the next batch in which something is done."""
+    incident = befell(records, what)[0]
+    at = list(records).index(incident)
+    after = next(i for i, r in enumerate(records) if i > at and isinstance(r, Batch) and r.acts)
+    later = msgspec.structs.replace(incident, now_ns=records[after].now_ns)  # type: ignore[union-attr]
+    return [*records[:at], *records[at + 1 : after + 1], later, *records[after + 1 :]]
+
+
+@breaks("delivery")
+def _did_not_hear_what_had_arrived(records: Records) -> list[Record]:
+    act = acts(records, "r1")[5]
+    return put_act(records, act, heard(*act.heard[1:]))
+
+
+@breaks("delivery")
+def _heard_out_of_turn(records: Records) -> list[Record]:
+    act = acts(records, "r1")[5]
+    return put_act(records, act, heard(*reversed(act.heard)))
+
+
+@breaks("delivery", run=DEAF)
+def _used_a_number_twice(records: Records) -> list[Record]:
+    act = acts(records, "r1")[5]
+    (envelope,) = act.outputs.outbox
+    again = msgspec.structs.replace(envelope, sequence=2)
+    return put_act(records, act, outputs(outbox=(again,)))
+
+
+@breaks("delivery", run=KILLED)
+def _heard_what_came_while_it_was_dead(records: Records) -> list[Record]:
+    act = next(act for act in acts(records, "r2") if act.now_ns > 1_100_000_000)
+    lost = next(
+        (verdict.source, verdict.sequence)
+        for batch in batches(records)
+        for verdict in batch.verdicts
+        if verdict.target == "r2" and verdict.due_ns == 600_000_000
+    )
+    return put_act(records, act, heard(lost, *act.heard))
+
+
+@breaks("delivery", run=MID_STEP)
+def _answered_without_what_it_was_given(records: Records) -> list[Record]:
+    act = next(act for act in acts(records, "r2") if act.now_ns == 500_000_000 and act.outputs)
+    return put_act(records, act, heard(*act.heard[1:]))
+
+
+@breaks("order", "epoch", "hold", run=FORGETFUL)
+def _steps_begin_anew(records: Records) -> list[Record]:
+    steps, again = 0, changed(records, "start", step=0)
+    for act in acts(records, "r2"):
+        if act.now_ns > 1_100_000_000:
+            steps += 1
+            again = put_act(again, act, outputs(step=steps))
+    return again
+
+
+@breaks("epoch", "weights", "ledger", run=KILLED)
+def _reborn_with_what_it_knew(records: Records) -> list[Record]:
+    return changed(_same_as_before_after_a_lost_disk(records), "start", epoch=1)
+
+
+@breaks("weights", run=FORGETFUL)
+def _reborn_and_does_not_begin_with_all_weights(records: Records) -> list[Record]:
+    told = [act for act in acts(records, "r2") if act.outputs and act.outputs.weights]
+    act = next(act for act in told if act.now_ns >= 1_100_000_000)
+    changes = msgspec.msgpack.decode(act.outputs.weights)
+    changes[3] = 1  # as if they were changes of something
+    return put_act(records, act, outputs(weights=msgspec.msgpack.encode(changes)))
+
+
+@breaks("energy", run=FORGETFUL)
+def _budget_was_for_all_its_lives(records: Records) -> list[Record]:
+    spent = max(sum(bool(act.outputs.spent) for act in acts(records, n)) for n in ("r1", "r3"))
+    both = sum(bool(act.outputs.spent) for act in acts(records, "r2"))
+    assert spent >= both or both > spent
+    return with_scenario(records, energy={"steps": max(spent, both) - 1})
+
+
+@breaks("ledger", run=FORGETFUL)
+def _forgets_its_predecessors_log(records: Records) -> list[Record]:
+    act = acts(records, "r2")[-1]
+
+    def forget(said: News) -> News:
+        told = read_have(said.have, 6) or []
+        rest = said.have[len(uints(*told)) :]
+        return msgspec.structs.replace(said, have=uints(told[0], 0, *told[2:]) + rest)
+
+    return put_act(records, act, news(act, forget))
+
+
+@breaks("ledger")
+def _holds_entries_of_nobody(records: Records) -> list[Record]:
+    act = acts(records, "r1")[-1]
+
+    def invent(said: News) -> News:
+        told = read_have(said.have, 3) or []
+        return msgspec.structs.replace(said, have=uints(*told, 1, 0, 0, *([0] * 6)))
+
+    return put_act(records, act, news(act, invent))
+
+
+@breaks("ledger")
+def _forwards_what_its_origin_never_made(records: Records) -> list[Record]:
+    act = acts(records, "r1")[5]
+    log = uints(1, 0, 1, 1) + pairs((59, 1))
+    return put_act(records, act, news(act, lambda said: msgspec.structs.replace(said, logs=log)))
+
+
+@breaks("register", run=(*FORGETFUL, *SPECTRAL))
+def _goes_on_with_its_predecessors_sums(records: Records) -> list[Record]:
+    act = next(act for act in reversed(acts(records, "r2")) if own_register(act, 6, 4))
+    content = decode_news(act.outputs.outbox[0].body).registers
+    _, sums = read_register(content, 6, 9, 4) or (0, [])
+    register = uints(0, 0, 0, 0, 0, 0, 4, own_register(act, 6, 4), 1, 2 * (sums[0] + VISIT))
+    change = news(act, lambda said: msgspec.structs.replace(said, registers=register))
+    return put_act(records, act, change)
+
+
+@breaks("incident")
+def _struck_by_no_fault(records: Records) -> list[Record]:
+    return [*records[:9], Incident(batches(records)[7].now_ns, "r1", "slow"), *records[9:]]
+
+
+@breaks("incident")
+def _strikes_a_stranger(records: Records) -> list[Record]:
+    return [*records[:9], Incident(batches(records)[7].now_ns, "r9", "leave"), *records[9:]]
+
+
+@breaks("incident", run=COPIED)
+def _strikes_somebody_else(records: Records) -> list[Record]:
+    return changed(records, "pretend", who="r1")
+
+
+@breaks("incident", run=COPIED)
+def _strikes_too_early(records: Records) -> list[Record]:
+    incident = befell(records)[0]
+    early = msgspec.structs.replace(incident, now_ns=0)
+    return [records[0], early, *(record for record in records[1:] if record is not incident)]
+
+
+@breaks("incident", run=COPIED)
+def _strikes_twice(records: Records) -> list[Record]:
+    incident = befell(records)[0]
+    at = list(records).index(incident)
+    return [*records[:at], incident, *records[at:]]
+
+
+@breaks("incident", run=COPIED)
+def _never_strikes(records: Records) -> list[Record]:
+    return [record for record in records if record is not befell(records)[0]]
+
+
+@breaks("dead", run=PAUSED)
+def _acts_while_it_is_paused(records: Records) -> list[Record]:
+    return delayed(records, "resume")
+
+
+@breaks("dead", run=FULL)
+def _acts_without_a_disk(records: Records) -> list[Record]:
+    return delayed(records, "free")
+
+
+@breaks("dead", run=(*LATE, *DEAF))
+def _acts_before_it_is_there(records: Records) -> list[Record]:
+    return acting_early(records)
+
+
+@breaks("dead", run=(*KILLED, *DEAF))
+def _acts_while_it_is_dead(records: Records) -> list[Record]:
+    return acting_early(records)
+
+
+def acting_early(records: Records) -> list[Record]:
+    """The records with a start that comes after a step."""
+    start = befell(records, "start")[0]
+    first = next(a for a in acts(records, "r2") if a.now_ns > start.now_ns)
+    return changed(delayed(records, "start"), "start", step=first.outputs.step)
+
+
+@breaks("dead", run=WORLDLESS)
+def _world_judges_while_it_is_down(records: Records) -> list[Record]:
+    return delayed(records, "start")
+
+
+@breaks("epoch", run=FORGETFUL)
+def _reborn_with_a_whole_disk(records: Records) -> list[Record]:
+    return under(records, Kill(who=("r2",), from_s=0.5, until_s=1.1))
+
+
+@breaks("epoch", run=KILLED)
+def _same_as_before_after_a_lost_disk(records: Records) -> list[Record]:
+    return under(records, Kill(who=("r2",), from_s=0.5, until_s=1.1, disk="lost"))
+
+
+@breaks("epoch", run=KILLED)
+def _goes_on_from_a_step_to_come(records: Records) -> list[Record]:
+    return changed(records, "start", step=befell(records, "start")[0].step + 2)
+
+
+@breaks("epoch")
+def _speaks_as_another_incarnation(records: Records) -> list[Record]:
+    act = acts(records, "r1")[5]
+    return put_act(records, act, news(act, lambda said: msgspec.structs.replace(said, epoch=1)))
+
+
+@breaks("epoch", run=MERGES["min"])
+def _speaks_as_another_incarnation_without_a_ledger(records: Records) -> list[Record]:
+    return _speaks_as_another_incarnation(records)
+
+
+@breaks("epoch", run=COPIED)
+def _impostor_is_let_in(records: Records) -> list[Record]:
+    return changed(records, "pretend", what="let in")
+
+
+@breaks("refusal")
+def _refuses_what_is_sound(records: Records) -> list[Record]:
+    return put_act(records, acts(records, "r1")[-1], outputs(refused=1))
+
+
+@breaks("refusal", run=HOSTILE)
+def _takes_in_what_is_forged(records: Records) -> list[Record]:
+    refused = max(act.outputs.refused for act in acts(records, "r1"))
+    taken = next(act for act in acts(records, "r1") if act.outputs.refused == refused)
+    return put_act(records, taken, outputs(refused=refused - 1))
+
+
+@breaks("refusal", run=HOSTILE)
+def _something_is_forged_without_a_fault(records: Records) -> list[Record]:
+    return under(records)
+
+
+@breaks("refusal", run=HOSTILE)
+def _forged_under_a_number_that_is_sent(records: Records) -> list[Record]:
+    batch = next(batch for batch in batches(records) if batch.injected)
+    more = (*batch.injected, Envelope("r1", 3, "", b""))
+    return put(records, batch, msgspec.structs.replace(batch, injected=more))
+
+
+@breaks("clock")
+def _clock_is_wrong_of_itself(records: Records) -> list[Record]:
+    return put_act(records, acts(records, "r1")[5], skewed(1))
+
+
+@breaks("clock", run=SKEWED)
+def _clock_is_not_as_wrong_as_a_fault_says(records: Records) -> list[Record]:
+    act = next(act for act in acts(records, "r2") if act.skew_ns)
+    return put_act(records, act, skewed(act.skew_ns - 1))
+
+
+def skewed(skew_ns: int) -> Change:
+    return lambda act: msgspec.structs.replace(act, skew_ns=skew_ns)
+
+
+@breaks("hold")
+def _steps_without_having_seen_the_last_one(records: Records) -> list[Record]:
+    act = acts(records, "r1")[5]
+    stale = msgspec.structs.replace(act.observation, step=act.observation.step - 1)
+    return put_act(records, act, lambda act: msgspec.structs.replace(act, observation=stale))
 
 
 @pytest.mark.parametrize("name", list(BROKEN))

@@ -132,7 +132,7 @@ def test_robots_know_what_their_own_charts_show() -> None:
     replica = Replica(1, 2, entries(frame), None, ledger=True, claims=False)
     chart = Chart(frame, 2)
     for place in (0, 1):
-        count = int(survey.books.counts[place, 1])
+        count = int(survey.books.written[place, 1])
         replica.store.length[place] = 0
         replica.reserve(count)
         replica.store.logs[place, :count, 0] = survey.books.told[place, :count]

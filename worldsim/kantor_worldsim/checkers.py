@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -31,7 +30,7 @@ from kantor_worldsim.exact import ROUNDING
 from kantor_worldsim.faults import LinkFaults
 from kantor_worldsim.map_checker import MapRules
 from kantor_worldsim.metrics import Row
-from kantor_worldsim.outages import deeds_of
+from kantor_worldsim.outages import Deed, deeds_of
 from kantor_worldsim.reading import Reader, Reading
 from kantor_worldsim.records import Act, Batch, Ending, Incident, Opening, Record
 from kantor_worldsim.rules import Table, reach_m, severs
@@ -832,7 +831,9 @@ class Checker:
         self._links = LinkFaults(scenario, opening.seed).table
         self._hostile = [fault for fault in scenario.faults if isinstance(fault, Hostile)]
         self._clocks = [fault for fault in scenario.faults if isinstance(fault, Clock)]
-        self._deeds = {(d.fault, d.who, d.what): d for d in deeds_of(scenario)}
+        self._deeds: dict[tuple[int, ParticipantId, str], Deed] = {
+            (deed.fault, deed.who, deed.what): deed for deed in deeds_of(scenario)
+        }
         self._stopped: dict[ParticipantId, dict[str, int]] = {name: {} for name in names}
         self._stopped[WORLD_SIM] = {}
         """Who is stopped by what, and since when."""

@@ -91,7 +91,7 @@ class MapRules:
 
     def _put_into_words(self, batch: Batch, fault: int, row: int, a: int, b: int) -> None:
         rule, text = _WORDS[fault]
-        origin = self._names[a] if fault == found.FOREIGN else ""
+        origin = self._names[a % len(self._names)] if fault == found.FOREIGN else ""
         kind = "occupied" if b else "free"
         self._complain(rule, batch.acts[row].name, text.format(a=a, b=b, origin=origin, kind=kind))
 

@@ -21,9 +21,10 @@ from kantor_protocol.machine import Observation, ParticipantId, Pose
 from kantor_protocol.messages import RefusedError
 from kantor_protocol.packing import take_int, take_uint
 from kantor_protocol.replica import LENGTH_MAX
+from kantor_protocol.slots import EPOCHS_MAX
 from kantor_worldsim import reading as of
 from kantor_worldsim.reading import Reader, Reading
-from kantor_worldsim.records import Batch, Opening, Record
+from kantor_worldsim.records import Batch, Incident, Opening, Record
 from kantor_worldsim.starts import observable
 from kantor_worldsim.world import Ruling
 
@@ -32,9 +33,9 @@ NEVER = -1
 KIND, VOID, OWN = 3, 4, 8
 """What Books.held says of a cell: its kind, that it is no frontier, that the robot saw it itself."""
 
-# Columns of Books.counts and slots of Books.union.
-MADE, TOLD, MATCHED, VOIDS, OWN_CELLS, HELD_CELLS, ABSENCES, STOOD = 0, 1, 2, 3, 4, 5, 6, 7
-_COUNT_COLUMNS = 8
+# Columns of Books.written and Books.counts, and slots of Books.union.
+MADE, TOLD, MATCHED, VOIDS = 0, 1, 2, 3
+OWN_CELLS, HELD_CELLS, STOOD = 0, 1, 2
 SEEN, FRONTIERS, LOG_BYTES, FAULTS = 0, 1, 2, 3
 
 # Faults in what robots send, and of what their scans say.
@@ -47,7 +48,10 @@ _VOID_CELLS = 2
 
 
 class Books(NamedTuple):
-    """All that is followed, for the kernels. n robots, p participants, c cells."""
+    """All that is followed, for the kernels. n robots, p participants, c cells.
+
+    Incarnation e of participant i writes the log of slot e p + i.
+    """
 
     first_tick: npt.NDArray[np.int32]
     """(c,) when anybody first saw a cell, or NEVER."""
@@ -56,16 +60,19 @@ class Books(NamedTuple):
     held: npt.NDArray[np.uint8]
     """(n, c) what each robot knows, by its own scans and the logs that it holds."""
     made: npt.NDArray[np.int32]
-    """(n, rows) the entries that each robot's scans gave."""
+    """(slots, rows) the entries that each robot's scans gave."""
     told: npt.NDArray[np.int32]
-    """(n, rows) its log as it sends it: the same, and frontiers that are none."""
+    """(slots, rows) its log as it sends it: the same, and frontiers that are none."""
     have: npt.NDArray[np.int64]
-    """(p, p) the version vector that each has sent last."""
+    """(p, slots) the version vector that each has sent last."""
     folded: npt.NDArray[np.int64]
-    """(n, p) entries of others' logs that are in `held`."""
+    """(n, slots) entries of others' logs that are in `held`."""
+    written: npt.NDArray[np.int64]
+    """(slots, 4) entries made and told; of those told, such that were made, and voids."""
+    slots: npt.NDArray[np.int64]
+    """(p,) the slot of each."""
     counts: npt.NDArray[np.int64]
-    """(p, 8) entries made and told; of those told, such that were made, and voids; cells seen by itself
-    and known in all; absences; cells in `stood`."""
+    """(n, 3) cells seen by itself and known in all; cells in `stood`."""
     stood: npt.NDArray[np.int32]
     """(n, rows) the cells in which a robot stood, in order."""
     union: npt.NDArray[np.int64]
@@ -165,6 +172,8 @@ def _look(
     told: np.ndarray,
     have: np.ndarray,
     folded: np.ndarray,
+    written: np.ndarray,
+    slots: np.ndarray,
     counts: np.ndarray,
     stood: np.ndarray,
     union: np.ndarray,
@@ -179,14 +188,26 @@ def _look(
 ) -> None:
     """A robot takes in what a scan says. news: (k,) entries; `made` has room for them."""
     books = Books(
-        first_tick, frontier, held, made, told, have, folded, counts, stood, union, faults
+        first_tick,
+        frontier,
+        held,
+        made,
+        told,
+        have,
+        folded,
+        written,
+        slots,
+        counts,
+        stood,
+        union,
+        faults,
     )
     land = Land(truth, counting, exact)
     cells, columns = first_tick.shape[0], truth.shape[1]
     for i in range(news.shape[0]):
         entry = news[i]
-        made[who, counts[who, MADE]] = entry
-        counts[who, MADE] += 1
+        made[slots[who], written[slots[who], MADE]] = entry
+        written[slots[who], MADE] += 1
         _hold(books, land, who, entry)
         if entry >= 2 * cells:
             continue
@@ -228,18 +249,19 @@ def _is_near(books: Books, who: int, cell: int, columns: int) -> bool:
 @kernel
 def _append(books: Books, land: Land, who: int, entry: int) -> int:
     """A robot tells the next entry of its log: a fault, or NEVER."""
-    cells, counts = books.first_tick.shape[0], books.counts[who]
+    cells, slot = books.first_tick.shape[0], books.slots[who]
+    written = books.written[slot]
     if 2 * cells <= entry < 3 * cells:
         if not _is_near(books, who, entry - 2 * cells, land.truth.shape[1]):
             return FAR_VOID
-        counts[VOIDS] += 1
+        written[VOIDS] += 1
         _hold(books, land, who, entry)
-    elif counts[MATCHED] < counts[MADE] and books.made[who, counts[MATCHED]] == entry:
-        counts[MATCHED] += 1
+    elif written[MATCHED] < written[MADE] and books.made[slot, written[MATCHED]] == entry:
+        written[MATCHED] += 1
     else:
         return NOT_ITS_SCANS
-    books.told[who, counts[TOLD]] = entry
-    counts[TOLD] += 1
+    books.told[slot, written[TOLD]] = entry
+    written[TOLD] += 1
     return NEVER
 
 
@@ -247,33 +269,41 @@ def _append(books: Books, land: Land, who: int, entry: int) -> int:
 def _follow_entry(
     books: Books, land: Land, who: int, origin: int, position: int, entry: int
 ) -> int:
-    """An entry of an origin's log as `who` sends it: a fault, or NEVER."""
-    if position < books.counts[origin, TOLD]:
+    """An entry of a slot's log as `who` sends it: a fault, or NEVER."""
+    own = origin == books.slots[who]
+    if position < books.written[origin, TOLD]:
         same = books.told[origin, position] == entry
-        return NEVER if same else NOT_ITS_SCANS if origin == who else FOREIGN
-    if origin != who:
+        return NEVER if same else NOT_ITS_SCANS if own else FOREIGN
+    if not own or who >= books.held.shape[0]:
         return FOREIGN
-    if position == books.counts[who, TOLD]:
+    if position == books.written[origin, TOLD]:
         return int(_append(books, land, who, entry))
-    return NEVER if books.counts[who, ABSENCES] > 0 else GAP
+    return GAP
 
 
 @kernel
 def _follow_have(
-    books: Books, payload: bytes, at: int, who: int, robots: int, row: int, item: int
+    books: Books, payload: bytes, at: int, told: int, who: int, row: int, item: int
 ) -> None:
-    """A version vector never falls and never names what nobody has told."""
-    for origin in range(books.have.shape[1]):
-        length, at = take_uint(payload, at)
+    """A version vector of `told` slots never falls and never names what nobody has told."""
+    robots = books.held.shape[0]
+    for origin in range(max(told, books.have.shape[1])):
+        length = 0
+        if origin < told:
+            length, at = take_uint(payload, at)
+        if origin >= books.have.shape[1]:
+            if length > 0:
+                _note(books, MORE, row, item, length, 0)
+            continue
         before, books.have[who, origin] = books.have[who, origin], length
         if length < before:
             _note(books, FORGETS, row, item, length, before)
-        if origin != who or who >= robots:
-            known = books.counts[origin, TOLD]
+        if origin != books.slots[who] or who >= robots:
+            known = books.written[origin, TOLD]
             if length > known:
                 _note(books, MORE, row, item, length, known)
         else:
-            known = books.counts[who, MADE] + books.counts[who, VOIDS]
+            known = books.written[origin, MADE] + books.written[origin, VOIDS]
             if not known <= length <= known + books.first_tick.shape[0]:
                 _note(books, SHORT, row, item, length, known)
 
@@ -307,23 +337,31 @@ def _follow_news(books: Books, land: Land, reading: Reading, row: int, item: int
     sent = reading.sent[reading.acts[row, of.SENT] + item]
     payload = reading.payload
     _epoch, have, have_end, at, end = of.parts_of_news(payload, sent[of.BODY], sent[of.BODY_END])
-    origins, robots = books.have.shape[0], books.held.shape[0]
-    after = have
-    for _ in range(origins):
-        _length, after = take_uint(payload, after)
-    if end < 0 or not _is_log(payload, at, end, origins) or not 0 <= after <= have_end:
+    roster, robots = books.slots.shape[0], books.held.shape[0]
+    slots = _slots(payload, have, have_end, roster) if end >= 0 else 0
+    if slots == 0 or not _is_log(payload, at, end, books.have.shape[1]):
         _note(books, UNREADABLE, row, item, 0, 0)
         return
     if who < robots:
         books.union[LOG_BYTES] += end - at
     _follow_logs(books, land, reading, row, item, at, end)
-    _follow_have(books, payload, have, who, robots, row, item)
-    for origin in range(robots if who < robots else 0):
-        last = min(books.have[who, origin], books.counts[origin, TOLD])
-        if origin != who:
+    _follow_have(books, payload, have, slots, who, row, item)
+    for origin in range(books.have.shape[1] if who < robots else 0):
+        last = min(books.have[who, origin], books.written[origin, TOLD])
+        if origin != books.slots[who]:
             for i in range(books.folded[who, origin], last):
                 _hold(books, land, who, books.told[origin, i])
             books.folded[who, origin] = max(last, books.folded[who, origin])
+
+
+@kernel
+def _slots(payload: bytes, at: int, end: int, roster: int) -> int:
+    """How many slots the version vector in payload[at:end] is for; 0 if it is none."""
+    numbers = 0
+    while 0 <= at < end:
+        _length, at = take_uint(payload, at)
+        numbers += 1
+    return numbers if at == end and numbers % roster == 0 else 0
 
 
 @kernel
@@ -344,6 +382,8 @@ def _follow(
     told: np.ndarray,
     have: np.ndarray,
     folded: np.ndarray,
+    written: np.ndarray,
+    slots: np.ndarray,
     counts: np.ndarray,
     stood: np.ndarray,
     union: np.ndarray,
@@ -354,7 +394,19 @@ def _follow(
 ) -> None:
     """Follow what is sent in one batch; `told` has room for it."""
     books = Books(
-        first_tick, frontier, held, made, told, have, folded, counts, stood, union, faults
+        first_tick,
+        frontier,
+        held,
+        made,
+        told,
+        have,
+        folded,
+        written,
+        slots,
+        counts,
+        stood,
+        union,
+        faults,
     )
     land = Land(truth, counting, exact)
     reading = Reading(payload, sizes, acts, poses_m, heard, sent, verdicts, pairs, injected)
@@ -363,8 +415,6 @@ def _follow(
         if who >= 0 and acts[row, of.PRESENT]:
             for item in range(acts[row, of.SENT_COUNT]):
                 _follow_news(books, land, reading, row, item)
-        elif who >= 0:
-            counts[who, ABSENCES] += 1
 
 
 @kernel
@@ -428,6 +478,8 @@ class Survey:
             self._open(record)
         elif isinstance(record, Batch):
             self._follow(record)
+        elif isinstance(record, Incident) and record.what in {"start", "join"}:
+            self._take_over(record)
 
     def _open(self, opening: Opening) -> None:
         self._reader.read(opening)
@@ -446,11 +498,13 @@ class Survey:
             first_tick=np.full(cells, NEVER, dtype=np.int32),
             frontier=np.zeros(cells, dtype=np.bool_),
             held=np.zeros((robots, cells), dtype=np.uint8),
-            made=np.zeros((robots, 4096), dtype=np.int32),
-            told=np.zeros((robots, 4096), dtype=np.int32),
+            made=np.zeros((everybody, 4096), dtype=np.int32),
+            told=np.zeros((everybody, 4096), dtype=np.int32),
             have=np.zeros((everybody, everybody), dtype=np.int64),
             folded=np.zeros((robots, everybody), dtype=np.int64),
-            counts=np.zeros((everybody, _COUNT_COLUMNS), dtype=np.int64),
+            written=np.zeros((everybody, 4), dtype=np.int64),
+            slots=np.arange(everybody),
+            counts=np.zeros((robots, 3), dtype=np.int64),
             stood=np.full((robots, 256), NEVER, dtype=np.int32),
             union=np.zeros(4, dtype=np.int64),
             faults=np.zeros((_FAULTS_MAX, 5), dtype=np.int64),
@@ -478,10 +532,8 @@ class Survey:
         self.places = {name: i for i, name in enumerate(scenario.robot_ids)}
         """Of the robots, in the order of the roster."""
         self._queue = np.zeros(cells, dtype=np.int32)
-        self._evidence = [
-            Evidence(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
-            for _ in range(robots)
-        ]
+        self._scenario = scenario
+        self._evidence = [self._new_evidence() for _ in range(robots)]
         self._looked: list[tuple[int, Pose | None]] = [(NEVER, None)] * robots
         for place in range(robots):
             self._stand(place, self.cell_of(place))
@@ -500,12 +552,12 @@ class Survey:
     @property
     def own_cells(self) -> npt.NDArray[np.int64]:
         """(n,) how many cells each robot has seen itself; a view."""
-        return self.books.counts[: len(self.ways_m), OWN_CELLS]
+        return self.books.counts[:, OWN_CELLS]
 
     @property
     def held_cells(self) -> npt.NDArray[np.int64]:
         """(n,) how many cells each robot knows; a view."""
-        return self.books.counts[: len(self.ways_m), HELD_CELLS]
+        return self.books.counts[:, HELD_CELLS]
 
     @property
     def log_bytes(self) -> int:
@@ -533,8 +585,8 @@ class Survey:
         if start == NOWHERE:
             return NEVER
         held = books.held[place]
-        made, voids = books.counts[place, MADE], books.counts[place, VOIDS]
-        untold = books.have[place, place] > made + voids
+        slot = books.slots[place]
+        untold = books.have[place, slot] > books.written[slot, MADE] + books.written[slot, VOIDS]
         while True:
             cell = int(_find_way(held, start, self.frame.columns, self._queue))
             if cell == NEVER or not untold or not self._is_near(place, cell):
@@ -561,7 +613,7 @@ class Survey:
         for row, place, act in acted:
             self._look(place, act.observation, row)
         acts = reading.acts[: reading.sizes[of.ACTS]]
-        self._reserve("told", TOLD, int(acts[:, of.BODY_BYTES].max(initial=0)))
+        self._reserve("told", "written", TOLD, int(acts[:, of.BODY_BYTES].max(initial=0)))
         _follow(*reading, *self._arguments)
         for _, place, act in acted:
             assert act.ruling is not None
@@ -569,6 +621,44 @@ class Survey:
             self._move(place, act.ruling)
             self._strive(place, act.outputs.goal)
         self._note_moments()
+
+    def _new_evidence(self) -> Evidence:
+        scenario = self._scenario
+        return Evidence(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
+
+    def _take_over(self, incident: Incident) -> None:
+        """A new incarnation of a robot knows nothing, and writes a new log."""
+        names = self._scenario.roster
+        if incident.who not in names:
+            return
+        who, roster = names.index(incident.who), len(names)
+        slot = incident.epoch * roster + who
+        if not self.books.slots[who] < slot <= EPOCHS_MAX * roster + who:
+            return
+        while slot >= self.books.have.shape[1]:
+            self._add_slots(roster)
+        books = self.books
+        books.slots[who] = slot
+        books.have[who] = 0
+        if who < books.held.shape[0]:
+            books.held[who] &= OWN  # a body counts a cell once
+            books.folded[who] = 0
+            books.counts[who, [HELD_CELLS, STOOD]] = 0
+            self._evidence[who] = self._new_evidence()
+            self._looked[who], self._strived[who] = (NEVER, None), (None, 0)
+            self._stand(who, self.cell_of(who))
+
+    def _add_slots(self, more: int) -> None:
+        """Room for another incarnation of everybody."""
+        books = self.books
+        self.books = books._replace(
+            made=np.pad(books.made, ((0, more), (0, 0))),
+            told=np.pad(books.told, ((0, more), (0, 0))),
+            written=np.pad(books.written, ((0, more), (0, 0))),
+            have=np.pad(books.have, ((0, 0), (0, more))),
+            folded=np.pad(books.folded, ((0, 0), (0, more))),
+        )
+        self._arguments = (*self.books, *self._land)
 
     def _look(self, place: int, observation: Observation, row: int) -> None:
         """A robot takes in each new scan once; it learns of ranges when it has moved."""
@@ -579,7 +669,7 @@ class Survey:
         self._looked[place] = observation.step, pose
         news = self._evidence[place].take(observation.scan, pose, moved=pose != before)
         if news.shape[0]:
-            self._reserve("made", MADE, news.shape[0])
+            self._reserve("made", "written", MADE, news.shape[0])
             _look(*self._arguments, news, place, row, self.tick)
 
     def _move(self, place: int, ruling: Ruling) -> None:
@@ -607,14 +697,14 @@ class Survey:
         count = self.books.counts.item(place, STOOD)
         if count and self.books.stood.item(place, count - 1) == cell:
             return
-        self._reserve("stood", STOOD, 1)
+        self._reserve("stood", "counts", STOOD, 1)
         self.books.stood[place, count] = cell
         self.books.counts[place, STOOD] += 1
 
-    def _reserve(self, name: str, column: int, more: int) -> None:
+    def _reserve(self, name: str, counted: str, column: int, more: int) -> None:
         """Room for so many more entries in one of the arrays that grow with the run."""
         rows = getattr(self.books, name)
-        needed = int(self.books.counts[:, column].max()) + more
+        needed = int(getattr(self.books, counted)[:, column].max()) + more
         if needed <= rows.shape[1]:
             return
         longer = np.zeros((rows.shape[0], 2 * needed), dtype=rows.dtype)
