@@ -177,7 +177,7 @@ def test_turn_is_asked_again_until_it_is_answered() -> None:
     silent = theatre.records[-1]
     theatre.play(r2=outputs(2, (20.0, 0.0), "r1", source="r2"))
     again = theatre.stage.turn("r1", 4 * PERIOD_NS)
-    theatre.stage.settle(4 * PERIOD_NS, [again._replace(outputs=outputs(1, (1.0, 0.0)))])
+    theatre.stage.settle(4 * PERIOD_NS, [again.answered(outputs(1, (1.0, 0.0)))])
     answered = theatre.records[-1]
     assert isinstance(silent, Batch)
     assert isinstance(answered, Batch)

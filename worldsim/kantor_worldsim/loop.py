@@ -22,6 +22,7 @@ from kantor_protocol.machine import (
     StateMachine,
 )
 from kantor_protocol.messages import decode_inputs, encode
+from kantor_worldsim.admission import Admission, Entry
 from kantor_worldsim.outages import Deed, Outages
 from kantor_worldsim.records import Incident
 from kantor_worldsim.stage import Stage
@@ -65,6 +66,11 @@ class _InProcess:
 
     def __init__(self, machines: Mapping[ParticipantId, StateMachine]) -> None:
         self._machines = machines
+        self._lives = dict.fromkeys(machines, 0)
+        """How often each participant was started anew."""
+        self._admission = Admission(machines)
+        for name in machines:
+            self._admission.join(name, self._nonce(name))
 
     def __call__(
         self, inputs: Mapping[ParticipantId, Inputs], /
@@ -80,17 +86,25 @@ class _InProcess:
         """End a participant; nothing has to be done to world-sim, which is rebuilt."""
         if name != WORLD_SIM:
             self._mortal(name).kill()
+            self._admission.leave(name, self._nonce(name))
 
     def start(self, name: ParticipantId, body: Body, disk: Disk) -> tuple[int, int]:
         """Start one that was killed, or is late."""
         machine = self._machines[name]
         if not isinstance(machine, Mortal):  # it has been there all the time, and was not asked
             return body.epoch, body.step
+        self._lives[name] += 1
+        self._admission.join(name, self._nonce(name))
         return machine.start(body, disk)
 
-    def pretend(self, _name: ParticipantId) -> bool:
-        """There is no door here."""
-        return False
+    def pretend(self, name: ParticipantId) -> bool:
+        """Have the register decide on somebody else; whoever gets in leaves again at once."""
+        let_in = self._admission.join(name, "impostor") in {Entry.NEW, Entry.BACK}
+        self._admission.leave(name, "impostor")
+        return let_in
+
+    def _nonce(self, name: ParticipantId) -> str:
+        return f"{name}, life {self._lives[name]}"
 
     def _mortal(self, name: ParticipantId) -> Mortal:
         machine = self._machines[name]

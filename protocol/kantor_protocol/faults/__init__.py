@@ -117,21 +117,38 @@ def complaints(
     for i, fault in enumerate(faults):
         for complaint in fault.complaints(scenario):
             yield f"faults[{i}].{complaint}"
-    known = [(f"the scenario's faults[{i}]", fault) for i, fault in enumerate(earlier)]
-    listed = [*known, *((f"faults[{i}]", fault) for i, fault in enumerate(faults))]
-    stopping = [(at, f) for at, f in listed if isinstance(f, OnProcesses) and f.stops]
-    for (there, one), (here, other) in combinations(stopping, 2):
+    listed = [(f"the scenario's faults[{i}]", fault) for i, fault in enumerate(earlier)]
+    listed += [(f"faults[{i}]", fault) for i, fault in enumerate(faults)]
+    of_processes = [(at, fault) for at, fault in listed if isinstance(fault, OnProcesses)]
+    for one, other in combinations(of_processes, 2):
+        yield from _complaints_of_two(*one, *other)
+
+
+def _complaints_of_two(
+    there: str, one: OnProcesses, here: str, other: OnProcesses
+) -> Iterable[str]:
+    """Why two faults of processes do not go together; the second is blamed."""
+    if one.stops and other.stops and _overlap(one, other):
         for name in one.who:
-            if name in other.who and _overlap(one, other):
+            if name in other.who:
                 yield (
                     f"{here}.who: {name} has a {kind_of(one)} then already, by {there}; "
                     f"move one of the two"
                 )
-        for one_, other_, at in ((one, other, here), (other, one, there)):
-            if WORLD_SIM in one_.who and isinstance(other_, Kill) and _overlap(one_, other_):
-                yield f"{at}.from_s: world-sim is down then and can see nobody die; move it"
+    for outage, kill in ((one, other), (other, one)):
+        if WORLD_SIM in outage.who and isinstance(kill, Kill) and WORLD_SIM not in kill.who:
+            for key, moment_ns in (("from_s", kill.from_ns), ("until_s", kill.until_ns)):
+                if moment_ns is not None and outage.holds(moment_ns):
+                    yield f"{here}: world-sim is down at {key} of a kill, see {there}; move it"
+    for impostor, absence in ((one, other), (other, one)):
+        if isinstance(impostor, Impostor) and isinstance(absence, (Kill, Late)):
+            for name in impostor.who:
+                if name in absence.who and absence.holds(impostor.from_ns):
+                    yield (
+                        f"{here}: {name} is away when its impostor comes, who would be let in, "
+                        f"see {there}; move it"
+                    )
 
 
 def _overlap(one: Fault, other: Fault) -> bool:
-    first, second = sorted((one, other), key=lambda fault: fault.from_ns)
-    return first.until_ns is None or second.from_ns < first.until_ns
+    return one.holds(other.from_ns) or other.holds(one.from_ns)

@@ -1,0 +1,140 @@
+"""Verifying runs whose processes failed: executed again, or replayed incarnation by incarnation."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from kantor_fleet.exits import Exit
+from kantor_fleet.team import play, team
+from kantor_fleet.verify import verify
+from kantor_protocol.machine import Inputs, Outputs, ParticipantId
+from kantor_protocol.scenario import Scenario, parse
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.recording import MANIFEST, Recording
+from kantor_worldsim.stage import Stage
+from kantor_worldsim.world import Site
+from strategies import SMALL
+
+TROUBLE = """
+[[faults]]
+kind = "kill"
+who = ["r1"]
+from_s = 0.72
+until_s = 1.02
+disk = "lost"
+
+[[faults]]
+kind = "kill"
+who = ["r1", "r2"]
+from_s = 1.52
+until_s = 2.02
+disk = "torn"
+mid_step = true
+
+[[faults]]
+kind = "kill"
+who = ["r3"]
+from_s = 1.12
+until_s = 2.42
+mid_step = true
+
+[[faults]]
+kind = "clock"
+who = ["r3"]
+from_s = 1.0
+offset_s = -0.5
+
+[[faults]]
+kind = "kill"
+who = ["worldsim"]
+from_s = 2.6
+until_s = 3.3
+
+[[faults]]
+kind = "late"
+who = ["r2"]
+until_s = 0.45
+"""
+PACES = {
+    "concurrent": (),
+    "supervised": ("coordination=centralized", "clock.order=turn", "radio.delay_s=0.1"),
+}
+
+
+def troubled(*overrides: str) -> Scenario:
+    """A small mission in which everybody dies at least once."""
+    roomy = ("samples.count=60", "energy.points=90", "energy.steps=60", "limit_s=12")
+    return parse(SMALL + TROUBLE, "troubled", (*roomy, "radio.drop=0.2", *overrides))
+
+
+def recording_of(scenario: Scenario, folder: Path) -> Recording:
+    return Recording(scenario, 1, "in-process", folder)
+
+
+def as_exchange(folder: Path, exchange: str) -> None:
+    """Have the manifest say that another exchange ran it."""
+    manifest = json.loads((folder / MANIFEST).read_text())
+    (folder / MANIFEST).write_text(json.dumps(manifest | {"exchange": exchange}))
+
+
+@pytest.mark.parametrize("pace", list(PACES))
+def test_ordered_faults_are_executed_again(
+    pace: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Deaths, absences and new incarnations are in the scenario: every byte comes out the same."""
+    scenario = troubled(*PACES[pace])
+    recording = recording_of(scenario, tmp_path)
+    play(scenario, 1, Site.of(scenario, 1), [recording.take])
+    recording.finish()
+    code = verify(tmp_path)
+
+    out = capsys.readouterr().out
+    assert "every byte the same" in out
+    assert (code, "FAIL" in out) == (Exit.DONE, False), out
+
+
+@pytest.mark.parametrize("pace", list(PACES))
+def test_incarnations_are_replayed(
+    pace: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As on the wall: machines go on over their deaths, or take over the body as the world knew it."""
+    scenario = troubled(*PACES[pace])
+    recording = recording_of(scenario, tmp_path)
+    play(scenario, 1, Site.of(scenario, 1), [recording.take])
+    steps = recording.finish()
+    as_exchange(tmp_path, "wall")
+    verify(tmp_path)
+
+    out = capsys.readouterr().out
+    assert f"steps of {len(scenario.roster)} participants, all the same" in out, steps
+
+
+class Forgetful:
+    """A crew in which r1 does not answer at times, as over a bus that is too slow."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._crew = in_process(team(scenario, 1, Site.of(scenario, 1)))
+
+    def __call__(self, inputs: dict[ParticipantId, Inputs], /) -> dict[ParticipantId, Outputs]:
+        asleep = {"r1"} if inputs["r1"].now_ns == 500_000_000 else set()
+        self.asked = getattr(self, "asked", 0) + bool(asleep)
+        given = {who: told for who, told in inputs.items() if who not in asleep or self.asked > 3}
+        return dict(self._crew(given))
+
+
+def test_absence_that_nobody_ordered_is_replayed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Executed again it would not happen; the inboxes are on record all the same."""
+    scenario = parse(SMALL, "small", ("limit_s=3", "energy.steps=60"))
+    recording = recording_of(scenario, tmp_path)
+    stage = Stage(scenario, 1, Site.of(scenario, 1), [recording.take])
+    simulate(stage, Forgetful(scenario), 1, lambda: False)  # type: ignore[arg-type]
+    result = recording.finish()
+    code = verify(tmp_path)
+
+    out = capsys.readouterr().out
+    assert result.absences == 3
+    assert "participants, all the same" in out
+    assert code == Exit.DONE, out

@@ -1,0 +1,454 @@
+"""Missions whose processes fail: what is lost, what is not, and what the record says of it."""
+
+import functools
+from collections import Counter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec.structs import replace
+
+from kantor_fleet.team import participant, play
+from kantor_protocol.life import Mortal
+from kantor_protocol.machine import WORLD_SIM, Body, Outputs, ParticipantId, Pose
+from kantor_protocol.messages import decode_news
+from kantor_protocol.scenario import Scenario, parse
+from kantor_worldsim.channel import DROPPED
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.records import Act, Batch, Ending, Incident, Mailbag, Record
+from kantor_worldsim.stage import ForeignRecordError, Stage
+from kantor_worldsim.world import Site
+from strategies import SMALL, examples
+
+MS = 1_000_000
+ROOMY = ("samples.count=60", "energy.points=90", "energy.steps=60", "limit_s=12")
+"""A mission of some 50 steps."""
+LOSSY = ("radio.drop=0.2", "radio.duplicate=0.3", "radio.jitter_s=0.2", "radio.reorder=0.3")
+PACES = {
+    "concurrent": (),
+    "ahead": ("radio.delay_s=0.25",),
+    "turn": ("clock.order=turn",),
+    "jitter": ("clock.jitter_s=0.07", "clock.drift_ppm=50000", "radio.delay_s=0.1"),
+    "supervised": ("coordination=centralized", "radio.delay_s=0.1"),
+}
+
+
+def troubled(*faults: str, overrides: tuple[str, ...] = ()) -> Scenario:
+    """A small mission with these faults, a line each."""
+    tables = "".join(f"\n[[faults]]\n{fault.replace('; ', chr(10))}\n" for fault in faults)
+    return parse(SMALL + tables, "troubled", (*ROOMY, *overrides))
+
+
+def run(*faults: str, overrides: tuple[str, ...] = ()) -> list[Record]:
+    """The record of such a mission."""
+    scenario = troubled(*faults, overrides=overrides)
+    records: list[Record] = []
+    play(scenario, 1, Site.of(scenario, 1), [records.append])
+    return records
+
+
+@functools.cache
+def undisturbed(overrides: tuple[str, ...]) -> list[Record]:
+    """Without any fault."""
+    return run(overrides=overrides)
+
+
+def batches(records: list[Record]) -> list[Batch]:
+    return [record for record in records if isinstance(record, Batch)]
+
+
+def incidents(records: list[Record]) -> list[Incident]:
+    return [record for record in records if isinstance(record, Incident)]
+
+
+def acts(records: list[Record], name: ParticipantId) -> list[Act]:
+    """A participant's answered steps."""
+    told = (act for batch in batches(records) for act in batch.acts)
+    return [act for act in told if act.name == name and act.outputs is not None]
+
+
+def outputs(act: Act) -> Outputs:
+    assert act.outputs is not None
+    return act.outputs
+
+
+def kill(who: str, from_s: float, until_s: float | None, *more: str) -> str:
+    """A kill as a line."""
+    end = () if until_s is None else (f"until_s = {until_s!r}",)
+    return "; ".join((f'kind = "kill"; who = ["{who}"]; from_s = {from_s!r}', *end, *more))
+
+
+def is_sound(records: list[Record]) -> bool:
+    """Steps without a gap, no message twice, nobody beyond its energy, no rule broken."""
+    all_acts = [act for batch in batches(records) for act in batch.acts if act.outputs]
+    sent = Counter((e.source, e.sequence) for act in all_acts for e in outputs(act).outbox)
+    spent = Counter(act.name for act in all_acts if outputs(act).spent)
+    steps: dict[ParticipantId, list[int]] = {}
+    for act in all_acts:
+        steps.setdefault(act.name, []).append(outputs(act).step)
+    return (
+        all(told == list(range(1, len(told) + 1)) for told in steps.values())
+        and set(sent.values()) == {1}
+        and all(count <= 60 for count in spent.values())
+        and not any(act.ruling.violations for act in all_acts if act.ruling)
+    )
+
+
+# Killed and started again.
+
+MOMENTS = st.integers(1, 4_500).map(lambda at_ms: at_ms / 1000 + 0.000_300_017)
+"""Seconds; nobody is due just then, and nothing arrives."""
+
+
+@examples(25)
+@given(
+    pace=st.sampled_from(list(PACES)),
+    who=st.sampled_from(["r1", "r3"]),
+    moments_s=st.lists(MOMENTS, min_size=1, max_size=4, unique=True),
+)
+def test_restart_with_the_snapshot_is_as_if_nothing_had_been(
+    pace: str, who: str, moments_s: list[float]
+) -> None:
+    """Killed and started at once at any moments, however often: every batch is the same."""
+    overrides = (*LOSSY, *PACES[pace])
+    kills = [kill(who, at_s, at_s + 1e-9) for at_s in sorted(moments_s)]
+    records = run(*kills, overrides=overrides)
+    starts = [incident for incident in incidents(records) if incident.what == "start"]
+
+    assert batches(records) == batches(undisturbed(overrides))
+    assert all(incident.epoch == 0 for incident in starts)
+    assert [(incident.who, incident.what) for incident in incidents(records)] == [
+        (who, what) for _ in starts for what in ("kill", "start")
+    ]
+
+
+def test_what_reaches_a_dead_robot_is_lost() -> None:
+    """What arrives while it is away, and only that; the rest it hears when it goes on."""
+    records = run(kill("r2", 1.05, 2.05), overrides=("radio.delay_s=0.08",))
+    heard = {reference for act in acts(records, "r2") for reference in act.heard}
+    arrived = {
+        (verdict.source, verdict.sequence): verdict.due_ns
+        for batch in batches(records)
+        for verdict in batch.verdicts
+        if verdict.target == "r2" and batch.now_ns <= 3000 * MS
+    }
+    missed = {reference for reference in arrived if reference not in heard}
+
+    assert missed == {
+        reference for reference, due_ns in arrived.items() if 1050 * MS <= due_ns < 2050 * MS
+    }
+    assert len(missed) > 10
+    assert [act.now_ns // MS for act in acts(records, "r2")][9:12] == [1000, 2100, 2200]
+    assert is_sound(records)
+
+
+@pytest.mark.parametrize("until_s", [1.35, 1.8])
+@pytest.mark.parametrize("pace", list(PACES))
+def test_step_between_its_note_and_its_answer_is_neither_lost_nor_made_twice(
+    pace: str, until_s: float
+) -> None:
+    """It spends once: on record before anybody hears of it, told when the robot is back."""
+    overrides = (*LOSSY, *PACES[pace])
+    records = run(kill("r2", 1.22, until_s, "mid_step = true"), overrides=overrides)
+    start = next(incident for incident in incidents(records) if incident.what == "start")
+    plain = acts(undisturbed(overrides), "r2")
+    silent = [batch for batch in batches(records) if batch.absent]
+    answer = next(act for act in acts(records, "r2") if outputs(act).step == start.step)
+    back = next(batch for batch in batches(records) if answer in batch.acts)
+
+    assert [batch.absent for batch in silent] == [("r2",)]
+    assert (start.epoch, start.now_ns) == (0, round(until_s * 1e9))
+    assert answer == plain[start.step - 1]
+    assert (back.now_ns, back.acts) == (start.now_ns, (answer,))
+    assert answer.now_ns == silent[0].now_ns < back.now_ns
+    assert is_sound(records)
+
+
+def test_who_has_no_step_to_die_in_dies_anyway() -> None:
+    """A window between two steps; the robot goes on with its snapshot."""
+    records = run(kill("r2", 1.22, 1.28, "mid_step = true"))
+
+    assert batches(records) == batches(undisturbed(()))
+
+
+@pytest.mark.parametrize("mid_step", [False, True])
+@pytest.mark.parametrize("disk", ["torn", "lost"])
+@pytest.mark.parametrize("pace", list(PACES))
+def test_who_forgot_comes_back_as_another(pace: str, disk: str, mid_step: bool) -> None:  # noqa: FBT001
+    """Its steps, messages and energy go on where the world saw them last, in a log of its own."""
+    more = (f'disk = "{disk}"', *(("mid_step = true",) if mid_step else ()))
+    kills = [kill("r1", 1.02, 1.42, *more), kill("r1", 2.02, 2.42, *more)]
+    records = run(*kills, overrides=(*LOSSY, *PACES[pace]))
+    starts = [incident for incident in incidents(records) if incident.what == "start"]
+    told = acts(records, "r1")
+    epochs = {
+        outputs(act).step: decode_news(envelope.body).epoch
+        for act in told
+        for envelope in outputs(act).outbox
+    }
+
+    assert [incident.epoch for incident in starts] == [1, 2]
+    assert all(epochs[start.step] == start.epoch - 1 for start in starts)
+    assert all(epochs[start.step + 1] == start.epoch for start in starts)
+    assert is_sound(records)
+    assert outputs(told[-1]).energy_spent == sum(bool(outputs(act).spent) for act in told)
+
+
+@pytest.mark.parametrize("disk", ["kept", "torn", "lost"])
+def test_who_never_acted_is_nobody_else(disk: str) -> None:
+    """Killed before or in its first step, it begins as it would have begun."""
+    records = run(
+        kill("r1", 0.01, 0.52, f'disk = "{disk}"', "mid_step = true"),
+        kill("r2", 0.01, 0.52, f'disk = "{disk}"'),
+    )
+    starts = {i.who: (i.epoch, i.step) for i in incidents(records) if i.what == "start"}
+
+    assert starts == {"r1": (0, int(disk == "kept")), "r2": (0, 0)}
+    assert is_sound(records)
+
+
+# Not there, or not at work.
+
+
+def test_late_joiner_takes_part() -> None:
+    """It does nothing and hears nothing before it is there; then its first step is its first."""
+    records = run('kind = "late"; who = ["r3"]; until_s = 1.55')
+    first = acts(records, "r3")[0]
+    sent_ns = {
+        (verdict.source, verdict.sequence): verdict.due_ns
+        for batch in batches(records)
+        for verdict in batch.verdicts
+    }
+
+    assert incidents(records) == [Incident(1550 * MS, "r3", "start", 0)]
+    assert (first.now_ns, outputs(first).step) == (1600 * MS, 1)
+    heard = [reference for act in acts(records, "r3") for reference in act.heard]
+    assert min(sent_ns[reference] for reference in heard) >= 1550 * MS
+    assert is_sound(records)
+
+
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ('kind = "pause"; who = ["r2"]; from_s = 1.0; until_s = 1.5', ("pause", "resume")),
+        ('kind = "full-disk"; who = ["r2"]; from_s = 1.0; until_s = 1.5', ("fill", "free")),
+    ],
+)
+def test_what_is_sent_to_an_idle_robot_waits(fault: str, told: tuple[str, str]) -> None:
+    """It takes no step and sends nothing; then it hears all that came, in order of arrival."""
+    records = run(fault)
+    r2 = acts(records, "r2")
+    back = next(act for act in r2 if act.now_ns == 1500 * MS)
+    waiting = sorted(
+        (verdict.due_ns, verdict.source, verdict.sequence)
+        for batch in batches(records)
+        for verdict in batch.verdicts
+        if verdict.target == "r2" and 900 * MS <= batch.now_ns < 1500 * MS
+    )
+
+    assert tuple(incident.what for incident in incidents(records)) == told
+    assert [act.now_ns // MS for act in r2][8:11] == [900, 1500, 1600]
+    assert back.heard == tuple((source, sequence) for _, source, sequence in waiting)
+    assert not any(batch.absent for batch in batches(records))
+    assert is_sound(records)
+
+
+def test_slow_robot_gets_to_some_of_its_steps() -> None:
+    """One in four while it is slow, and no step number is left out."""
+    records = run('kind = "slow"; who = ["r2"]; from_s = 1.0; until_s = 2.5; every = 4')
+    times_ms = [act.now_ns // MS for act in acts(records, "r2")]
+
+    assert times_ms[8:15] == [900, 1200, 1600, 2000, 2400, 2500, 2600]
+    assert [incident.what for incident in incidents(records)] == ["slow", "quicken"]
+    assert is_sound(records)
+
+
+@pytest.mark.parametrize("offset_s", [-7.0, -0.25, 0.25, 7.0])
+@pytest.mark.parametrize("pace", ["concurrent", "turn", "supervised"])
+def test_wrong_clock_is_on_record_and_breaks_no_rule(pace: str, offset_s: float) -> None:
+    """The machine reads the wrong time, the world goes by the right one."""
+    clock = f'kind = "clock"; who = ["r2"]; from_s = 1.0; until_s = 2.0; offset_s = {offset_s}'
+    records = run(clock, overrides=(*LOSSY, *PACES[pace]))
+    wrong = [act for act in acts(records, "r2") if 1000 * MS <= act.now_ns < 2000 * MS]
+    act = next(act for act in acts(records, "r2") if act.skew_ns)
+    mailbag = Mailbag()
+    for batch in batches(records):
+        mailbag.post(batch)
+
+    assert wrong
+    assert all(act.skew_ns == max(round(offset_s * 1e9), -act.now_ns) for act in wrong)
+    assert {act.skew_ns for act in acts(records, "r1")} == {0}
+    assert mailbag.inputs(act).now_ns == act.now_ns + act.skew_ns >= 0
+    assert is_sound(records)
+
+
+def test_impostor_is_refused() -> None:
+    """Somebody else plays that robot."""
+    records = run('kind = "impostor"; who = ["r2"]; from_s = 1.0')
+
+    assert incidents(records) == [Incident(1000 * MS, "r2", "pretend", 0)]
+    assert batches(records) == batches(undisturbed(()))
+
+
+# The end.
+
+
+def test_who_is_dead_for_good_is_not_waited_for() -> None:
+    """The mission is done when the others rest; who comes back is waited for."""
+    gone = run(kill("r2", 0.52, None))
+    away = run(kill("r2", 0.52, 11.0))
+
+    assert isinstance(gone[-1], Ending)
+    assert isinstance(away[-1], Ending)
+    assert gone[-1].reason == away[-1].reason == "done"
+    assert gone[-1].now_ns < 11_000 * MS <= away[-1].now_ns
+
+
+def test_nobody_left_is_a_deserted_mission() -> None:
+    """It ends with the last death."""
+    records = run(kill("r1", 0.5, None), kill("r2", 0.7, None), kill("r3", 0.7, None))
+
+    assert records[-1] == Ending(700 * MS, "deserted")
+
+
+def test_limit_holds_for_deeds_too() -> None:
+    """What would be done after the limit is not done."""
+    records = run(kill("r2", 0.52, 2.5), overrides=("limit_s=2.0",))
+
+    assert [incident.what for incident in incidents(records)] == ["kill"]
+    assert records[-1] == Ending(2000 * MS, "limit")
+
+
+# World-sim.
+
+STORMS = (
+    'kind = "replay"; probability = 0.3; age_s = 1.0',
+    'kind = "bandwidth"; bytes_per_s = 4000',
+    'kind = "duplicate"; probability = 0.3; copies = 2; delay_s = 0.3',
+    'kind = "hostile"; probability = 0.2',
+)
+
+
+@examples(25)
+@given(
+    pace=st.sampled_from(list(PACES)),
+    from_ms=st.integers(0, 4000),
+    span_ms=st.integers(1, 1500),
+    others=st.integers(0, 1),
+)
+def test_world_sim_goes_on_from_its_record(
+    pace: str, from_ms: int, span_ms: int, others: int
+) -> None:
+    """Killed at any moment: every batch is as if it had only stood still, in the worst of weathers too."""
+    window = f"from_s = {from_ms / 1000!r}; until_s = {(from_ms + span_ms) / 1000!r}"
+    later = (from_ms + span_ms) / 1000
+    crashes = (kill("r1", later, later + 0.4, "mid_step = true", 'disk = "lost"'),) * others
+    killed, paused = (
+        run(
+            f'kind = "{kind}"; who = ["worldsim"]; {window}',
+            *STORMS,
+            *crashes,
+            overrides=(*LOSSY, *PACES[pace], "targets.count=20"),
+        )
+        for kind in ("kill", "pause")
+    )
+    during = range(from_ms * MS, (from_ms + span_ms) * MS)
+
+    assert [b for b in killed if not isinstance(b, Incident)][1:] == [
+        b for b in paused if not isinstance(b, Incident)
+    ][1:]
+    assert not any(batch.now_ns in during for batch in batches(killed))
+    told = [(i.now_ns, i.what) for i in incidents(killed) if i.who == WORLD_SIM]
+    assert told == [(during.start, "kill"), (during.stop, "start")][: len(told)]
+
+
+MORTALS = (
+    kill("r1", 0.72, 1.32, "mid_step = true"),
+    kill("r2", 0.52, 0.92, 'disk = "lost"'),
+    kill("r3", 1.22, 2.02, 'disk = "torn"', "mid_step = true"),
+    'kind = "clock"; who = ["r1"]; from_s = 1.0; offset_s = -0.5',
+    'kind = "pause"; who = ["r2"]; from_s = 1.3; until_s = 2.3',
+    *STORMS,
+)
+
+
+def everybody_mortal(scenario: Scenario, site: Site) -> dict[ParticipantId, Mortal]:
+    def mortal(name: ParticipantId) -> Mortal:
+        place = Stage(scenario, 1, site, []).body(name).pose
+        build = functools.partial(participant, name, scenario, 1, site)
+        return Mortal(build, Body(place))
+
+    return {name: mortal(name) for name in scenario.roster}
+
+
+@pytest.mark.parametrize("pace", ["concurrent", "ahead", "jitter", "supervised"])
+def test_mission_goes_on_from_any_record(pace: str) -> None:
+    """Stopped anywhere, resumed from what was told, with the robots as they are: the same record."""
+    scenario = troubled(*MORTALS, overrides=(*LOSSY, *PACES[pace], "limit_s=3"))
+    site = Site.of(scenario, 1)
+    whole: list[Record] = []
+    play(scenario, 1, site, [whole.append])
+    for asks in range(1, 60, 2):
+        crew = in_process(everybody_mortal(scenario, site))
+        left = iter(range(asks))
+        records: list[Record] = []
+        stage = Stage(scenario, 1, site, [records.append])
+        simulate(stage, crew, 1, lambda left=left: next(left, None) is None)  # type: ignore[misc]
+        if records[-1] == whole[-1]:
+            break
+        records.pop()
+        again = Stage.resumed(scenario, 1, site, tuple(records), [records.append])
+        simulate(again, crew, 1, lambda: False)
+
+        assert records == whole
+
+
+def test_records_that_do_not_follow_are_refused() -> None:
+    """A journal of another version, or one that was changed, is named with its place."""
+    scenario = troubled(overrides=LOSSY)
+    site = Site.of(scenario, 1)
+    records = run(overrides=LOSSY)
+    number, batch = next(
+        (i, record)
+        for i, record in enumerate(records)
+        if isinstance(record, Batch) and any(act.heard for act in record.acts)
+    )
+    unheard = [replace(act, heard=(("r1", 4711),)) for act in batch.acts]
+    elsewhere = [
+        replace(act, ruling=act.ruling and replace(act.ruling, pose=Pose(1.0, 2.0)))
+        for act in batch.acts
+    ]
+
+    for changed in (
+        replace(batch, acts=tuple(unheard)),
+        replace(batch, acts=tuple(elsewhere)),
+        replace(batch, out_of_range=99),
+    ):
+        with pytest.raises(ForeignRecordError, match=f"^record {number}: "):
+            Stage.resumed(scenario, 1, site, [*records[:number], changed], [])
+    with pytest.raises(ForeignRecordError, match=f"^record {len(records) - 1}: "):
+        Stage.resumed(scenario, 1, site, records, [])
+
+
+def test_only_what_was_heard_is_taken_from_what_is_under_way() -> None:
+    """A stage that is resumed holds exactly what nobody has heard yet."""
+    scenario = troubled(overrides=LOSSY)
+    records = run(overrides=LOSSY)[:30]
+    stage = Stage.resumed(scenario, 1, Site.of(scenario, 1), records, [])
+    under_way = Counter(
+        (v.target, v.source, v.sequence)
+        for batch in batches(records)
+        for v in batch.verdicts
+        if v.due_ns != DROPPED
+    )
+    for batch in batches(records):
+        for act in batch.acts:
+            under_way.subtract((act.name, *reference) for reference in act.heard)
+    held = Counter(
+        (name, envelope.source, envelope.sequence)
+        for name in scenario.roster
+        for envelope in stage.channel.take(name, 2**62)
+    )
+
+    assert held == +under_way
+    assert held.total() > 0

@@ -1,0 +1,292 @@
+"""Forged envelopes: what comes beside real ones, and that nobody takes any of it in."""
+
+import itertools
+from collections import Counter
+from collections.abc import Callable, Sequence
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kantor_fleet.team import play
+from kantor_protocol.faults import Delay, Drop, Hostile, Partition
+from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, Pose
+from kantor_protocol.messages import (
+    BODY_BYTES_MAX,
+    News,
+    RefusedError,
+    decode_news,
+    encode_news,
+)
+from kantor_protocol.scenario import Scenario
+from kantor_worldsim import faults as injection
+from kantor_worldsim.channel import DROPPED, Channel, Sent, Verdict
+from kantor_worldsim.faults import LinkFaults
+from kantor_worldsim.hostile import (
+    FIRST_SEQUENCE,
+    FORGERS,
+    OVERSIZED_SHARE,
+    Dice,
+    forge,
+    forged,
+    strangers,
+)
+from kantor_worldsim.records import (
+    Batch,
+    Mailbag,
+    Opening,
+    Record,
+    decode_record,
+    encode_record,
+)
+from kantor_worldsim.world import Site
+from mapping import on_map, site_of
+from strategies import NEWS, SEEDS, examples, mission
+
+MS = 1_000_000
+BODY = encode_news(News(1, 7, 1.0, 2.0, b"\1\2\3\4\5\6", b"\0\0\1\1\2\1", b"\0\1\1\0"))
+NAMES = ("r1", "r2", "r3")
+
+
+class Air:
+    """A radio with everybody in one place."""
+
+    def __init__(self, *faults: Hostile | Partition | Delay | Drop, seed: int = 1) -> None:
+        self.scenario = msgspec.structs.replace(mission(), faults=faults)
+        self.faults = LinkFaults(self.scenario, seed)
+        self.channel = Channel(self.scenario, seed, None, self.faults.rule)
+        for name in self.scenario.roster:
+            self.channel.place(name, Pose(0.0, 0.0))
+
+    def say(self, *sent: Sent) -> tuple[list[Verdict], list[Verdict]]:
+        """What becomes of envelopes, and of what comes beside them."""
+        verdicts = self.channel.transmit(sent)[0]
+        beside = [v for v in verdicts if v.sequence >= FIRST_SEQUENCE]
+        return [v for v in verdicts if v.sequence < FIRST_SEQUENCE], beside
+
+
+def chatter(count: int) -> list[Sent]:
+    """Everybody speaks to everybody `count` times, 100 ms apart."""
+    return [
+        Sent(100 * MS * i, Envelope(name, i, EVERYBODY, BODY))
+        for i in range(1, count + 1)
+        for name in NAMES
+    ]
+
+
+# What is injected.
+
+
+def test_what_is_sent_is_ruled_as_if_there_were_none() -> None:
+    air = Air(Hostile(probability=0.5))
+
+    assert air.say(*chatter(50))[0] == Air().say(*chatter(50))[0]
+
+
+@pytest.mark.parametrize("probability", [0.1, 0.9])
+def test_forgeries_come_at_their_rate(probability: float) -> None:
+    air = Air(Hostile(probability=probability))
+    beside = air.say(*chatter(300))[1]
+    (toll,) = air.faults.take_tolls()
+
+    assert abs(len(beside) - 1800 * probability) < 5 * (1800 * 0.09) ** 0.5
+    assert toll.forged == len(beside)
+
+
+def test_a_forgery_arrives_with_what_it_comes_beside_and_has_a_number_of_its_own() -> None:
+    """It is for that receiver, in the sender's name or a stranger's, and it is on record."""
+    air = Air(Hostile(probability=1.0))
+    verdicts, beside = air.say(*chatter(100))
+    forgeries = air.faults.take_forged()
+
+    assert [v.sequence for v in beside] == list(range(FIRST_SEQUENCE, FIRST_SEQUENCE + 600))
+    assert [(v.source, v.sequence, v.target) for v in beside] == [
+        (e.source, e.sequence, e.target) for e in forgeries
+    ]
+    for own, other in zip(verdicts, beside, strict=True):
+        assert (own.target, own.due_ns) == (other.target, other.due_ns)
+        assert other.source == own.source or other.source in strangers(NAMES)
+    assert air.faults.take_forged() == ()
+    assert air.say(*chatter(1))[1][0].sequence == FIRST_SEQUENCE + 600
+
+
+def test_forgeries_share_the_fate_of_links() -> None:
+    """A cut severs them as well, losses strike them by themselves, delays hold them up."""
+    halves = Air(Hostile(probability=1.0), Partition(shape="halves")).say(*chatter(50))
+    lossy = Air(Hostile(probability=1.0), Drop(probability=0.5)).say(*chatter(200))
+    late = Air(Delay(delay_s=0.5), Hostile(probability=1.0)).say(*chatter(1))
+
+    for own, other in zip(*halves, strict=True):
+        assert own.due_ns == other.due_ns
+    drops = Counter((a.due_ns == DROPPED, b.due_ns == DROPPED) for a, b in zip(*lossy, strict=True))
+    assert all(230 < drops[pair] < 370 for pair in itertools.product((False, True), repeat=2))
+    assert {v.due_ns for v in late[1]} == {600 * MS}
+
+
+@examples(40)
+@given(st.data())
+def test_forgeries_depend_on_the_message_alone(data: st.DataObject) -> None:
+    """All but their numbers: in any portions, with others in between or not."""
+    talk = chatter(20)
+    some = [talk[i] for i in sorted(data.draw(st.sets(st.integers(0, len(talk) - 1))))]
+    made = []
+    for portions in ([talk], [some], [[each] for each in some]):
+        air = Air(Hostile(probability=0.5))
+        made.append([])
+        for portion in portions:
+            air.say(*portion)
+        for envelope in air.faults.take_forged():
+            made[-1].append((envelope.source, envelope.target, envelope.body))
+
+    assert made[1] == made[2]
+    assert not Counter(made[1]) - Counter(made[0])
+
+
+# What is forged.
+
+
+def test_nobody_is_called_like_a_stranger() -> None:
+    for scenario in (mission(), mission("coordination=centralized")):
+        assert not set(strangers(scenario.roster)) & set(scenario.roster)
+        assert EVERYBODY in strangers(scenario.roster)
+    assert SUPERVISOR in strangers(NAMES)
+
+
+def test_every_entry_of_the_catalogue_comes_and_the_oversized_are_rare() -> None:
+    made = [forge(Dice(1, 5, i, 0), Envelope("r1", i, "", BODY), ("x",)) for i in range(8000)]
+    oversized = sum(len(body) > BODY_BYTES_MAX for _, body in made)
+    strange = sum(source == "x" for source, _ in made)
+
+    assert 10 < oversized < 60
+    assert abs(oversized - 8000 * OVERSIZED_SHARE) < 30
+    assert 700 < strange < 1100
+    assert all(body == BODY for source, body in made if source == "x")
+    assert len({body for _, body in made}) > 400
+
+
+@examples(200)
+@given(
+    news=NEWS,
+    noise=st.binary(max_size=50),
+    seed=SEEDS,
+    which=st.integers(0, len(FORGERS) - 1),
+)
+def test_forgers_are_total_and_forge_the_same_again(
+    news: News, noise: bytes, seed: int, which: int
+) -> None:
+    for body in (encode_news(news), noise, b""):
+        first, second = (forged(FORGERS[which], Dice(seed, 1, 2, 3), body) for _ in range(2))
+        assert first == second
+
+
+def _is_news(body: bytes) -> bool:
+    try:
+        decode_news(body)
+    except RefusedError:
+        return False
+    return True
+
+
+def test_some_forgeries_are_only_found_out_by_what_they_say() -> None:
+    """So the door is not all that is tested."""
+    found_out = [f for f in FORGERS if _is_news(forged(f, Dice(1, 1, 1, 1), BODY))]
+
+    assert len(found_out) >= 8
+
+
+# Whole missions.
+
+ROOMY = ("samples.count=60", "energy.points=90", "energy.steps=60")
+WORLDS: dict[str, Callable[[], Scenario]] = {
+    "ledger": lambda: mission(*ROOMY),
+    "state": lambda: mission(*ROOMY, "radio.beacon=state"),
+    "min": lambda: mission(*ROOMY, "merge=min", "claims=false"),
+    "spectral": lambda: mission(*ROOMY, "planner.name=spectral", "claims=false"),
+    "centralized": lambda: mission(*ROOMY, "coordination=centralized"),
+    "map": lambda: on_map("radio.range_m=30"),
+    "map-hungarian": lambda: on_map(
+        "radio.range_m=30", "coordination=centralized", "planner.name=burgard"
+    ),
+}
+
+
+def recorded(scenario: Scenario) -> list[Record]:
+    """The records of a mission."""
+    site = site_of(scenario) if scenario.mapping else Site.of(scenario, 1)
+    records: list[Record] = []
+    play(scenario, 1, site, [records.append])
+    return records
+
+
+def without_forgeries(records: Sequence[Record]) -> list[Record]:
+    """The records as if nothing had been forged, and nothing refused."""
+    return [_clean(record) for record in records]
+
+
+def _clean(record: Record) -> Record:
+    replace = msgspec.structs.replace
+    if isinstance(record, Opening):
+        return replace(record, scenario=replace(record.scenario, faults=()))
+    if not isinstance(record, Batch):
+        return record
+    acts = [
+        replace(
+            act,
+            heard=tuple(each for each in act.heard if each[1] < FIRST_SEQUENCE),
+            outputs=act.outputs and replace(act.outputs, refused=0),
+        )
+        for act in record.acts
+    ]
+    verdicts = [v for v in record.verdicts if v.sequence < FIRST_SEQUENCE]
+    return replace(record, acts=tuple(acts), verdicts=tuple(verdicts), tolls=(), injected=())
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_nobody_takes_in_anything_of_the_catalogue(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Everybody does what it does without forgeries, and counts each that reaches it.
+
+    Every forger, and every stranger, in turn.
+    """
+    made: Counter[object] = Counter()
+
+    def in_turn(dice: Dice, envelope: Envelope, names: tuple[str, ...]) -> tuple[str, bytes]:
+        which = made.total() % (len(FORGERS) + len(names))
+        made[which] += 1
+        if which < len(FORGERS):
+            return envelope.source, forged(FORGERS[which], dice, envelope.body)
+        return names[which - len(FORGERS)], envelope.body
+
+    monkeypatch.setattr(injection, "forge", in_turn)
+    scenario = WORLDS[name]()
+    faults = 6 * (Hostile(probability=1.0),)
+    records = recorded(msgspec.structs.replace(scenario, faults=faults))
+    refused: Counter[str] = Counter()
+    for record in records:
+        for act in record.acts if isinstance(record, Batch) else ():
+            refused[act.name] += sum(sequence >= FIRST_SEQUENCE for _, sequence in act.heard)
+            assert act.outputs is not None
+            assert act.outputs.refused == refused[act.name]
+
+    assert min(made.values()) >= 3
+    assert len(made) == len(FORGERS) + len(strangers(scenario.roster))
+    assert without_forgeries(records) == without_forgeries(recorded(scenario))
+
+
+def test_inboxes_with_forgeries_can_be_opened_again() -> None:
+    """From the records as they are kept, also when they have to be encoded first."""
+    scenario = msgspec.structs.replace(mission(), faults=3 * (Hostile(probability=0.5),))
+    mailbag = Mailbag()
+    heard = 0
+    for record in recorded(scenario):
+        again = decode_record(encode_record(record))
+        assert again == record
+        if isinstance(again, Batch):
+            for act in again.acts:
+                inputs = mailbag.inputs(act)
+                heard += sum(envelope.sequence >= FIRST_SEQUENCE for envelope in inputs.inbox)
+            mailbag.post(again)
+
+    assert heard > 50
