@@ -164,7 +164,7 @@ def _in_range(
 def hears(field: Field, one: int, other: int, range_m: float) -> bool:
     """Whether two participants (places in the roster) hear each other if their range is so many metres."""
     through = field.supervisor in (one, other) and not field.supervisor_stands
-    return _in_range(
+    heard: bool = _in_range(
         field.left_m,
         field.bottom_m,
         field.resolution_m,
@@ -177,6 +177,7 @@ def hears(field: Field, one: int, other: int, range_m: float) -> bool:
         range_m,
         through,
     )
+    return heard
 
 
 @kernel

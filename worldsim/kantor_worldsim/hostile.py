@@ -21,6 +21,7 @@ from kantor_protocol.messages import (
     encode,
     encode_news,
 )
+from kantor_protocol.slots import EPOCHS_MAX
 
 FIRST_SEQUENCE = 2**62
 """Forgeries are numbered from here on; no participant sends so much."""
@@ -93,6 +94,10 @@ def _before_the_start(_dice: Dice, _body: bytes, news: News) -> bytes:
     return encode_news(replace(news, step=-1))
 
 
+def _of_no_incarnation(dice: Dice, _body: bytes, news: News) -> bytes:
+    return encode_news(replace(news, epoch=(EPOCHS_MAX + 1, -1, 2**40)[dice.below(3)]))
+
+
 def _another_kind(_dice: Dice, body: bytes, _news: News) -> bytes:
     return encode(body)
 
@@ -151,6 +156,7 @@ FORGERS: tuple[Forger, ...] = (
     _another_version,
     _nowhere,
     _before_the_start,
+    _of_no_incarnation,
     _another_kind,
     _vector_of_wrong_length,
     _huge_number_in_vector,
