@@ -7,10 +7,10 @@ complains. `python tests/campaign/mutants.py` hunts all of them and writes docs/
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,14 +22,13 @@ from kantor_agent import core as agent_core
 from kantor_agent.belief import Belief
 from kantor_agent.core import Agent
 from kantor_agent.pace import Pace
-from kantor_agent.vehicles import VEHICLES
 from kantor_fleet.campaign.draw import draw
 from kantor_fleet.campaign.mission import Trial, attempt
 from kantor_fleet.experiment import Case
 from kantor_protocol import life, replica
 from kantor_protocol.faults import FullDisk, Hostile, Impostor, Kill, Late, Partition, Pause
 from kantor_protocol.life import Life, Memory, Mortal, Pages
-from kantor_protocol.machine import EVERYBODY, SUPERVISOR, WORLD_SIM, Body
+from kantor_protocol.machine import EVERYBODY, WORLD_SIM, Body
 from kantor_protocol.radio import Radio
 from kantor_protocol.registers import Registers
 from kantor_protocol.replica import Replica, read_logs
@@ -60,7 +59,7 @@ class Mutant(NamedTuple):
     """Missions that it can change at all; the others count, and need not run."""
 
 
-class Kill_(NamedTuple):  # noqa: N801  a kill of a mutant, not of a process
+class Catch(NamedTuple):
     """How a mutant was caught."""
 
     seed: int
@@ -85,7 +84,7 @@ def mutant(
     return add
 
 
-def hunt(one: Mutant, limit: int = LIMIT) -> Kill_ | None:
+def hunt(one: Mutant, limit: int = LIMIT) -> Catch | None:
     """Run the missions of a campaign, from seed 0 on, until one catches the bug; None if none does."""
     started_s = time.monotonic()
     with pytest.MonkeyPatch.context() as patch:
@@ -96,7 +95,7 @@ def hunt(one: Mutant, limit: int = LIMIT) -> Kill_ | None:
                 continue
             trial: Trial = attempt(Case(scenario, seed))
             if trial.violation is not None:
-                return Kill_(seed, trial.violation, seed + 1, time.monotonic() - started_s)
+                return Catch(seed, trial.violation, seed + 1, time.monotonic() - started_s)
     return None
 
 
@@ -143,16 +142,10 @@ def _spatial(scenario: Scenario) -> bool:
 # Helpers of bugs.
 
 
-@contextmanager
-def _now_and_then(every: int) -> Iterator[Callable[[], bool]]:
-    count = 0
-
-    def due() -> bool:
-        nonlocal count
-        count += 1
-        return count % every == 0
-
-    yield due
+def _now_and_then(every: int) -> Callable[[], bool]:
+    """True at every so many-th question."""
+    asked = itertools.count(1)
+    return lambda: next(asked) % every == 0
 
 
 def _wrap(patch: Patch, owner: Any, name: str, make: Callable[[Any], Any]) -> None:
@@ -170,7 +163,9 @@ def _set(store: replica.Store, index: int, value: int) -> None:
         store.counters[0] += 1
 
 
-def _merging(patch: Patch, merge: Callable[[Replica, np.ndarray, np.ndarray, np.ndarray], None]) -> None:
+def _merging(
+    patch: Patch, merge: Callable[[Replica, np.ndarray, np.ndarray, np.ndarray], None]
+) -> None:
     """After each message: merge(replica, weights and lengths before, rows of its log entries)."""
 
     def make(learn: Any) -> Any:
@@ -269,7 +264,9 @@ def dropping_the_newest_entry(patch: Patch) -> None:
     _wrap(patch, Belief, "spend", make)
 
 
-@mutant("whoever hears of a new incarnation forgets the end of a log", _has(Kill, disk=("torn", "lost")))
+@mutant(
+    "whoever hears of a new incarnation forgets the end of a log", _has(Kill, disk=("torn", "lost"))
+)
 def forgetting_while_growing(patch: Patch) -> None:
     def make(widen: Any) -> Any:
         def widened(self: Replica, slots: int) -> None:
@@ -328,7 +325,10 @@ def range_plus_five_percent(patch: Patch) -> None:
     _wrap(patch, Channel, "__init__", make)
 
 
-@mutant("the supervisor is heard however far away", lambda s: s.supervisor.range_m < 1e9 and s.centralized)
+@mutant(
+    "the supervisor is heard however far away",
+    lambda s: s.supervisor.range_m < 1e9 and s.centralized,
+)
 def supervisors_range_ignored(patch: Patch) -> None:
     def make(init: Any) -> Any:
         def made(self: Channel, *arguments: Any, **named: Any) -> None:
@@ -357,19 +357,22 @@ def partition_leaks_one_way(patch: Patch) -> None:
 
 @mutant("now and then somebody gets what was for another")
 def delivery_to_the_wrong_robot(patch: Patch) -> None:
-    with _now_and_then(50) as due:
+    due = _now_and_then(50)
 
-        def make(take: Any) -> Any:
-            def taken(self: Channel, name: str, now_ns: int) -> Any:
-                others = [other for other in self._roster if other != name]
-                return take(self, others[0] if others and due() else name, now_ns)
+    def make(take: Any) -> Any:
+        def taken(self: Channel, name: str, now_ns: int) -> Any:
+            others = [other for other in self._roster if other != name]
+            return take(self, others[0] if others and due() else name, now_ns)
 
-            return taken
+        return taken
 
-        _wrap(patch, Channel, "take", make)
+    _wrap(patch, Channel, "take", make)
 
 
-@mutant("messages are heard up to a period before they arrive", lambda s: s.radio.delay_s + s.radio.jitter_s > 0.0)
+@mutant(
+    "messages are heard up to a period before they arrive",
+    lambda s: s.radio.delay_s + s.radio.jitter_s > 0.0,
+)
 def heard_before_it_is_due(patch: Patch) -> None:
     def make(take: Any) -> Any:
         return lambda self, name, now_ns: take(self, name, now_ns + 200_000_000)
@@ -379,30 +382,30 @@ def heard_before_it_is_due(patch: Patch) -> None:
 
 @mutant("one delivery in a hundred vanishes on the way")
 def a_delivery_vanishes(patch: Patch) -> None:
-    with _now_and_then(100) as due:
+    due = _now_and_then(100)
 
-        def make(take: Any) -> Any:
-            def taken(self: Channel, name: str, now_ns: int) -> Any:
-                envelopes = take(self, name, now_ns)
-                return envelopes[:-1] if envelopes and due() else envelopes
+    def make(take: Any) -> Any:
+        def taken(self: Channel, name: str, now_ns: int) -> Any:
+            envelopes = take(self, name, now_ns)
+            return envelopes[:-1] if envelopes and due() else envelopes
 
-            return taken
+        return taken
 
-        _wrap(patch, Channel, "take", make)
+    _wrap(patch, Channel, "take", make)
 
 
 @mutant("one delivery in a hundred comes twice, though nobody said so")
 def a_delivery_comes_twice(patch: Patch) -> None:
-    with _now_and_then(100) as due:
+    due = _now_and_then(100)
 
-        def make(take: Any) -> Any:
-            def taken(self: Channel, name: str, now_ns: int) -> Any:
-                envelopes = take(self, name, now_ns)
-                return (*envelopes, envelopes[-1]) if envelopes and due() else envelopes
+    def make(take: Any) -> Any:
+        def taken(self: Channel, name: str, now_ns: int) -> Any:
+            envelopes = take(self, name, now_ns)
+            return (*envelopes, envelopes[-1]) if envelopes and due() else envelopes
 
-            return taken
+        return taken
 
-        _wrap(patch, Channel, "take", make)
+    _wrap(patch, Channel, "take", make)
 
 
 @mutant("who is started finds what arrived while it was dead", _has(Kill))
@@ -438,12 +441,12 @@ def hostile_message_taken_in(patch: Patch) -> None:
 
 @mutant("sound messages are refused now and then")
 def sound_message_refused(patch: Patch) -> None:
-    with _now_and_then(100) as due:
+    due = _now_and_then(100)
 
-        def make(take: Any) -> Any:
-            return lambda self, envelope, learn: not due() and take(self, envelope, learn)
+    def make(take: Any) -> Any:
+        return lambda self, envelope, learn: not due() and take(self, envelope, learn)
 
-        _wrap(patch, Radio, "_take", make)
+    _wrap(patch, Radio, "_take", make)
 
 
 @mutant("a new incarnation counts its messages from 1 again", _has(Kill, disk=("torn", "lost")))
@@ -553,7 +556,9 @@ def speed_limit_one_percent_too_high(patch: Patch) -> None:
     _wrap(patch, Pace, "elapsed_s", faster)
 
 
-@mutant("who takes a body over drives for the time since the start", _has(Kill, disk=("torn", "lost")))
+@mutant(
+    "who takes a body over drives for the time since the start", _has(Kill, disk=("torn", "lost"))
+)
 def a_new_incarnation_leaps(patch: Patch) -> None:
     def make(init: Any) -> Any:
         def made(self: Pace, period_ns: int, body: Body) -> None:
@@ -568,32 +573,31 @@ def a_new_incarnation_leaps(patch: Patch) -> None:
 
 @mutant("a weight rises now and then", _density)
 def weight_that_rises(patch: Patch) -> None:
-    with _now_and_then(100) as due:
+    def make(learn: Any) -> Any:
+        def learnt(self: Replica, *arguments: Any) -> bool:
+            taken: bool = learn(self, *arguments)
+            index = int(np.argmin(self.weights)) if self.weights.size else 0
+            if self.store.counters[1] % 50 == 0 and self.weights.size:
+                _set(self.store, index, int(self.weights[index]) + 1)
+            return taken
 
-        def make(advance: Any) -> Any:
-            def advanced(self: Belief, now_ns: int) -> None:
-                advance(self, now_ns)
-                index = int(np.argmin(self.weights))
-                if due() and self.weights[index] > 0:
-                    _set(self.replica.store, index, int(self.weights[index]) + 1)
+        return learnt
 
-            return advanced
-
-        _wrap(patch, Belief, "advance", make)
+    _wrap(patch, Replica, "learn", make)
 
 
 @mutant("what is published misses an entry now and then", _density)
 def published_vector_differs(patch: Patch) -> None:
-    with _now_and_then(20) as due:
+    due = _now_and_then(20)
 
-        def make(step: Any) -> Any:
-            def stepped(self: WeightsPublisher, lowered: np.ndarray, *, last: bool) -> bytes:
-                packed: bytes = step(self, lowered[1:] if due() else lowered, last=last)
-                return packed
+    def make(step: Any) -> Any:
+        def stepped(self: WeightsPublisher, lowered: np.ndarray, *, last: bool) -> bytes:
+            packed: bytes = step(self, lowered[1:] if due() else lowered, last=last)
+            return packed
 
-            return stepped
+        return stepped
 
-        _wrap(patch, WeightsPublisher, "step", make)
+    _wrap(patch, WeightsPublisher, "step", make)
 
 
 @mutant("a robot keeps to a goal that has no weight left", lambda s: s.planner.name == "transport")
@@ -610,17 +614,17 @@ def goal_without_weight(patch: Patch) -> None:
     _wrap(patch, agent_core.Agent, "_explore", make)
 
 
-@mutant("a register is one more than the sum of its places", _spectral)
+@mutant("a register is not the sum over its places", _spectral)
 def register_off_by_one(patch: Patch) -> None:
-    def make(add: Any) -> Any:
-        def added(self: Registers, amounts: np.ndarray) -> None:
-            amounts = amounts.copy()
-            amounts[-1] += 1
-            add(self, amounts)
+    def make(compose: Any) -> Any:
+        def composed(self: Registers, target: int = -1) -> bytes:
+            self.values[self.me, 1:2] += 1
+            told: bytes = compose(self, target)
+            return told
 
-        return added
+        return composed
 
-    _wrap(patch, Registers, "add", make)
+    _wrap(patch, Registers, "compose", make)
 
 
 # Lives.
@@ -652,7 +656,10 @@ def amnesia(patch: Patch) -> None:
     patch.setattr(Mortal, "start", start)
 
 
-@mutant("after a lost disk the old incarnation goes on with an empty log", _has(Kill, disk=("torn", "lost")))
+@mutant(
+    "after a lost disk the old incarnation goes on with an empty log",
+    _has(Kill, disk=("torn", "lost")),
+)
 def old_incarnation_used_again(patch: Patch) -> None:
     patch.setattr(life, "_reborn", lambda body: body)
 
@@ -688,7 +695,9 @@ def lost_step_count(patch: Patch) -> None:
 
 def _ignoring(patch: Patch, kind: type) -> None:
     def make(holds: Any) -> Any:
-        return lambda self, fault, now_ns: not isinstance(fault, kind) and holds(self, fault, now_ns)
+        return lambda self, fault, now_ns: (
+            not isinstance(fault, kind) and holds(self, fault, now_ns)
+        )
 
     _wrap(patch, Outages, "_holds", make)
 
@@ -719,7 +728,10 @@ def impostor_let_in(patch: Patch) -> None:
     patch.setattr(loop._InProcess, "pretend", lambda _self, _name: True)
 
 
-@mutant("the world judges by the clock of the robot", lambda s: any(f.__struct_config__.tag == "clock" for f in s.faults))
+@mutant(
+    "the world judges by the clock of the robot",
+    lambda s: any(f.__struct_config__.tag == "clock" for f in s.faults),
+)
 def clock_skew_leaks_into_physics(patch: Patch) -> None:
     def make(act: Any) -> Any:
         def acted(self: Stage, step: Any) -> Any:
@@ -730,28 +742,31 @@ def clock_skew_leaks_into_physics(patch: Patch) -> None:
     _wrap(patch, Stage, "_act", make)
 
 
-@mutant("a clock fault does nothing", lambda s: any(f.__struct_config__.tag == "clock" for f in s.faults))
+@mutant(
+    "a clock fault does nothing",
+    lambda s: any(f.__struct_config__.tag == "clock" for f in s.faults),
+)
 def clock_stays_right(patch: Patch) -> None:
     patch.setattr(outages.Outages, "skew_ns", lambda *_: 0)
 
 
-def write(kills: list[tuple[Mutant, Kill_ | None]], path: Path = TABLE) -> None:
+def write(hunted: list[tuple[Mutant, Catch | None]], path: Path = TABLE) -> None:
     """The table, for the repository."""
-    caught = sum(kill is not None for _, kill in kills)
+    caught = sum(catch is not None for _, catch in hunted)
     lines = [
         "# Planted bugs, and who caught them",
         "",
-        f"{caught} of {len(kills)} caught within {LIMIT} missions of `kantor campaign`, from seed 0 on. Written by",
+        f"{caught} of {len(hunted)} caught within {LIMIT} missions of `kantor campaign`, from seed 0 on. Written by",
         "`python tests/campaign/mutants.py`; `tests/campaign/test_mutants.py` plants every one of them.",
         "",
         "| mutant | what it does | caught at seed | by rule | complaint |",
         "|---|---|---:|---|---|",
     ]
-    for one, kill in kills:
-        rule, _, complaint = kill.complaint.partition(": ") if kill else ("**nobody**", "", "")
+    for one, catch in hunted:
+        rule, _, complaint = catch.complaint.partition(": ") if catch else ("**nobody**", "", "")
         told = complaint.replace("|", "\\|")[:90]
         lines.append(
-            f"| {one.name} | {one.does} | {kill.seed if kill else ''} | {rule} | {told} |"
+            f"| {one.name} | {one.does} | {catch.seed if catch else ''} | {rule} | {told} |"
         )
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -759,15 +774,15 @@ def write(kills: list[tuple[Mutant, Kill_ | None]], path: Path = TABLE) -> None:
 def main() -> int:
     """Hunt all mutants, or those that are named."""
     wanted = sys.argv[1:]
-    kills = []
+    hunted = []
     for one in MUTANTS:
         if not wanted or one.name in wanted:
-            kill = hunt(one)
-            kills.append((one, kill))
-            print(f"{one.name:38} {kill or 'SURVIVES'}", flush=True)
+            catch = hunt(one)
+            hunted.append((one, catch))
+            print(f"{one.name:38} {catch or 'SURVIVES'}", flush=True)  # noqa: T201
     if not wanted:
-        write(kills)
-    return int(any(kill is None for _, kill in kills))
+        write(hunted)
+    return int(any(catch is None for _, catch in hunted))
 
 
 if __name__ == "__main__":
