@@ -35,7 +35,7 @@ _MISSION, _TEAM, _RADIO, _CLOCK, _FAULTS = range(5)
 _A_CLASS = 16
 """Subjects of draws; from the last one on, one for each class of faults."""
 
-_CENTRALIZED = 0.35
+_CENTRALIZED = 0.28
 _METRICS_EVERY = 20
 """Nobody looks at the rows."""
 _TRIES = 6
@@ -79,7 +79,7 @@ def _density(seed: int, sort: str) -> Tree:
     dice = Dice(seed, _TEAM)
     robots = dice.whole(2, 8)
     points = robots * max(30, round(dice.scale(300, 6000) / robots))
-    period_s = dice.scale(0.2, 2.0)
+    period_s = dice.scale(0.25, 2.5)
     steps = points // robots
     if dice.coin(0.4):
         steps = round(steps * dice.between(1.0, 1.6))
@@ -103,13 +103,13 @@ def _density(seed: int, sort: str) -> Tree:
         "density": [_gaussian(dice, side_m) for _ in range(dice.whole(1, 3))],
         "samples": {
             "count": round(dice.scale(16, 400)),
-            "diffusion_m": dice.scale(0.01, 0.5) * stride_m if sort == "walking" else 0.0,
+            "diffusion_m": short(dice.scale(0.01, 0.5) * stride_m) if sort == "walking" else 0.0,
         },
         "targets": {
             "count": dice.whole(0, 40),
             "diffusion_m": dice.scale(0.01, 1.0) if dice.coin(0.3) else 0.0,
         },
-        "sensor": {"range_m": side_m * dice.scale(0.01, 0.2)},
+        "sensor": {"range_m": short(side_m * dice.scale(0.01, 0.2))},
         "planner": {
             "name": "spectral" if sort == "spectral" else "transport",
             "horizon": dice.whole(1, 5),
@@ -131,7 +131,7 @@ def _map(seed: int) -> Tree:
         "limit_s": 1500.0,
         "map": {
             "layout": layout,
-            "size_m": [side_m, dice.between(1.0, 1.3) * side_m],
+            "size_m": [side_m, dice.between(side_m, 1.3 * side_m)],
             "resolution_m": resolution_m,
             "seed": dice.whole(0, 1000),
         },
@@ -139,7 +139,7 @@ def _map(seed: int) -> Tree:
         "starts": {"random": True, "spread": dice.one_of(["separate", "together"])},
         "vehicle": {
             "name": dice.one_of(["first-order", "second-order", "unicycle"], [4, 1, 1]),
-            "speed_m_s": dice.between(0.6, 1.2) * min(1.0, 2.0 * resolution_m) / period_s,
+            "speed_m_s": short(dice.between(0.6, 1.2) * min(1.0, 2.0 * resolution_m) / period_s),
         },
         "clock": _clock(seed, period_s),
         "sensor": {"range_m": dice.between(3.0, 6.0), "beams": dice.whole(16, 64)},
@@ -166,23 +166,23 @@ def _vehicle(dice: Dice, stride_m: float, period_s: float) -> Tree:
 def _gaussian(dice: Dice, side_m: float) -> Tree:
     spread_m = side_m * dice.between(0.05, 0.3)
     return {
-        "mean_m": [side_m * dice.between(0.1, 0.9), side_m * dice.between(0.1, 0.9)],
+        "mean_m": [dice.between(0.1 * side_m, 0.9 * side_m) for _ in "xy"],
         "variance_m2": [short(spread_m**2), short(spread_m**2 * dice.between(0.3, 1.0))],
         "weight": dice.between(0.2, 1.0),
     }
 
 
 def _clock(seed: int, period_s: float) -> Tree:
-    """Half of the teams step all at once; then one moment is one batch."""
+    """Most teams step all at once; the others show what clocks do to them."""
     dice = Dice(seed, _CLOCK)
-    if dice.coin():
+    if dice.coin(0.7):
         return {"period_s": period_s, "spread": 0.0}
     spread = dice.between(0.0, 0.4) if dice.coin(0.4) else 0.0
     drift_ppm = dice.scale(1.0, 50_000.0) if dice.coin(0.4) else 0.0
     jitter = dice.between(0.0, 0.8) if dice.coin(0.4) else 0.0
     return {
         "period_s": period_s,
-        "order": dice.one_of(["concurrent", "turn"], [2, 1]),
+        "order": dice.one_of(["concurrent", "turn"]),
         "spread": spread,
         "drift_ppm": drift_ppm,
         "jitter_s": short(jitter * period_s * (1.0 - spread) * 0.9),
