@@ -116,12 +116,22 @@ def summary(result: Result) -> str:
 
 
 def _of_faults(result: Result) -> list[str]:
-    """What each fault did, in a line of its own."""
+    """What each fault did, in a line of its own, and who came back."""
     lines = []
     for name, counts in result.faults.items():
-        deeds = [f"{n} {deed}" for deed, n in msgspec.structs.asdict(counts).items() if n]
+        told = msgspec.structs.asdict(counts).items()
+        deeds = [f"{n} {deed.replace('_', ' ')}" for deed, n in told if n]
         lines.append(f"  fault {name:<16} {', '.join(deeds) or 'never struck'}")
+    if result.restarts:
+        back = f"{_counted(result.restarts, 'restart')}, {_counted(result.incarnations, 'new incarnation')}"
+        if (rejoin := result.rejoin_s) is not None:
+            back += f"; back to a step in {rejoin.median_s:.2f} s, at most {rejoin.max_s:.2f} s"
+        lines.append(f"  back      {back}")
     return lines
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _found(result: Result) -> str:

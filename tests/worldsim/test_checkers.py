@@ -1036,6 +1036,22 @@ def skewed(skew_ns: int) -> Change:
     return lambda act: msgspec.structs.replace(act, skew_ns=skew_ns)
 
 
+@breaks("ruling", run=SKEWED)
+def _too_fast_by_a_clock_that_did_not_gain(records: Records) -> list[Record]:
+    act = next(act for act in reversed(acts(records, "r2")) if act.skew_ns)
+    return put_act(records, act, ruling(violations=("speed",)))
+
+
+def test_too_fast_by_a_clock_that_gains_is_excused(played: Play) -> None:
+    """It cannot know that its clock has jumped; the world refuses the move, and nobody is to blame."""
+    records = played(*SKEWED)
+    act = next(act for act in acts(records, "r2") if act.skew_ns)
+
+    assert rules(put_act(records, act, ruling(violations=("speed",)))) == set()
+    assert rules(put_act(records, act, ruling(violations=("speed", "units")))) == {"ruling"}
+    assert rules(put_act(records, act, ruling(violations=("units",)))) == {"ruling"}
+
+
 @breaks("hold")
 def _steps_without_having_seen_the_last_one(records: Records) -> list[Record]:
     act = acts(records, "r1")[5]

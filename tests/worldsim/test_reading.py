@@ -53,7 +53,9 @@ def plain(batch: Batch, roster: tuple[str, ...], samples: int) -> list[Any]:
         if out is not None and ruling is not None:
             refused = {"step", "energy", "units"} & set(ruling.violations)
             told += [out.step, out.energy_spent, int(out.state), out.refused, len(ruling.found)]
-            told += [len(ruling.violations), bool(refused), len(out.weights)]
+            fast = [i for i, what in enumerate(ruling.violations, 1) if what == "speed"]
+            told += [len(ruling.violations), bool(refused), max(fast, default=0)]
+            told += [len(out.weights)]
             told += [sum(len(envelope.body) for envelope in out.outbox)]
             told += [[ruling.pose.x_m, ruling.pose.y_m]]
             told += [None if out.goal is None else [*out.goal], out.weights]
@@ -90,7 +92,8 @@ def tabled(reading: Reading) -> list[Any]:
         told += [act[of.OBSERVED], act[of.SKEW_NS]]
         if act[of.PRESENT]:
             told += [act[of.STEP], act[of.ENERGY], act[of.STATE], act[of.REFUSED], act[of.FINDS]]
-            told += [act[of.VIOLATIONS], bool(act[of.VOID]), act[of.WEIGHTS_BYTES]]
+            told += [act[of.VIOLATIONS], bool(act[of.VOID]), act[of.TOO_FAST]]
+            told += [act[of.WEIGHTS_BYTES]]
             *pose_m, goal_x_m, goal_y_m = reading.poses_m[row].tolist()
             begin, end = act[of.WEIGHTS], act[of.WEIGHTS] + act[of.WEIGHTS_BYTES]
             told += [act[of.BODY_BYTES], pose_m]
@@ -321,7 +324,7 @@ def test_garbled_batch_stays_within_its_tables(changes: list[tuple[int, int]]) -
     for at, byte in changes:
         payload[at % len(payload)] = byte
     rows = len(payload) // 2 + 1
-    around = [np.full((rows + 8, columns), 77, dtype=np.int64) for columns in (24, 2, 5, 4, 2, 5)]
+    around = [np.full((rows + 8, columns), 77, dtype=np.int64) for columns in (25, 2, 5, 4, 2, 5)]
     acts, heard, sent, verdicts, pairs, injected = (table[:rows] for table in around)
     poses_m = np.zeros((rows, 4))
     sizes, bits = np.zeros(6, dtype=np.int64), poses_m.view(np.int64)

@@ -225,17 +225,20 @@ def test_referees_may_share_a_survey() -> None:
 
 @pytest.mark.parametrize("radio", [(), ("radio.range_m=0.01", "radio.beacon=state")])
 def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
-    """A robot whose output was lost has told its log to nobody; it is not accused of that."""
+    """A robot whose output was lost gives it again when it is asked again (`life.Life`)."""
     scenario = on_map(*radio)
     site = site_of(scenario)
     records: list[Record] = []
     play_all = in_process(team(scenario, 1, site))
     rounds = iter(range(10_000))
+    lost: dict[str, Outputs] = {}
 
     def lossy(inputs: Mapping[str, Inputs]) -> Mapping[str, Outputs]:
-        outputs = dict(play_all(inputs))
+        fresh = {name: given for name, given in inputs.items() if name not in lost}
+        outputs = dict(play_all(fresh)) | lost
+        lost.clear()
         if next(rounds) % 5 == 3:
-            del outputs["r1"]
+            lost["r1"] = outputs.pop("r1")
         return outputs
 
     reason = simulate(Stage(scenario, 1, site, [records.append]), lossy, 1, lambda: False)

@@ -96,8 +96,8 @@ _WORDS = {
 # Columns of State.book.
 _STEPS, _SLOT, _MOVED_NS, _POINTS, _OPEN, _POSTED, _FLYING, _TOLD = 0, 1, 2, 3, 4, 5, 6, 7
 _SEQUENCE, _DIFFERING, _COMING, _KEYFRAME, _STOPPED_NS = 8, 9, 10, 13, 14
-_REFUSALS_SO_FAR, _NUMBER = 15, 16
-_BOOK_COLUMNS = 17
+_REFUSALS_SO_FAR, _NUMBER, _SKEW_BEFORE_NS = 15, 16, 17
+_BOOK_COLUMNS = 18
 # Columns of State.shipped.
 _ENTRIES, _WRITES = 0, 1
 # Slots of State.found.
@@ -118,12 +118,12 @@ class State(NamedTuple):
     """What the kernels keep of the run so far. n participants, N samples."""
 
     book: npt.NDArray[np.int64]
-    """(n, 17): last step; origin slot; time of the last move; points shipped by all its incarnations;
+    """(n, 18): last step; origin slot; time of the last move; points shipped by all its incarnations;
     whether it has a turn that it has not answered; rows used of posted and flights; whether this
     incarnation has sent a version vector; sequence of what it published last, entries in which that
     differs from its view; rows that this batch brings to logs, posted and flights; 1 + the act with which
     it publishes a keyframe in this batch; since when it is stopped, or _NOT; messages it has refused;
-    the highest number of what it has sent."""
+    the highest number of what it has sent; how far its clock was ahead in its last step."""
     poses_m: npt.NDArray[np.float64]
     """(n, 2) world frame."""
     views: npt.NDArray[np.int64]
@@ -366,6 +366,18 @@ def _check_life(state: State, law: Law, reading: Reading, row: int) -> None:
         _note(state, _STOPPED, row, 0, 0, 0, stopped_ns * 1e-9, 0.0)
     if act[of.SKEW_NS] != 0 and not law.clocks:
         _note(state, _SKEW, row, 0, act[of.SKEW_NS], 0, 0.0, 0.0)
+
+
+@kernel
+def _check_ruling(state: State, law: Law, reading: Reading, row: int) -> None:
+    """Who is too fast since its clock has gained on time cannot know, and is not to blame."""
+    act = reading.acts[row]
+    book = state.book[act[of.PLACE]]
+    excused = law.clocks and act[of.SKEW_NS] > book[_SKEW_BEFORE_NS]
+    book[_SKEW_BEFORE_NS] = act[of.SKEW_NS]
+    for item in range(act[of.VIOLATIONS]):
+        if not (excused and item + 1 == act[of.TOO_FAST]):
+            _note(state, _REFUSED, row, item, 0, 0, 0.0, 0.0)
 
 
 @kernel
@@ -716,8 +728,7 @@ def _check(
         _check_weights(state, law, reading, row)
         for item in range(acts[row, of.SENT_COUNT]):
             _check_news(state, law, reading, row, item)
-        for item in range(acts[row, of.VIOLATIONS]):
-            _note(state, _REFUSED, row, item, 0, 0, 0.0, 0.0)
+        _check_ruling(state, law, reading, row)
         if acts[row, of.WEIGHTS_BYTES]:
             _check_published(state, reading, row)
         if transport and acts[row, of.HEADS]:
@@ -754,7 +765,8 @@ class Checker:
     order       steps count up by one, whatever becomes of processes, time never runs back, an opening
                 first, nothing after the end
     hold        a step is made by who has seen what became of the one before
-    ruling      the world found no fault of its own
+    ruling      the world found no fault of its own, but for the speed of who has a clock that has gained on
+                time since its last step
     incident    what befalls a process is what a fault says: of its kind, to whom it names, not too early,
                 once, and not left out; without a fault processes only leave and join
     dead        who is dead, paused, not there yet or without a disk does not act, and nobody does while

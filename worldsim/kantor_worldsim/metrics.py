@@ -25,6 +25,7 @@ about: every shipped point where it was shipped, what is left shared evenly by t
 
 import math
 from collections import Counter
+from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import msgspec
@@ -41,7 +42,7 @@ from kantor_worldsim import reading as of
 from kantor_worldsim.bounds import Auction, measure
 from kantor_worldsim.channel import DROPPED, links
 from kantor_worldsim.reading import Reader
-from kantor_worldsim.records import Batch, Ending, Opening, Record
+from kantor_worldsim.records import Batch, Ending, Incident, Opening, Record
 
 _PAIRS_PER_ROW = 200_000
 """Robot-sample distances that one row of metrics may cost when the period is chosen by size."""
@@ -152,16 +153,75 @@ class MapResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FaultCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """What one fault of the scenario did, in copies of messages; all 0 says that it never struck."""
+    """What one fault of the scenario did; all 0 says that it never struck.
+
+    A fault of links counts copies of messages, one of processes how often it did what.
+    """
 
     dropped: int = 0
     """For receivers that the radio alone would have let hear; one that several faults drop counts for each."""
     delayed: int = 0
     doubled: int = 0
     replayed: int = 0
+    forged: int = 0
+    """Nobody sent them."""
+    killed: int = 0
+    started: int = 0
+    """Late joiners too."""
+    paused: int = 0
+    resumed: int = 0
+    filled: int = 0
+    """Disks."""
+    freed: int = 0
+    slowed: int = 0
+    quickened: int = 0
+    skewed: int = 0
+    """Clocks."""
+    righted: int = 0
+    refused: int = 0
+    """Impostors."""
+    let_in: int = 0
 
 
-_DEEDS = FaultCounts.__struct_fields__
+_OF_LINKS = ("dropped", "delayed", "doubled", "replayed", "forged")
+_OF_PROCESSES = {
+    "kill": "killed",
+    "start": "started",
+    "pause": "paused",
+    "resume": "resumed",
+    "fill": "filled",
+    "free": "freed",
+    "slow": "slowed",
+    "quicken": "quickened",
+    "skew": "skewed",
+    "right": "righted",
+    "pretend": "refused",
+    "let in": "let_in",
+}
+"""What a fault is counted for by what it did, see `outages.Deed`."""
+
+
+class Rejoining(msgspec.Struct, frozen=True, kw_only=True):
+    """How long participants that had started again took to their first step, in simulated seconds."""
+
+    count: int
+    median_s: float
+    p99_s: float
+    max_s: float
+
+    @classmethod
+    def of(cls, times_ns: Sequence[int]) -> "Rejoining | None":
+        """Of so many times, if there are any. A quantile is one of them."""
+        if not times_ns:
+            return None
+        times_s = [time_ns * 1e-9 for time_ns in sorted(times_ns)]
+        last = len(times_s) - 1
+        return cls(
+            count=len(times_s),
+            median_s=times_s[-(-last // 2)],
+            p99_s=times_s[-(-99 * last // 100)],
+            max_s=times_s[-1],
+        )
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
@@ -206,6 +266,12 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
     faults: dict[str, FaultCounts] = {}
     """By place in the scenario's list and kind, such as `0 partition`."""
+    restarts: int = 0
+    """How often a participant, or world-sim, that had been killed or had left was there again."""
+    incarnations: int = 0
+    """New ones: robots, or the supervisor, that came back and had forgotten what others had of them."""
+    rejoin_s: Rejoining | None = None
+    """In real seconds on the wall at speed 1; turn by turn to the next step that is due."""
     map: MapResult | None = None
     """Of a mission that explores a map; bounds, energy and mass then say nothing but mass_left, the share
     of cells that nobody has seen."""
@@ -213,7 +279,7 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
 
 # Slots of Tally.counts and Tally.shipped.
 _VIOLATIONS, _STEPS, _BYTES_WEIGHTS, _BYTES_TOTAL, _ENERGY, _UNITS = 0, 1, 2, 3, 4, 5
-_DELIVERIES, _DROPS, _FIRST_CONTACT, _LEAST = 6, 7, 8, 9
+_DELIVERIES, _DROPS, _FIRST_CONTACT, _LEAST, _REFUSED_BEFORE = 6, 7, 8, 9, 10
 _EVER, _NOW = 0, 1
 _NEVER = -1
 
@@ -222,12 +288,14 @@ class Tally(NamedTuple):
     """What is counted batch by batch. n participants, of them m robots; N samples."""
 
     counts: npt.NDArray[np.int64]
-    """(10,): violations, robot-steps, bytes on weights keys and in all, points and units shipped,
-    deliveries, drops, step of the first contact or _NEVER, units in `least`."""
+    """(11,): violations, robot-steps, bytes on weights keys and in all, points and units shipped,
+    deliveries, drops, step of the first contact or _NEVER, units in `least`, messages that
+    incarnations refused that are no more."""
     shipped: npt.NDArray[np.float64]
     """(2,) mass times metres: since the start, in this tick."""
     standing: npt.NDArray[np.int64]
-    """(n, 3): refused messages; whether it rests; step in which it saw no weight left, or _NEVER."""
+    """(n, 4): refused messages; whether it rests; step in which it saw no weight left, or _NEVER; how far
+    its clock was ahead in its last step."""
     shipped_by: npt.NDArray[np.float64]
     """(m,) since the start."""
     xy_m: npt.NDArray[np.float64]
@@ -252,6 +320,27 @@ def _lower(tally: Tally, place: int, sample: int, left: int) -> None:
             lower = min(lower, tally.views[other, sample])
     tally.least[sample] = lower
     tally.counts[_LEAST] += lower - least
+
+
+@kernel
+def _begin_anew(
+    counts: np.ndarray,
+    shipped: np.ndarray,
+    standing: np.ndarray,
+    shipped_by: np.ndarray,
+    xy_m: np.ndarray,
+    views: np.ndarray,
+    least: np.ndarray,
+    true_left: np.ndarray,
+    place: int,
+    units: int,
+) -> None:
+    """Who drives a body has forgotten all: its view is full, it rests no more, it has refused nothing."""
+    tally = Tally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left)
+    counts[_REFUSED_BEFORE] += standing[place, 0]
+    standing[place, 0], standing[place, 1], standing[place, 2] = 0, 0, _NEVER
+    for sample in range(least.shape[0]):
+        _lower(tally, place, sample, units)
 
 
 @kernel
@@ -304,6 +393,9 @@ def _follow(
         if place < 0 or not act[of.PRESENT]:
             continue
         counts[_VIOLATIONS] += act[of.VIOLATIONS]
+        if act[of.TOO_FAST] > 0 and act[of.SKEW_NS] > standing[place, 3]:  # see the checker's rule
+            counts[_VIOLATIONS] -= 1
+        standing[place, 3] = act[of.SKEW_NS]
         standing[place, 0] = act[of.REFUSED]
         for i in range(act[of.LOWERED], act[of.LOWERED] + max(0, act[of.LOWERED_COUNT])):
             _lower(tally, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS])
@@ -462,7 +554,9 @@ class Following:
             self._open(record)
         elif isinstance(record, Batch):
             self._follow(record)
-        elif isinstance(record, Ending):
+        elif isinstance(record, Incident):
+            self._befall(record)
+        else:
             self._ending = record
             self._row(last=True)
 
@@ -481,9 +575,9 @@ class Following:
         names, samples, robots = scenario.roster, site.samples_m.shape[0], scenario.robots.count
         self._targets = site.targets_m.shape[0]
         self._tally = Tally(
-            counts=np.zeros(10, dtype=np.int64),
+            counts=np.zeros(11, dtype=np.int64),
             shipped=np.zeros(2),
-            standing=np.zeros((len(names), 3), dtype=np.int64),
+            standing=np.zeros((len(names), 4), dtype=np.int64),
             shipped_by=np.zeros(robots),
             xy_m=site.starts_m.copy(),
             views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
@@ -496,6 +590,12 @@ class Following:
         self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
         self._out_of_range = self._absences = 0
         self._tolls = Counter[tuple[int, str]]()
+        self._restarts = 0
+        self._epochs = dict.fromkeys(names, 0)
+        self._gone: set[ParticipantId] = set()
+        self._started_ns: dict[ParticipantId, int] = {}
+        """Who has started again and not stepped yet, and when that was."""
+        self._rejoined_ns: list[int] = []
         self._ending = Ending(0, "cut")
         self._tick = 0
         for name, found in opening.first_look.items():
@@ -513,12 +613,44 @@ class Following:
         self._out_of_range += batch.out_of_range
         self._absences += len(batch.absent)
         for toll in batch.tolls:
-            for deed in _DEEDS:
+            for deed in _OF_LINKS:
                 self._tolls[toll.fault, deed] += getattr(toll, deed)
+        if self._started_ns:
+            self._note_rejoining(batch)
         reading = self._reader.read(batch)
         if _follow(*reading, *self._arguments):
             self._note_finds(batch)
         self._attend(batch, reading)
+
+    def _befall(self, incident: Incident) -> None:
+        """Follow what befell a process."""
+        name, what = incident.who, incident.what
+        if incident.fault >= 0 and what in _OF_PROCESSES:
+            self._tolls[incident.fault, _OF_PROCESSES[what]] += 1
+        if what in {"kill", "leave"}:
+            self._gone.add(name)
+            self._started_ns.pop(name, None)
+        elif what in {"start", "join"}:
+            self._restarts += name in self._gone
+            if name in self._epochs:
+                self._take_over(incident)
+            self._gone.discard(name)
+
+    def _take_over(self, incident: Incident) -> None:
+        name = incident.who
+        if name in self._gone:
+            self._started_ns[name] = incident.now_ns
+        if incident.epoch <= self._epochs[name]:
+            return
+        self._epochs[name] = incident.epoch
+        place = self._scenario.roster.index(name)
+        _begin_anew(*self._tally, place, self._units.sample)
+
+    def _note_rejoining(self, batch: Batch) -> None:
+        for act in batch.acts:
+            if act.outputs is not None and act.name in self._started_ns:
+                started_ns = self._started_ns.pop(act.name)
+                self._rejoined_ns.append(max(0, batch.now_ns - started_ns))
 
     @property
     def steps(self) -> int:
@@ -619,7 +751,9 @@ class Following:
             deliveries=counts[_DELIVERIES],
             drops=counts[_DROPS],
             out_of_range_refused=self._out_of_range,
-            messages_refused=int(self._tally.standing[:, 0].sum()) + refused_at_door,
+            messages_refused=int(self._tally.standing[:, 0].sum())
+            + counts[_REFUSED_BEFORE]
+            + refused_at_door,
             absences=self._absences,
             ended=self._ending.reason,
             record=record,
@@ -628,9 +762,14 @@ class Following:
             digest=digest,
             wall_s=wall_s,
             faults={
-                f"{i} {kind_of(fault)}": FaultCounts(**{d: self._tolls[i, d] for d in _DEEDS})
+                f"{i} {kind_of(fault)}": FaultCounts(
+                    **{deed: self._tolls[i, deed] for deed in FaultCounts.__struct_fields__}
+                )
                 for i, fault in enumerate(scenario.faults)
             },
+            restarts=self._restarts,
+            incarnations=sum(self._epochs.values()),
+            rejoin_s=Rejoining.of(self._rejoined_ns),
             **self._measured(),
         )
 

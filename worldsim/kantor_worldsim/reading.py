@@ -33,10 +33,11 @@ FINDS, VIOLATIONS, VOID, WEIGHTS_BYTES, BODY_BYTES = 7, 8, 9, 10, 11
 HEARD, HEARD_COUNT, SENT, SENT_COUNT = 12, 13, 14, 15
 SPENT, SPENT_COUNT, LOWERED, LOWERED_COUNT = 16, 17, 18, 19
 HEADS, WEIGHTS = 20, 21
-OBSERVED, SKEW_NS = 22, 23
-_ACT_COLUMNS = 24
+OBSERVED, SKEW_NS, TOO_FAST = 22, 23, 24
+_ACT_COLUMNS = 25
 """PRESENT: it has outputs and a ruling; all columns from STEP on hold only then, but for HEARD, OBSERVED and
-SKEW_NS. OBSERVED: the step in the observation that it was given.
+SKEW_NS. OBSERVED: the step in the observation that it was given. TOO_FAST: 1 + which of the violations
+is of its speed, or 0.
 VOID: the world refused the step, its energy or its units, so that nothing was shipped. HEADS: it has a
 goal. WEIGHTS: where what it publishes begins in the payload."""
 
@@ -59,7 +60,7 @@ class Reading(NamedTuple):
     sizes: npt.NDArray[np.int64]
     """(6,): how many rows of each table count."""
     acts: npt.NDArray[np.int64]
-    """(rows, 24)"""
+    """(rows, 25)"""
     poses_m: npt.NDArray[np.float64]
     """(rows, 4): x and y of each ruling and of each goal, world frame."""
     heard: npt.NDArray[np.int64]
@@ -211,6 +212,7 @@ _NEWS_TAG = News.__struct_config__.tag
 _WEIGHTS_TAG = WeightsMessage.__struct_config__.tag
 _SUPERVISOR_TEXT = np.frombuffer(SUPERVISOR.encode(), dtype=np.uint8)
 _REFUSALS = tuple(np.frombuffer(text, dtype=np.uint8) for text in (b"step", b"energy", b"units"))
+_SPEED = np.frombuffer(b"speed", dtype=np.uint8)
 
 
 @kernel
@@ -349,13 +351,15 @@ def _read_ruling(tables: Tables, act: np.ndarray, row: int, at: int) -> int:
     act[FINDS], at = _array(tables.payload, at, _ANY)
     at = skip(tables.payload, at, act[FINDS])
     act[VIOLATIONS], at = _array(tables.payload, at, _ANY)
-    act[VOID] = 0
-    for _ in range(act[VIOLATIONS]):
+    act[VOID] = act[TOO_FAST] = 0
+    for item in range(act[VIOLATIONS]):
         kind, size, at = head_of(tables.payload, at)
         if kind != TEXT:
             return _MALFORMED
         for text in _REFUSALS:
             act[VOID] |= _reads(tables.payload, at, size, text)
+        if _reads(tables.payload, at, size, _SPEED):
+            act[TOO_FAST] = item + 1
         at += size
     return skip(tables.payload, at, fields - 3)
 

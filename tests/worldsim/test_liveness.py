@@ -1,0 +1,199 @@
+"""What must happen some day: quiet about sound runs that come to rest, and each rule can be broken."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import msgspec
+import pytest
+
+from kantor_fleet.team import team
+from kantor_protocol.machine import EVERYBODY, SUPERVISOR
+from kantor_protocol.messages import decode_news, encode_news
+from kantor_protocol.packing import put_uint
+from kantor_protocol.replica import read_have
+from kantor_protocol.scenario import Scenario
+from kantor_worldsim.liveness import Liveness, settling_ns
+from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.records import Act, Batch, Ending, Record
+from kantor_worldsim.stage import Stage
+from kantor_worldsim.world import Site
+from strategies import mission
+
+SIZE = ("samples.count=60", "energy.points=90", "energy.steps=60", "limit_s=300")
+LOST = "faults=[{kind='kill', who=['r2'], from_s=0.75, until_s=1.5, disk='lost'}]"
+CUT = "faults=[{kind='partition', shape='halves', from_s=0.3, until_s=3.0}]"
+AWAY = "faults=[{kind='kill', who=['supervisor'], from_s=0.5, until_s=2.0}]"
+GUIDED = "coordination=centralized"
+
+
+class _Patient(Stage):
+    """A stage on which the mission goes on for a while when everybody rests."""
+
+    rested_ns = -1
+
+    @property
+    def over(self) -> str | None:
+        reason = super().over
+        if reason is not None and self.rested_ns < 0:
+            self.rested_ns = max(self.now_ns, 4_000_000_000)
+        longer_ns = settling_ns(self.scenario, len(self.scenario.roster))
+        return reason if self.now_ns > self.rested_ns + longer_ns else None
+
+
+def rested(*overrides: str, seed: int = 1) -> list[Record]:
+    """The records of a mission that goes on until news could be everywhere."""
+    scenario: Scenario = mission(*SIZE, *overrides)
+    site = Site.of(scenario, seed)
+    records: list[Record] = []
+    stage = _Patient(scenario, seed, site, [records.append])
+    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    return records
+
+
+def judged(records: Sequence[Record]) -> Liveness:
+    referee = Liveness()
+    for record in records:
+        referee.take(record)
+    return referee
+
+
+def rules(records: Sequence[Record]) -> set[str]:
+    return {complaint.partition(":")[0] for complaint in judged(records).complaints}
+
+
+@pytest.mark.parametrize("merge", [("merge=ledger",), ("merge=min", "claims=false")])
+@pytest.mark.parametrize("fault", ["faults=[]", LOST, CUT])
+@pytest.mark.parametrize("guided", [(), (GUIDED,)])
+@pytest.mark.parametrize("radio", [(), ("radio.drop=0.2",), ("radio.delay_s=0.25",)])
+def test_all_is_known_to_all_in_the_end(
+    merge: tuple[str, ...], fault: str, guided: tuple[str, ...], radio: tuple[str, ...]
+) -> None:
+    """Whatever happened before: who can hear one another hold the same when all is quiet."""
+    referee = judged(rested(*merge, fault, *guided, *radio))
+
+    assert referee.complaints == []
+    assert {"L1", "L2"} <= referee.judged
+    assert ("I8" in referee.judged) == ("merge=ledger" in merge)
+
+
+def test_supervisor_that_dies_is_given_up_and_taken_back() -> None:
+    """Robots talk to everybody meanwhile, and nobody complains."""
+    records = rested(AWAY, GUIDED)
+    referee = judged(records)
+    targets = [e.target for act in acts(records, "r1") if act.outputs for e in act.outputs.outbox]
+
+    assert referee.complaints == []
+    assert "L3" in referee.judged
+    assert {SUPERVISOR, EVERYBODY} == set(targets)
+    assert targets[-1] == SUPERVISOR
+
+
+def test_nothing_is_judged_before_it_can_be_known() -> None:
+    """A run that ends while robots move, or under a fault, says nothing of what would have been."""
+    lasting = judged(rested("faults=[{kind='partition', shape='halves'}]"))
+
+    assert lasting.complaints == []
+    assert lasting.judged == {"L2"}
+
+
+def acts(records: Sequence[Record], name: str) -> list[Act]:
+    return [act for r in records if isinstance(r, Batch) for act in r.acts if act.name == name]
+
+
+@dataclass
+class Edit:
+    """Changes acts of a record."""
+
+    records: Sequence[Record]
+    done: list[Record] = field(default_factory=list)
+
+    def acts(self, name: str, **values: object) -> list[Record]:
+        """Everything that a participant returned, changed."""
+
+        def change(act: Act) -> Act:
+            if act.name != name or act.outputs is None:
+                return act
+            told = msgspec.structs.replace(act.outputs, **values)
+            return msgspec.structs.replace(act, outputs=told)
+
+        return [
+            msgspec.structs.replace(r, acts=tuple(map(change, r.acts)))
+            if isinstance(r, Batch)
+            else r
+            for r in self.records
+        ]
+
+
+def said(have: Sequence[int], act: Act) -> object:
+    """The last message of an act with other log lengths."""
+    assert act.outputs is not None
+    (envelope,) = act.outputs.outbox
+    news = decode_news(envelope.body)
+    rest = news.have[len(_uints(read_have(news.have, 3) or [])) :]
+    body = encode_news(msgspec.structs.replace(news, have=_uints(have) + rest))
+    return (msgspec.structs.replace(envelope, body=body),)
+
+
+def _uints(values: Sequence[int]) -> bytes:
+    import numpy as np  # noqa: PLC0415
+
+    buffer, at = np.zeros(10 * len(values), dtype=np.uint8), 0
+    for value in values:
+        at = put_uint(buffer, at, value)
+    return buffer[:at].tobytes()
+
+
+def have_of(act: Act) -> list[int]:
+    assert act.outputs is not None
+    return read_have(decode_news(act.outputs.outbox[0].body).have, 3) or []
+
+
+def test_who_never_learns_is_named() -> None:
+    """L1: a participant that lacks entries, and one whose view is another."""
+    records = rested()
+    last = acts(records, "r2")[-1]
+    less = [have_of(last)[0] - 1, *have_of(last)[1:]]
+
+    assert rules(Edit(records).acts("r2", outbox=said(less, last))) == {"L1"}
+    assert rules(Edit(records).acts("r2", lowered=b"")) == {"L1"}
+
+
+def test_mission_without_an_end_is_named() -> None:
+    """L2."""
+    records = rested()
+    ending = records[-1]
+    assert isinstance(ending, Ending)
+
+    assert rules([*records[:-1], Ending(ending.now_ns, "limit")]) == {"L2"}
+    assert rules([*records[:-1], Ending(ending.now_ns, "interrupted")]) == set()
+
+
+@pytest.mark.parametrize("target", [SUPERVISOR, EVERYBODY])
+def test_who_does_not_turn_to_others_is_named(target: str) -> None:
+    """L3: one that waits for a dead supervisor, and one that ignores it when it is back."""
+    records = rested(AWAY, GUIDED)
+
+    def change(act: Act) -> Act:
+        if act.name != "r1" or act.outputs is None:
+            return act
+        box = tuple(msgspec.structs.replace(e, target=target) for e in act.outputs.outbox)
+        told = msgspec.structs.replace(act.outputs, outbox=box)
+        return msgspec.structs.replace(act, outputs=told)
+
+    stubborn = [
+        msgspec.structs.replace(r, acts=tuple(map(change, r.acts))) if isinstance(r, Batch) else r
+        for r in records
+    ]
+    assert rules(stubborn) == {"L3"}
+
+
+def test_lost_entries_are_named() -> None:
+    """I8: what a robot has consumed and nobody knows of, not even itself."""
+    records = rested()
+    told = [*records]
+    for name in ("r1", "r2", "r3"):
+        last = acts(records, name)[-1]
+        have = have_of(last)
+        told = Edit(told).acts(name, outbox=said([have[0], have[1] - 1, have[2]], last))
+
+    assert rules(told) == {"I8"}
