@@ -3,12 +3,15 @@
 import functools
 from collections import Counter
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from grounds import exploration
 from kantor_fleet.team import participant, play
+from kantor_protocol.faults import Kill, Pause
 from kantor_protocol.life import Mortal
 from kantor_protocol.machine import WORLD_SIM, Body, Outputs, ParticipantId, Pose
 from kantor_protocol.messages import decode_news
@@ -18,6 +21,7 @@ from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.records import Act, Batch, Ending, Incident, Mailbag, Record
 from kantor_worldsim.stage import ForeignRecordError, Stage
 from kantor_worldsim.world import Site
+from mapping import ROOMS
 from strategies import SMALL, examples
 
 MS = 1_000_000
@@ -334,15 +338,21 @@ STORMS = (
     pace=st.sampled_from(list(PACES)),
     from_ms=st.integers(0, 4000),
     span_ms=st.integers(1, 1500),
-    others=st.integers(0, 1),
+    others=st.sampled_from([None, (0.35, 0.75), (-0.25, 0.1)]),
 )
 def test_world_sim_goes_on_from_its_record(
-    pace: str, from_ms: int, span_ms: int, others: int
+    pace: str, from_ms: int, span_ms: int, others: tuple[float, float] | None
 ) -> None:
-    """Killed at any moment: every batch is as if it had only stood still, in the worst of weathers too."""
+    """Killed at any moment, every batch is as if it had only stood still, in the worst of weathers too.
+
+    others: a robot dies in a step, so long after the outage or before it, and comes back after it.
+    """
     window = f"from_s = {from_ms / 1000!r}; until_s = {(from_ms + span_ms) / 1000!r}"
-    later = (from_ms + span_ms) / 1000
-    crashes = (kill("r1", later, later + 0.4, "mid_step = true", 'disk = "lost"'),) * others
+    crashes = ()
+    if others is not None and from_ms / 1000 + others[0] > 0.0:
+        dies_s = (from_ms + (span_ms if others[0] > 0.0 else 0)) / 1000 + others[0]
+        back_s = (from_ms + span_ms) / 1000 + others[1]
+        crashes = (kill("r1", dies_s, back_s, "mid_step = true", 'disk = "lost"'),)
     killed, paused = (
         run(
             f'kind = "{kind}"; who = ["worldsim"]; {window}',
@@ -360,6 +370,33 @@ def test_world_sim_goes_on_from_its_record(
     assert not any(batch.now_ns in during for batch in batches(killed))
     told = [(i.now_ns, i.what) for i in incidents(killed) if i.who == WORLD_SIM]
     assert told == [(during.start, "kill"), (during.stop, "start")][: len(told)]
+
+
+@pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
+def test_world_with_a_map_goes_on_from_its_record(coordination: str) -> None:
+    """What range finders measured, who bumped where: all of it follows from what robots did."""
+    scenario = exploration(
+        "robots.count=2",
+        f"coordination={coordination}",
+        "sensor.noise_m=0.1",
+        "sensor.range_m=3",
+        "radio.range_m=6",
+        "vehicle.speed_m_s=10",
+    )
+    site = Site(np.zeros((0, 2)), np.array([[9.5, 4.5]]), np.array([[1.5, 1.5], [2.5, 1.5]]), ROOMS)
+    lost = Kill(who=("r1",), from_s=0.42, until_s=0.91, disk="lost")
+
+    def explored(outage: Kill | Pause) -> list[Batch]:
+        records: list[Record] = []
+        play(replace(scenario, faults=(lost, outage)), 1, site, [records.append])
+        assert isinstance(records[-1], Ending)
+        assert records[-1].reason == "done"
+        assert [incident.epoch for incident in incidents(records) if incident.step] == [1]
+        return batches(records)
+
+    window = {"who": (WORLD_SIM,), "from_s": 1.2, "until_s": 1.5}
+
+    assert explored(Kill(**window)) == explored(Pause(**window))  # type: ignore[arg-type]
 
 
 MORTALS = (

@@ -71,8 +71,7 @@ def test_what_ends_comes_before_what_begins() -> None:
 )
 def test_who_is_idle_when(who: str, at_ms: int, idle: bool) -> None:  # noqa: FBT001
     """From the beginning of a window up to its end; everybody is while world-sim is."""
-    faults = (KILL, PAUSE, SLOW, FOR_GOOD if who == "r2" else DARK)
-    outages = Outages(troubled(*faults))
+    outages = Outages(troubled(KILL, FOR_GOOD, PAUSE, DARK, SLOW))
 
     assert outages.idle(who, at_ms * MS) == idle
 

@@ -12,7 +12,7 @@ from grounds import HEADINGS, drawn, exploration, places
 from grounds import Place as Stand
 from kantor_protocol.grid import FREE, Frame, free_way
 from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import SUPERVISOR, Outputs, Pose
+from kantor_protocol.machine import SUPERVISOR, Body, Outputs, Pose
 from kantor_protocol.messages import RefusedError
 from kantor_protocol.packing import Pairs
 from kantor_protocol.scenario import ScenarioError
@@ -115,6 +115,24 @@ def test_stale_step_changes_nothing(step: int, now_ns: int) -> None:
     assert act(there, 3, (8.0, 0.0), SPENT).violations == ()
 
 
+# Bodies.
+
+
+def test_body_outlives_whoever_drives_it() -> None:
+    """Pose, step and gauge go on through all incarnations; the world notes which one it is."""
+    there = world(overrides=("energy.steps=2",))
+    act(there, 1, (2.0, 0.0), SPENT)
+    first = there.body("r1")
+    changed = [there.begin("r1", epoch) for epoch in (0, 3, 3)]
+    rulings = [act(there, step, (2.0, 0.0), SPENT).violations for step in (2, 3)]
+
+    assert first == Body(Pose(2.0, 0.0), 1, 1, 0)
+    assert changed == [False, True, False]
+    assert rulings == [(), ("energy",)]
+    assert there.body("r1") == Body(Pose(2.0, 0.0), 3, 2, 3)
+    assert there.body("r2") == Body(Pose(90.0, 20.0))
+
+
 # Energy.
 
 
@@ -180,7 +198,6 @@ def test_first_look_is_at_time_0() -> None:
 
     assert there.first_look() == {"r1": ((0, 1.0, 0.0),), "r2": ((1, 90.0, 21.0),), "r3": ()}
     assert there.observe("r1").detected == (0,)
-    assert there.observe("r1").detected == ()
     assert there.found.tolist() == [True, True, False]
 
 
@@ -192,6 +209,19 @@ def test_target_is_found_once() -> None:
 
     assert found == [((0, 8.0, 0.0), (1, 9.0, 0.0)), ()]
     assert there.found.tolist() == [True, True, False]
+
+
+def test_finds_are_told_with_the_step_that_made_them() -> None:
+    """However often one looks, and no longer than until the next step."""
+    there = world((8.0, 0.0))
+    act(there, 1, (4.0, 0.0))
+    told = [there.observe("r1").detected for _ in range(2)]
+    act(there, 1, (4.0, 0.0))
+    told.append(there.observe("r1").detected)
+    act(there, 2, (4.0, 0.0))
+
+    assert told == [(0,), (0,), (0,)]
+    assert there.observe("r1").detected == ()
 
 
 def test_only_where_a_robot_ends_up_counts() -> None:

@@ -118,12 +118,12 @@ class Outages:
 
     def idle(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether a participant takes no step now, because of its own or of world-sim's state."""
-        return any(self._holds(fault, now_ns) for fault in self._stops[name])
+        return any(self._stands(fault, now_ns) for fault in self._stops[name])
 
     def dies(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether the next step of a participant is the one in which it dies, or was."""
         return any(
-            isinstance(fault, Kill) and fault.mid_step and _within(fault, now_ns)
+            isinstance(fault, Kill) and fault.mid_step and fault.holds(now_ns)
             for fault in self._faults[name]
         )
 
@@ -139,14 +139,10 @@ class Outages:
         clocks = self._clocks[name]
         if not clocks:
             return 0
-        skew_ns = sum(clock.skew_ns(now_ns) for clock in clocks if _within(clock, now_ns))
+        skew_ns = sum(clock.skew_ns(now_ns) for clock in clocks if clock.holds(now_ns))
         return max(skew_ns, -now_ns)
 
-    def _holds(self, fault: OnProcesses, now_ns: int) -> bool:
-        if not _within(fault, now_ns):
+    def _stands(self, fault: OnProcesses, now_ns: int) -> bool:
+        if not fault.holds(now_ns):
             return False
         return not isinstance(fault, Slow) or now_ns // self._period_ns % fault.every != 0
-
-
-def _within(fault: OnProcesses, now_ns: int) -> bool:
-    return fault.from_ns <= now_ns and (fault.until_ns is None or now_ns < fault.until_ns)

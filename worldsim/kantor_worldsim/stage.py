@@ -170,10 +170,10 @@ class Stage:
         ruled, out_of_range = self.channel.transmit(sent)
         verdicts = tuple(ruled)
         acts = tuple([self._act(step) for step in sound])
-        absent = tuple([act.name for act in acts if act.outputs is None])
+        absent = [act.name for act in acts if act.outputs is None] if self._unanswered else ()
         tolls = self._faults.take_tolls() if self._faults else ()
         forged = self._faults.take_forged() if self._faults else ()
-        self._tell(Batch(now_ns, acts, verdicts, out_of_range, absent, tolls, forged))
+        self._tell(Batch(now_ns, acts, verdicts, out_of_range, tuple(absent), tolls, forged))
         return verdicts
 
     def note(self, incident: Incident) -> None:

@@ -112,7 +112,7 @@ class _Body:
         self.epoch = 0
         self.moved_ns = 0
         self.energy_spent = 0
-        self.found: list[int] = []
+        self.found: tuple[int, ...] = ()
         self.scan = b""
         self.bumped = False
 
@@ -159,7 +159,7 @@ class World:
     def observe(self, name: ParticipantId) -> Observation:
         """What the world tells a participant of its last step, or of the start."""
         body = self._bodies[name]
-        return Observation(body.step, body.pose, tuple(body.found), body.scan, body.bumped)
+        return Observation(body.step, body.pose, body.found, body.scan, body.bumped)
 
     def body(self, name: ParticipantId) -> Body:
         """What whoever takes a participant over has to know."""
@@ -177,7 +177,7 @@ class World:
         body = self._bodies[name]
         if outputs.step <= body.step or now_ns < body.moved_ns:
             return Ruling(pose=body.pose, violations=("step",))
-        body.bumped, body.found = False, []
+        body.bumped, body.found = False, ()
         violations = [] if self._moves(name, body, now_ns, outputs.pose) else ["speed"]
         if outputs.spent:
             violations += self._spend(body, outputs.spent)
@@ -227,7 +227,7 @@ class World:
         if not count:
             return ()
         indices = self._room[:count].tolist()
-        body.found += indices
+        body.found += tuple(indices)
         return tuple((i, float(targets_m[i, 0]), float(targets_m[i, 1])) for i in indices)
 
 
