@@ -4,9 +4,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_agent.belief import Belief
-from kantor_agent.pace import Pace
 from kantor_agent.planners import PLANNERS, Goal
-from kantor_agent.vehicles import VEHICLES
+from kantor_agent.vehicles import LATER_NS, VEHICLES
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import (
     Body,
@@ -22,9 +21,9 @@ from kantor_protocol.scenario import Scenario
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units, WeightsPublisher
 
-_WALK_PERIODS = 32
-"""Samples walk at most so many of their steps in one of the robot's, and never back. Who joins late, or has
-a clock that was behind, catches up within a few steps; who had a clock that was ahead waits until it is time."""
+_WALK_STEPS_MAX = 32
+"""Samples walk at most so many steps in one of the robot's, and never back. Who joins late, or has a clock
+that was behind, catches up within a few steps; who had a clock that was ahead waits until it is time."""
 
 
 class Agent:
@@ -51,6 +50,7 @@ class Agent:
             scenario.period_ns,
             seed,
             Purpose.SAMPLE_WALK,
+            most_steps=_WALK_STEPS_MAX,
         )
         self._belief = Belief(walk, units, replica)
         self._radio = Radio(me, scenario, body.epoch)
@@ -61,8 +61,8 @@ class Agent:
         )
         self._budget = scenario.steps_per_robot
         self._period_ns = scenario.period_ns
-        self._pace = Pace(scenario.period_ns, body)
-        self._now_ns = 0
+        # Who takes over a body on its way does not know when that moved last, and holds for a step.
+        self._now_ns = 0 if body.step == 0 else LATER_NS
         self._step, self._pose, self._energy_spent = body.step, body.pose, body.energy_spent
         self._goal: Goal | None = None
 
@@ -70,16 +70,11 @@ class Agent:
         """One step; see the class."""
         self._radio.hear(inputs.inbox, self._belief.learn)
         self._locate(inputs.observation)
+        self._belief.advance(inputs.now_ns)
+        elapsed_ns = max(0, min(inputs.now_ns - self._now_ns, self._period_ns))
         self._now_ns, self._step = inputs.now_ns, self._step + 1
-        self._belief.advance(min(self._now_ns, self._walkable_ns))
-        elapsed_s = self._pace.elapsed_s(self._now_ns)
-        spent = self._explore(elapsed_s) if self._state is State.EXPLORING else b""
+        spent = self._explore(elapsed_ns * 1e-9) if self._state is State.EXPLORING else b""
         return self._publish(spent)
-
-    @property
-    def _walkable_ns(self) -> int:
-        """How far samples may walk in one step: one that was away, or whose clock jumps, must still answer."""
-        return (self._belief.walked + _WALK_PERIODS) * self._period_ns
 
     @property
     def _state(self) -> State:

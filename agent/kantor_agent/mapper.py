@@ -12,10 +12,9 @@ import numpy as np
 from kantor_agent.chart import Chart
 from kantor_agent.dispatch import CELL, TARGET, Dispatch, Patience, order_in, register_of, roll_call
 from kantor_agent.navigation import Navigator
-from kantor_agent.pace import Pace
 from kantor_agent.planners.team import Member, Task
 from kantor_agent.terrain import Terrain
-from kantor_agent.vehicles import VEHICLES
+from kantor_agent.vehicles import LATER_NS, VEHICLES
 from kantor_protocol.evidence import Evidence, entries, void
 from kantor_protocol.grid import NOWHERE, Frame
 from kantor_protocol.machine import Body, Inputs, Observation, Outputs, ParticipantId, Pose, State
@@ -57,8 +56,8 @@ class Mapper:
         self._period_ns = scenario.period_ns
         self._counting_on = Patience.of(scenario, scenario.period_ns)
         self._patience = scenario.planner.patience
-        self._pace = Pace(scenario.period_ns, body)
-        self._now_ns = 0
+        # Who takes over a body on its way does not know when that moved last, and holds for a step.
+        self._now_ns = 0 if body.step == 0 else LATER_NS
         self._step, self._pose = body.step, body.pose
         self._unsure_until = body.step + _SURE_STEPS
         self._scanned_step = -1
@@ -72,15 +71,15 @@ class Mapper:
         """One step; see the module."""
         self._radio.hear(inputs.inbox, self._learn)
         self._locate(inputs.observation)
+        elapsed_ns = max(0, min(inputs.now_ns - self._now_ns, self._period_ns))
         self._now_ns, self._step = inputs.now_ns, self._step + 1
-        elapsed_s = self._pace.elapsed_s(self._now_ns)
         self._chart.fold(self._replica)
         self._give_up()
         if not self._resting:
             self._decide()
         self._look(inputs.observation)
         if not self._resting:
-            self._move(elapsed_s)
+            self._move(elapsed_ns * 1e-9)
         return self._publish()
 
     @property
@@ -186,12 +185,13 @@ class Mapper:
         if self._clearance_cells == 0.0:
             return False
         registers = self._replica.registers
-        here = int(registers.values[registers.me, CELL]) - 1
-        lower = [registers.values[registers.newest(robot)] for robot in range(self._me)]
+        told = registers.values
+        here = int(told[registers.me, CELL]) - 1
         return any(
-            told[TARGET] == self._task.target + 1
-            and self._terrain.cells_between(int(told[CELL]) - 1, here) <= self._clearance_cells
-            for told in lower
+            told[slot, TARGET] == self._task.target + 1
+            and self._terrain.cells_between(int(told[slot, CELL]) - 1, here)
+            <= self._clearance_cells
+            for slot in map(registers.newest, range(self._me))
         )
 
     def _publish(self) -> Outputs:

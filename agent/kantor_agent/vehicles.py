@@ -11,6 +11,9 @@ from typing import Protocol
 from kantor_protocol.machine import Pose
 from kantor_protocol.scenario import Vehicle as Parameters
 
+LATER_NS = 1 << 62
+"""A last step later than any: since then no time has passed, as on a clock that was set back."""
+
 
 class Vehicle(Protocol):
     """Motion under a goal."""

@@ -28,8 +28,9 @@ class Radio:
         """Messages that were malformed, too old or from nobody in the roster."""
         roster = scenario.roster
         self._me, self._epoch, self._origins = me, epoch, len(roster)
-        self._slots = {name: i for i, name in enumerate(roster) if name != me}
-        self._supervised = scenario.centralized and me != SUPERVISOR
+        self._places = {name: i for i, name in enumerate(roster) if name != me}
+        self._supervisor = self._supervisor_slot = self._places.get(SUPERVISOR, NOBODY)
+        """Its place, and the slot of its newest incarnation; NOBODY without one."""
         self._unheard_steps = -patience_steps(me, scenario)  # the first word takes its time
         """Own steps since the supervisor was heard."""
 
@@ -37,30 +38,27 @@ class Radio:
         """Pass every sound message of a step on to `learn(slot of the sender, news)`; count the others."""
         self._unheard_steps += 1
         for envelope in inbox:
+            place = self._places.get(envelope.source)
             try:
-                taken = self._take(envelope, learn)
+                taken = place is not None and self._take(place, decode_news(envelope.body), learn)
             except RefusedError:
                 taken = False
             self.refused += not taken
 
-    def _take(self, envelope: Envelope, learn: Callable[[int, News], bool]) -> bool:
-        newest = self._slots.get(envelope.source)
-        if newest is None:
-            return False
-        news = decode_news(envelope.body)
-        slot = newest % self._origins + news.epoch * self._origins
+    def _take(self, place: int, news: News, learn: Callable[[int, News], bool]) -> bool:
+        slot = place + news.epoch * self._origins
         if not learn(slot, news):
             return False
-        self._slots[envelope.source] = max(newest, slot)
-        if envelope.source == SUPERVISOR:
+        if place == self._supervisor:
+            self._supervisor_slot = max(self._supervisor_slot, slot)
             self._unheard_steps = 0
         return True
 
     def say(self, replica: Replica, step: int, pose: Pose) -> Envelope:
         """What whoever it talks to lacks."""
-        alone = not self._supervised or self._unheard_steps > CONTACT_PERIODS
+        alone = self._supervisor == NOBODY or self._unheard_steps > CONTACT_PERIODS
+        slot = NOBODY if alone else self._supervisor_slot
         target = EVERYBODY if alone else SUPERVISOR
-        slot = NOBODY if alone else self._slots[SUPERVISOR]
         have, logs, claims = replica.compose(slot)
         news = News(
             version=VERSION,

@@ -29,19 +29,27 @@ class Walk:
         period_ns: int,
         seed: int,
         purpose: Purpose,
+        *,
+        most_steps: int | None = None,
     ) -> None:
-        """xy_m: (N, 2) points at time 0, in the world frame. They are copied."""
+        """xy_m: (N, 2) points at time 0, in the world frame. They are copied.
+
+        most_steps: in one `advance`, whatever the clock says; the rest follows with the next. None: any.
+        """
         self.xy_m = np.array(xy_m, dtype=np.float64, order="C")
         self.steps = 0
         self._diffusion_m = diffusion_m
         self._period_ns = period_ns
         self._seed = seed
         self._purpose = int(purpose)
+        self._most_steps = most_steps
 
     def advance(self, now_ns: int) -> bool:
-        """Bring `xy_m` to simulated time `now_ns`; True if the points moved."""
+        """Bring `xy_m` to simulated time `now_ns`, never back; True if the points moved."""
         due = now_ns // self._period_ns if self._diffusion_m > 0.0 else 0
         moved = due > self.steps
+        if moved and self._most_steps is not None:
+            due = min(due, self.steps + self._most_steps)
         while self.steps < due:
             self.steps += 1
             _walk(self.xy_m, self._seed, self._purpose, self.steps, self._diffusion_m)
