@@ -73,7 +73,8 @@ def _nothing(_dice: Dice, _body: bytes, _news: News) -> bytes:
 
 
 def _noise(dice: Dice, _body: bytes, _news: News) -> bytes:
-    noise = bytes([dice.below(256) for _ in range(1 + dice.below(_NOISE_BYTES_MAX))])
+    length = 1 + dice.below(_NOISE_BYTES_MAX)
+    noise = b"".join([dice.below(1 << 48).to_bytes(6, "big") for _ in range(0, length, 6)])[:length]
     return b"" if _is_news(noise) else noise
 
 
