@@ -273,6 +273,8 @@ class Scenario(Table, frozen=True, kw_only=True):
     """Robots claim the sample they head for, if their planner heads for samples."""
     limit_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     """Simulated time after which the mission is cut; by default 1.5 times the energy's."""
+    linger_s: Seconds = 0.0
+    """Simulated time that it goes on once every robot rests and no fault is left, so that news gets around."""
     domain: Domain = Domain(min_m=(0.0, 0.0), max_m=(0.0, 0.0))
     map: Map | None = None
     """Given one, the robots explore it; they then need no domain, energy, samples or density."""

@@ -17,6 +17,7 @@ from kantor_protocol import faults as of_faults
 from kantor_protocol.faults import KINDS, Fault, Kill
 from kantor_protocol.machine import SUPERVISOR, WORLD_SIM, ParticipantId
 from kantor_protocol.scenario import Scenario, from_tree, to_tree
+from kantor_worldsim.liveness import settling_ns
 
 Tree = dict[str, Any]
 
@@ -31,11 +32,12 @@ SORTS = {
 """Sorts of missions and how often each is drawn: a transport ledger with claims and without, the minimum,
 multiscale coverage, samples that walk, a map that nobody knows."""
 
-_MISSION, _TEAM, _RADIO, _CLOCK, _FAULTS = range(5)
+_MISSION, _TEAM, _RADIO, _CLOCK, _FAULTS, _PUBLISH, _LINGER = range(7)
 _A_CLASS = 16
 """Subjects of draws; from the last one on, one for each class of faults."""
 
 _CENTRALIZED = 0.28
+_LINGER_PERIODS = 150
 _METRICS_EVERY = 20
 """Nobody looks at the rows."""
 _TRIES = 6
@@ -69,10 +71,19 @@ def draw(seed: int) -> Scenario:
         "publish": _publish(seed),
         "metrics": {"every": _METRICS_EVERY},
     }
-    scenario = from_tree(tree, f"seed {seed}")
+    scenario = _lingering(seed, from_tree(tree, f"seed {seed}"))
     faults = tuple(_faults(seed, scenario, calm_s))
     # Once more through the parser: what a campaign runs is what a user can write.
     return from_tree(to_tree(msgspec.structs.replace(scenario, faults=faults)), f"seed {seed}")
+
+
+def _lingering(seed: int, scenario: Scenario) -> Scenario:
+    """Half of the missions, where it is no long time, go on until news could be everywhere."""
+    linger_ns = settling_ns(scenario, len(scenario.roster)) + 2 * scenario.period_ns
+    if linger_ns > _LINGER_PERIODS * scenario.period_ns or not Dice(seed, _LINGER).coin():
+        return scenario
+    linger_s, limit_s = short(1.01e-9 * linger_ns), scenario.limit_s or 0.0
+    return msgspec.structs.replace(scenario, linger_s=linger_s, limit_s=limit_s + 2.0 * linger_s)
 
 
 def _density(seed: int, sort: str) -> Tree:
@@ -190,7 +201,7 @@ def _clock(seed: int, period_s: float) -> Tree:
 
 
 def _publish(seed: int) -> Tree:
-    dice = Dice(seed, _CLOCK + _A_CLASS // 2)
+    dice = Dice(seed, _PUBLISH)
     return {"weights_every": dice.whole(1, 20), "keyframe_every": dice.whole(1, 30)}
 
 

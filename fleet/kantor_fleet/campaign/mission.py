@@ -15,8 +15,9 @@ from kantor_fleet.campaign.struck import Struck
 from kantor_fleet.experiment import Case, Outcome, reason
 from kantor_fleet.team import play
 from kantor_protocol.scenario import Scenario
-from kantor_worldsim.checkers import Checker, check
+from kantor_worldsim.checkers import Checker
 from kantor_worldsim.journal import Digest, Journal, read
+from kantor_worldsim.liveness import Liveness
 from kantor_worldsim.recording import JOURNAL, Recording
 from kantor_worldsim.records import Batch, Record, decode_record, encode_record
 from kantor_worldsim.world import Site
@@ -101,6 +102,8 @@ class Follower:
         self._keep()
         self.struck, self.sightings = Struck(), Sightings()
         self.steps = 0
+        self.judged: frozenset[str] = frozenset()
+        """Rules of liveness that the record could have broken."""
         self._robots = frozenset(scenario.robot_ids)
 
     def take(self, record: Record) -> None:
@@ -130,7 +133,16 @@ class Follower:
     def complaints(self) -> tuple[str, ...]:
         """What is wrong with the whole, once it is over: as it was seen, and from the record alone."""
         seen = tuple(self.recording.checker.complaints[:10])
-        return seen or tuple(_judged(self.payloads)[:10])
+        return seen or tuple(self._judged()[:10])
+
+    def _judged(self) -> list[str]:
+        """What referees find who have nothing but the bytes of the record."""
+        checker, liveness = Checker(), Liveness()
+        for record in map(decode_record, self.payloads):
+            checker.take(record)
+            liveness.take(record)
+        self.judged = frozenset(liveness.judged)
+        return checker.complaints or liveness.complaints
 
 
 def _attempt(case: Case) -> dict[str, Any]:
@@ -152,15 +164,10 @@ def _attempt(case: Case) -> dict[str, Any]:
         "digest": result.digest,
         "complaints": complaints,
         "struck": dict(follower.struck.counts),
-        "seen": follower.sightings.counts,
+        "seen": follower.sightings.counts | {f"{rule} judged": 1 for rule in sorted(follower.judged)},
         "twice": int(twice),
         "cut": _CUTS if cut else 0,
     }
-
-
-def _judged(payloads: Iterable[bytes]) -> list[str]:
-    """What referees find who have nothing but the bytes of a record."""
-    return check(map(decode_record, payloads)).complaints
 
 
 def _differing(scenario: Scenario, seed: int, digest: str) -> Iterable[str]:

@@ -300,7 +300,10 @@ class _Ends(_Sight):
 
 _SIGHTS = (_Goals, _Sides, _Lives, _Ears, _Memory, _Ends)
 
-SIGHTS: tuple[str, ...] = tuple(name for sight in _SIGHTS for name in sight.names)
+JUDGED = ("L1 judged", "L2 judged", "L3 judged", "I8 judged")
+"""Missions in which a rule of liveness could have been broken; see `kantor_worldsim.liveness`."""
+
+SIGHTS: tuple[str, ...] = (*(name for sight in _SIGHTS for name in sight.names), *JUDGED)
 """What a campaign has to see."""
 
 
