@@ -298,8 +298,8 @@ def _mark_outages(diagrams: Sequence[Axes], run: Run, end_s: float) -> list[Arti
         low, high = 1.0 - height * (row + 0.9), 1.0 - height * (row + 0.1)
         top.axvspan(from_s, last_s, low, high, color=colour, alpha=0.8, lw=0.0, zorder=1.2)
         if len(rows) <= _ROWS_NAMED:
-            place = {"xy": (last_s, low), "xycoords": ("data", "axes fraction")}
-            top.annotate(f" {who}", size=TEXT_PT - 2.5, color=colour, va="bottom", **place)
+            style: dict[str, Any] = {"size": TEXT_PT - 2.5, "color": colour, "va": "bottom"}
+            top.text(last_s, low, f" {who}", transform=top.get_xaxis_transform(), **style)
         for axes in diagrams if who in {SUPERVISOR, WORLD_SIM} else ():
             axes.axvspan(from_s, last_s, color=colour, alpha=0.1, lw=0.0, zorder=0.1)
         for axes in diagrams if len(run.outages) <= _LINES_SHOWN else ():

@@ -309,10 +309,12 @@ def test_moments_are_in_time_not_in_steps() -> None:
 
 STRUCK = (
     "coordination=centralized",
-    "faults=[{kind='kill', who=['r2'], from_s=1.0, until_s=1.9, disk='lost'},"
-    "{kind='kill', who=['supervisor'], from_s=1.5}, {kind='pause', who=['worldsim'], from_s=2.4,"
-    "until_s=2.9}, {kind='late', who=['r1'], until_s=0.4},"
-    "{kind='partition', shape='halves', from_s=0.5, until_s=1000.0}]",
+    (
+        "faults=[{kind='kill', who=['r2'], from_s=1.0, until_s=1.9, disk='lost'},"
+        "{kind='kill', who=['supervisor'], from_s=1.5}, {kind='pause', who=['worldsim'], from_s=2.4,"
+        "until_s=2.9}, {kind='late', who=['r1'], until_s=0.4},"
+        "{kind='partition', shape='halves', from_s=0.5, until_s=1000.0}]"
+    ),
 )
 
 
