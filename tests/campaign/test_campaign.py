@@ -6,8 +6,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from mutants import MUTANTS
 
+from campaign.mutants import MUTANTS
 from kantor_fleet.campaign import run as campaigns
 from kantor_fleet.campaign.draw import draw
 from kantor_fleet.campaign.mission import Trial, attempt

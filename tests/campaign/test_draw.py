@@ -4,12 +4,12 @@ from collections import Counter
 from itertools import chain
 
 from hypothesis import given
-from strategies import SEEDS, examples
 
 from kantor_fleet.campaign.dice import Dice
 from kantor_fleet.campaign.draw import SORTS, draw, sort_of
 from kantor_protocol.faults import KINDS, Kill, kind_of
 from kantor_protocol.scenario import from_tree, parse, to_toml, to_tree
+from strategies import SEEDS, examples
 
 MANY = 2000
 
@@ -20,6 +20,7 @@ def test_every_seed_is_a_scenario_that_a_user_could_write(seed: int) -> None:
     scenario = draw(seed)
     assert from_tree(to_tree(scenario), "drawn") == scenario
     assert parse(to_toml(scenario), "written") == scenario
+    assert parse(to_toml(scenario, brief=True), "written briefly") == scenario
 
 
 def test_many_seeds_draw_everything() -> None:

@@ -1,8 +1,8 @@
 """Every planted bug is caught by a referee within a bounded number of a campaign's missions."""
 
 import pytest
-from mutants import LIMIT, MUTANTS, Mutant, hunt
 
+from campaign.mutants import LIMIT, MUTANTS, Mutant, hunt
 from kantor_fleet.campaign.mission import rule_of
 
 _CRASH = "Error"
