@@ -194,6 +194,42 @@ def sweep(
     return run_sweep(order, pool(jobs, cluster))
 
 
+def campaign(
+    *,
+    seeds: str = "2000",
+    jobs: int | None = None,
+    minutes: float | None = None,
+    out: Path = Path("campaign"),
+    replay: int | None = None,
+) -> int:
+    """Draw missions full of faults, seed by seed, and judge every event, until a rule breaks.
+
+    The first violation ends it: its seed, the command that replays it, and the smallest scenario that
+    shows it are printed. Finished missions are kept: the same command goes on where it was stopped.
+    Exit code 1 for a violation, and from 500 missions on for a fault that never struck or a rare
+    situation that was never seen.
+
+    Args:
+        seeds: How many, from 0 on; or 500:1000 (without 1000).
+        jobs: Processes, by default one for each core.
+        minutes: Real time after which no further mission begins.
+        out: Where campaign.jsonl is kept, and what is found.
+        replay: Run the mission of this seed alone, and leave its scenario and its record.
+    """
+    from kantor_fleet.campaign.mission import attempt  # noqa: PLC0415
+    from kantor_fleet.campaign.run import Order, numbered  # noqa: PLC0415
+    from kantor_fleet.campaign.run import campaign as run_campaign  # noqa: PLC0415
+    from kantor_fleet.campaign.run import replay as replay_mission  # noqa: PLC0415
+    from kantor_fleet.pools import pool  # noqa: PLC0415
+
+    if replay is not None:
+        _check_seed(replay)
+        return replay_mission(replay, out)
+    if minutes is not None and not minutes > 0.0:
+        fail(Exit.USAGE, f"--minutes {minutes:g}: give a time above 0")
+    return run_campaign(Order(numbered(seeds), out, minutes), pool(jobs, work=attempt))
+
+
 def scenarios(
     action: Annotated[Literal["list", "show"], tyro.conf.Positional] = "list",
     name: Annotated[str, tyro.conf.Positional] = "fleet",
@@ -307,6 +343,7 @@ VERBS: dict[str, Callable[..., int]] = {
     "agent": agent,
     "supervisor": supervisor,
     "sweep": sweep,
+    "campaign": campaign,
     "scenarios": scenarios,
     "verify": verify,
     "reproduce": reproduce,

@@ -13,10 +13,10 @@ import shutil
 import signal
 import socket
 import warnings
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
+from itertools import islice
 from multiprocessing.connection import Connection, wait
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, NamedTuple
@@ -151,15 +151,17 @@ class _Worker:
 def _in_processes(cases: Iterable[Case], jobs: int, work: Work) -> Generator[_Done | None]:
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")  # a core each
-    waiting = deque(cases)
+    waiting = iter(cases)
     idle: list[_Worker] = []
     busy: dict[object, tuple[_Worker, Case]] = {}  # by the worker's pipe
     try:
-        while waiting or busy:
-            while waiting and len(busy) < jobs:
-                worker, case = idle.pop() if idle else _Worker(work), waiting.popleft()
+        while True:
+            for case in islice(waiting, jobs - len(busy)):
+                worker = idle.pop() if idle else _Worker(work)
                 busy[worker.pipe] = worker, case
                 worker.pipe.send(case)
+            if not busy:
+                return
             ready = wait([worker.pipe for worker, _ in busy.values()], _GLANCE_S)
             for pipe in ready:
                 worker, case = busy.pop(pipe)

@@ -52,6 +52,7 @@ class Purpose(enum.IntEnum):
     FAULT_FLAP = 24
     FAULT_HOSTILE = 25
     FORGERY = 26
+    CAMPAIGN = 27
 
 
 @kernel

@@ -63,6 +63,9 @@ class Stage:
         self.deeds = 0
         """So many of the scenario's deeds (see `outages`) are done."""
         self.limit_ns = scenario.limit_ns
+        self._linger_ns = round(scenario.linger_s * 1e9)
+        self._restless_ns = max((fault.until_ns or 0 for fault in scenario.faults), default=0)
+        """Up to then somebody explored, or something could go wrong."""
         self._faults = LinkFaults.of(scenario, seed)
         self.channel = Channel(
             scenario, seed, site.ground, self._faults.rule if self._faults else None
@@ -164,8 +167,15 @@ class Stage:
     def over(self) -> str | None:
         """Why there is nothing more to do, or None.
 
-        `done`: every robot rests, or has left while others rest. `deserted`: nobody is left.
+        `done`: every robot rests, or has left while others rest, for as long as the scenario has them
+        linger. `deserted`: nobody is left.
         """
+        reason = self._at_rest
+        lingers = self.now_ns < self._restless_ns + self._linger_ns if self._linger_ns else False
+        return None if lingers and reason == "done" else reason
+
+    @property
+    def _at_rest(self) -> str | None:
         robots = self._robots
         if len(self._resting) + len(self.gone) < len(robots) or not robots <= (
             self._resting | self.gone
@@ -180,6 +190,8 @@ class Stage:
         """
         self.now_ns = max(self.now_ns, now_ns)
         self.done_ns = now_ns + 1
+        if self._linger_ns and self._at_rest is None:
+            self._restless_ns = max(self._restless_ns, now_ns)
         sound = [step if _is_sound(step) else step.answered(None) for step in steps]
         sent = [Sent(now_ns, e) for step in sound if step.outputs for e in step.outputs.outbox]
         ruled, out_of_range = self.channel.transmit(sent)

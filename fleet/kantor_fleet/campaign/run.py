@@ -1,0 +1,225 @@
+"""`kantor campaign`: seed by seed until one breaks a rule, and on from where it was left."""
+
+import functools
+import hashlib
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import NamedTuple
+
+from kantor_fleet.campaign.draw import draw, sort_of
+from kantor_fleet.campaign.mission import Follower, Trial
+from kantor_fleet.campaign.shrink import shrink
+from kantor_fleet.campaign.totals import ENOUGH, Totals
+from kantor_fleet.counting import RunsView, table_console
+from kantor_fleet.exits import Exit
+from kantor_fleet.experiment import Case, Outcome, code
+from kantor_fleet.interrupts import Interrupts
+from kantor_fleet.pools import Pool
+from kantor_fleet.progress import printable
+from kantor_fleet.sweep.journal import Journal
+from kantor_fleet.sweep.plan import Key, parse_seeds
+from kantor_fleet.team import play
+from kantor_protocol.scenario import Scenario, to_toml
+from kantor_worldsim.world import Site
+
+RUNS = "campaign.jsonl"
+SMALLEST = "smallest.toml"
+_SHRINK_S = 60.0
+
+
+class Order(NamedTuple):
+    """A campaign, and what is wanted of it."""
+
+    seeds: Sequence[int]
+    folder: Path
+    minutes: float | None = None
+    """Real time after which no further mission begins."""
+
+
+class Broken(NamedTuple):
+    """A mission that breaks a rule."""
+
+    seed: int
+    trial: Trial
+
+
+def numbered(text: str) -> tuple[int, ...]:
+    """Seeds from a number of them, from 0 on, or as `parse_seeds` reads them. Raises SweepError."""
+    return parse_seeds(f"0:{text}" if text.strip().isdecimal() else text)
+
+
+def campaign(order: Order, start: Callable[[Iterable[Case]], Pool]) -> Exit:
+    """Run what is not yet done, up to the first violation; what to exit with.
+
+    start: the pool, whose work is `attempt`. Raises SweepError, OSError.
+    """
+    started_s = time.monotonic()
+    totals = Totals()
+    with Interrupts() as interrupts, Journal(order.folder / RUNS, Trial) as journal:
+        broken = _known(order, journal, totals)
+        if broken is None:
+            broken = _run(order, journal, totals, start, interrupts)
+        for line in totals.lines(time.monotonic() - started_s):
+            print(line)
+        if totals.missions:
+            for table in totals.tables():
+                table_console().print(table)
+    if broken is not None:
+        _report(order.folder, broken)
+        return Exit.NOT_MET
+    return interrupts.code or _verdict(order, totals)
+
+
+def replay(seed: int, folder: Path) -> Exit:
+    """Run the mission of one seed, leave its scenario and its record, and tell what is wrong with it."""
+    scenario = draw(seed)
+    place = folder / f"seed-{seed}"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(parents=True)
+    follower = Follower(scenario, seed, place)
+    play(
+        scenario,
+        seed,
+        Site.of(scenario, seed),
+        [follower.take],
+        stopped=lambda: follower.broken,
+    )
+    result = follower.recording.finish()
+    print(f"seed {seed}: {scenario.summary}; ended: {result.ended}; digest {result.digest[:16]}")
+    complaints = follower.complaints()
+    for complaint in complaints:
+        print(f"  VIOLATION  {complaint}")
+    print(f"  {place}/  ({', '.join(sorted(path.name for path in place.iterdir()))})")
+    print(f"  the same   {_command(place / 'scenario.toml', seed)}")
+    return Exit.NOT_MET if complaints else Exit.DONE
+
+
+def _known(order: Order, journal: Journal, totals: Totals) -> Broken | None:
+    """Count what was run before; the first of it that broke."""
+    first = None
+    for seed in order.seeds:
+        trial = journal.outcomes.get(_key(seed))
+        if isinstance(trial, Trial):
+            totals.add(trial)
+            if trial.violation and first is None:
+                first = Broken(seed, trial)
+    if totals.missions:
+        print(f"{totals.missions} missions are known from {order.folder / RUNS}")
+    return first
+
+
+def _run(
+    order: Order,
+    journal: Journal,
+    totals: Totals,
+    start: Callable[[Iterable[Case]], Pool],
+    interrupts: Interrupts,
+) -> Broken | None:
+    left = [seed for seed in order.seeds if _key(seed) not in journal.outcomes]
+    if not left:
+        return None
+    with RunsView(len(left)) as view, closing(start(_cases(left, order.minutes))) as pool:
+        view.note("starting workers (the first time, kernels are compiled: about half a minute)")
+        for done in pool:
+            if done is not None:
+                case, outcome = done
+                trial = _trial(case, outcome)
+                journal.add(_key(case.seed), trial)
+                totals.add(trial)
+                view.count()
+                if trial.violation:
+                    return Broken(case.seed, trial)
+            if interrupts():
+                break
+    return None
+
+
+def _cases(seeds: Iterable[int], minutes: float | None) -> Iterator[Case]:
+    """Drawn as they are asked for, until the time is up."""
+    until_s = None if minutes is None else time.monotonic() + 60.0 * minutes
+    for seed in seeds:
+        if until_s is not None and time.monotonic() >= until_s:
+            return
+        yield Case(draw(seed), seed)
+
+
+def _trial(case: Case, outcome: Outcome) -> Trial:
+    """The outcome; a worker that died could tell no trial."""
+    if isinstance(outcome, Trial):
+        return outcome
+    return Trial(failed=outcome.failed, sort=sort_of(case.scenario))
+
+
+def _report(folder: Path, broken: Broken) -> None:
+    """Everything that is needed to see it again, and the smallest scenario that shows it."""
+    seed, trial = broken
+    print(f"VIOLATION  seed {seed} ({trial.sort})")
+    for complaint in (trial.violation or "", *trial.complaints[1:]):
+        print(f"  {printable(complaint)}")
+    print(f"  commit     {_commit()}, sources {code()[:16]}")
+    print(f"  replay     kantor campaign --replay {seed}")
+    case = Case(draw(seed), seed)
+    print(f"  shrinking  for up to {_SHRINK_S:.0f} s", flush=True)
+    smallest, still = shrink(case, trial.rule or "", _SHRINK_S)
+    place = folder / f"seed-{seed}"
+    place.mkdir(parents=True, exist_ok=True)
+    (place / SMALLEST).write_text(to_toml(smallest, brief=True), encoding="utf-8")
+    print(
+        f"  smallest   {_size(case.scenario)} -> {_size(smallest)}: {printable(still.violation or 'none')}"
+    )
+    print(f"             {_command(place / SMALLEST, seed)}")
+
+
+def _verdict(order: Order, totals: Totals) -> Exit:
+    if totals.missions < len(order.seeds):
+        print(
+            f"kantor: {totals.missions} of {len(order.seeds)} missions are done; the same command goes on"
+        )
+    if totals.missions < ENOUGH or not totals.missing:
+        return Exit.DONE
+    for name in totals.missing:
+        print(f"kantor: never reached: {name}")
+    return Exit.NOT_MET
+
+
+def _size(scenario: Scenario) -> str:
+    return (
+        f"{scenario.robots.count} robots, {len(scenario.faults)} faults, "
+        f"{scenario.steps_per_robot} steps"
+    )
+
+
+def _command(path: Path, seed: int) -> str:
+    return f"kantor run {path} --exchange in-process --seed {seed}"
+
+
+def _key(seed: int) -> Key:
+    """A mission is known by what draws and judges it, and by its seed."""
+    return Key(f"campaign {_draws()}", code(), seed, exact=False)
+
+
+@functools.cache
+def _draws() -> str:
+    """Digest of this package, which decides what a seed stands for."""
+    digest = hashlib.blake2b(digest_size=8)
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _commit() -> str:
+    """What git says of the sources, if they are under git."""
+    git = shutil.which("git")
+    if git is None:
+        return "unknown"
+    told = subprocess.run(
+        [git, "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return told.stdout.strip() or "unknown"

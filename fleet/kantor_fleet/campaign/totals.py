@@ -1,0 +1,101 @@
+"""What a campaign has run, injected and seen."""
+
+from collections import Counter
+from collections.abc import Iterator
+
+from rich.table import Table
+
+from kantor_fleet.campaign.draw import SORTS
+from kantor_fleet.campaign.mission import Trial
+from kantor_fleet.campaign.sightings import SIGHTS
+from kantor_fleet.campaign.struck import CLASSES, is_of_processes
+
+ENOUGH = 500
+"""Missions after which every class of faults must have struck, and every rare situation been seen."""
+
+
+class Totals:
+    """Sums over missions."""
+
+    def __init__(self) -> None:
+        self.missions = 0
+        self.violations = 0
+        self.steps = 0
+        self.cpu_s = 0.0
+        self.simulated_s = 0.0
+        self.robot_hours = 0.0
+        self.twice = 0
+        self.cuts = 0
+        self.sorts: Counter[str] = Counter()
+        self.planners: Counter[str] = Counter()
+        self.ended: Counter[str] = Counter()
+        self.struck: Counter[str] = Counter()
+        self.seen: Counter[str] = Counter()
+        self.missions_with: Counter[str] = Counter()
+        """Missions in which a class struck, or a situation was seen."""
+
+    def add(self, trial: Trial) -> None:
+        """One more mission."""
+        self.missions += 1
+        self.violations += trial.violation is not None
+        self.steps += trial.steps
+        self.cpu_s += trial.cpu_s
+        self.simulated_s += trial.simulated_s
+        self.robot_hours += trial.simulated_s * trial.robots / 3600.0
+        self.twice += trial.twice
+        self.cuts += trial.cut
+        self.sorts[trial.sort] += 1
+        self.planners[trial.planner + ("*" if trial.centralized else "")] += 1
+        self.ended[trial.ended] += 1
+        self.struck.update(trial.struck)
+        self.seen.update(trial.seen)
+        self.missions_with.update({name for name, times in trial.struck.items() if times})
+        self.missions_with.update(trial.seen.keys())
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Classes of faults that never struck, and situations that were never seen."""
+        return tuple(
+            [name for name in CLASSES if not self.struck[name]]
+            + [name for name in SIGHTS if not self.seen[name]]
+        )
+
+    def lines(self, wall_s: float) -> Iterator[str]:
+        """In words. wall_s: real time of this command."""
+        cpu_s = max(self.cpu_s, 1e-9)
+        on_links = sum(n for name, n in self.struck.items() if not is_of_processes(name))
+        on_processes = sum(n for name, n in self.struck.items() if is_of_processes(name))
+        yield f"{self.missions} missions, {self.violations} with violations; ended: {_listed(self.ended)}"
+        yield f"  sorts      {_listed(self.sorts, tuple(SORTS))}"
+        yield f"  planners   {_listed(self.planners)}  (* with a supervisor)"
+        yield (
+            f"  simulated  {self.robot_hours:.1f} robot-hours, {self.steps} robot-steps; "
+            f"{self.twice} missions executed twice, {self.cuts} journals cut"
+        )
+        yield (
+            f"  faults     {on_links} copies of messages touched, {on_processes} processes hit, "
+            f"{sum(1 for name in CLASSES if self.struck[name])} of {len(CLASSES)} classes"
+        )
+        yield (
+            f"  speed      {self.steps / cpu_s:.0f} robot-steps per CPU second with every check on "
+            f"({cpu_s:.0f} CPU s of all workers, {wall_s:.0f} s here); "
+            f"simulated : CPU time {self.simulated_s / cpu_s:.0f} : 1"
+        )
+
+    def tables(self) -> Iterator[Table]:
+        """Classes of faults, and what was seen."""
+        yield self._table("class of faults", "copies or processes", CLASSES, self.struck)
+        yield self._table("sometimes", "times", SIGHTS, self.seen)
+
+    def _table(self, title: str, unit: str, names: tuple[str, ...], counts: Counter[str]) -> Table:
+        table = Table(title, "missions", unit, box=None, pad_edge=False)
+        for column in table.columns[1:]:
+            column.justify = "right"
+        for name in names:
+            table.add_row(name, str(self.missions_with[name]), str(counts[name]))
+        return table
+
+
+def _listed(counts: Counter[str], order: tuple[str, ...] = ()) -> str:
+    names = [name for name in order if counts[name]] or [name for name, _ in counts.most_common()]
+    return ", ".join(f"{name or 'crashed'} {counts[name]}" for name in names)
