@@ -27,7 +27,7 @@ from kantor_worldsim.maps import Ground, parts
 from kantor_worldsim.reading import Reader
 from kantor_worldsim.records import Act, Batch, Opening, Record
 from kantor_worldsim.stage import Stage
-from kantor_worldsim.survey import KIND, Survey
+from kantor_worldsim.survey import KIND, TOLD, Survey
 from mapping import ROOMS, explored, on_map, site_of
 from strategies import examples
 
@@ -134,7 +134,7 @@ def test_robots_know_what_their_own_charts_show() -> None:
     replica = Replica(1, 2, entries(frame), None, ledger=True, claims=False)
     chart = Chart(frame, 2)
     for place in (0, 1):
-        count = int(survey.books.counts[place, 1])
+        count = survey.books.written.item(place, TOLD)
         replica.store.length[place] = 0
         replica.reserve(count)
         replica.store.logs[place, :count, 0] = survey.books.told[place, :count]
