@@ -1,11 +1,11 @@
 """A rare situation is seen where it happens, and not where it does not."""
 
 import pytest
-from strategies import mission
 
 from kantor_fleet.campaign.mission import attempt
 from kantor_fleet.campaign.sightings import SIGHTS
 from kantor_fleet.experiment import Case
+from strategies import mission
 
 TEAM = ("energy.points=240", "samples.count=60")
 CENTRALIZED = ("coordination=centralized",)
