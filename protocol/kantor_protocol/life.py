@@ -19,6 +19,7 @@ from typing import NamedTuple, Protocol
 
 import msgspec
 
+from kantor_protocol.faults import Disk
 from kantor_protocol.machine import Body, Inputs, Outputs, StateMachine
 from kantor_protocol.messages import decode_inputs, encode
 
@@ -88,6 +89,59 @@ class Life:
         self._given, self._told = inputs, self._machine.step(inputs)
         self.step_count = self._told.step
         return self._told
+
+
+class Memory:
+    """A diary in memory: it outlives its owner, not the process that both are in."""
+
+    def __init__(self) -> None:
+        self._birth: Body | None = None
+        self._inputs: list[bytes] = []
+
+    def read(self) -> Pages | None:
+        """All of it."""
+        return None if self._birth is None else Pages(self._birth, tuple(self._inputs))
+
+    def begin(self, birth: Body) -> None:
+        """Anew."""
+        self._birth, self._inputs = birth, []
+
+    def note(self, inputs: bytes) -> None:
+        """One more page."""
+        self._inputs.append(inputs)
+
+    def damage(self, disk: Disk, step: int) -> None:
+        """Lose all, or the end with the page of the last step that the world knows of."""
+        if self._birth is None or disk == "kept":
+            return
+        del self._inputs[max(0, step - self._birth.step - 1) :]
+        if disk == "lost":
+            self._birth = None
+
+
+class Mortal:
+    """A participant in this process that can be killed; its diary is in memory."""
+
+    def __init__(self, build: Build, body: Body) -> None:
+        """body: what it takes over at time 0."""
+        self._build = build
+        self._diary = Memory()
+        self._life: Life | None = Life(build, self._diary, body)
+
+    def step(self, inputs: Inputs, /) -> Outputs:
+        """See `Life`. Nobody may ask the dead."""
+        assert self._life is not None
+        return self._life.step(inputs)
+
+    def kill(self) -> None:
+        """All is gone but the diary."""
+        self._life = None
+
+    def start(self, body: Body, disk: Disk) -> tuple[int, int]:
+        """Go on with what is left of the diary; the epoch, and the last step."""
+        self._diary.damage(disk, body.step)
+        self._life = Life(self._build, self._diary, body)
+        return self._life.epoch, self._life.step_count
 
 
 def _covers(pages: Pages, body: Body) -> bool:

@@ -168,14 +168,26 @@ def test_unsound_outputs_are_as_if_missing(name: str) -> None:
     assert theatre.stage.acted("r2")
 
 
-def test_inbox_of_an_absent_participant_is_in_the_record() -> None:
-    """What it was given is gone; the record says so."""
+def test_turn_is_asked_again_until_it_is_answered() -> None:
+    """The same inputs, whatever came since; the inbox is on record with the answer."""
     theatre = Theatre()
     theatre.play(r2=outputs(1, (20.0, 0.0), "r1", source="r2"))
-    batch = theatre.play(r1=None)
+    turn = theatre.stage.turn("r1", 2 * PERIOD_NS, skew_ns=7)
+    theatre.stage.settle(2 * PERIOD_NS, [turn])
+    silent = theatre.records[-1]
+    theatre.play(r2=outputs(2, (20.0, 0.0), "r1", source="r2"))
+    again = theatre.stage.turn("r1", 4 * PERIOD_NS)
+    theatre.stage.settle(4 * PERIOD_NS, [again._replace(outputs=outputs(1, (1.0, 0.0)))])
+    answered = theatre.records[-1]
+    assert isinstance(silent, Batch)
+    assert isinstance(answered, Batch)
 
-    assert act_of(batch, "r1").heard == (("r2", 10),)
-    assert theatre.stage.inputs("r1", 3 * PERIOD_NS).inbox == ()
+    assert turn == again
+    assert (silent.absent, answered.absent) == (("r1",), ())
+    assert [act_of(batch, "r1").heard for batch in (silent, answered)] == [(), (("r2", 10),)]
+    assert act_of(answered, "r1").now_ns == act_of(silent, "r1").now_ns == 2 * PERIOD_NS
+    assert turn.inputs.now_ns == 2 * PERIOD_NS + 7
+    assert theatre.stage.unanswered("r1") is None
 
 
 # The end.

@@ -326,6 +326,34 @@ class Channel:
         self._under_way[name] = waiting[arrived:]
         return tuple([item[3] for item in waiting[:arrived]])
 
+    def take_heard(
+        self, name: ParticipantId, heard: Iterable[tuple[ParticipantId, int]]
+    ) -> tuple[Envelope, ...]:
+        """What a participant is known to have taken, by source and sequence, of several copies the first.
+
+        Raises KeyError for what is not under way.
+        """
+        waiting = self._under_way[name]
+        waiting.sort(key=_ARRIVAL)
+        taken = []
+        for reference in heard:
+            places = (i for i, item in enumerate(waiting) if (item[3].source, item[2]) == reference)
+            place = next(places, None)
+            if place is None:
+                raise KeyError(reference)
+            taken.append(waiting.pop(place)[3])
+        return tuple(taken)
+
+    def lose(self, name: ParticipantId, from_ns: int, until_ns: int) -> None:
+        """Throw away what arrives at a participant within a window, its end excluded."""
+        self._under_way[name] = [
+            item for item in self._under_way[name] if not from_ns <= item[0] < until_ns
+        ]
+
+    def clear(self) -> None:
+        """Throw away all that is under way."""
+        self._under_way = {name: [] for name in self._under_way}
+
     def waits(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether something has arrived at a participant that was not taken."""
         return any(item[0] <= now_ns for item in self._under_way[name])

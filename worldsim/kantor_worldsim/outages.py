@@ -3,7 +3,6 @@
 Whoever runs the mission does the deeds: the virtual loop to its crew, the wall's relay to real processes.
 """
 
-from itertools import chain
 from typing import Literal, NamedTuple
 
 from kantor_protocol.faults import Clock, FullDisk, Impostor, Kill, Late, OnProcesses, Pause, Slow
@@ -57,7 +56,10 @@ class Deed(NamedTuple):
 
 
 def deeds_of(scenario: Scenario) -> list[Deed]:
-    """Everything that is done to processes in a mission, in order of time and of the list."""
+    """Everything that is done to processes in a mission, in order of time and of the list.
+
+    At one moment what ends comes before what begins, so that a process can come and go.
+    """
     deeds: list[Deed] = []
     for index, fault in enumerate(scenario.faults):
         if not isinstance(fault, OnProcesses):
@@ -69,20 +71,32 @@ def deeds_of(scenario: Scenario) -> list[Deed]:
                 deeds.append(Deed(fault.from_ns, index, who, first, disk, mid_step))
             if (last := _LAST.get(type(fault))) and fault.until_ns is not None:
                 deeds.append(Deed(fault.until_ns, index, who, last, disk, mid_step))
-    return sorted(deeds, key=lambda deed: deed.at_ns)
+    return sorted(deeds, key=_turn)
+
+
+def _turn(deed: Deed) -> tuple[int, bool]:
+    return deed.at_ns, deed.what in _FIRST.values()
 
 
 class Outages:
     """The process faults of a scenario as time goes by."""
 
-    def __init__(self, scenario: Scenario, after_ns: int = -1) -> None:
-        """after_ns: deeds up to then are done already."""
-        self._deeds = [deed for deed in deeds_of(scenario) if deed.at_ns > after_ns]
+    def __init__(self, scenario: Scenario, after_ns: int = -1, done: int = 0) -> None:
+        """after_ns: deeds up to then are done already; done: so many are."""
+        self._deeds = [deed for deed in deeds_of(scenario)[done:] if deed.at_ns > after_ns]
         self._period_ns = scenario.period_ns
         faults = [fault for fault in scenario.faults if isinstance(fault, OnProcesses)]
         self._faults = {
             name: [fault for fault in faults if name in fault.who]
             for name in (*scenario.roster, WORLD_SIM)
+        }
+        self._stops = {
+            name: [fault for fault in faults if fault.stops and {name, WORLD_SIM} & set(fault.who)]
+            for name in (*scenario.roster, WORLD_SIM)
+        }
+        self._clocks = {
+            name: [fault for fault in self._faults[name] if isinstance(fault, Clock)]
+            for name in self._faults
         }
 
     @property
@@ -96,11 +110,20 @@ class Outages:
         self._deeds = self._deeds[len(due) :]
         return due
 
+    def pop(self) -> Deed:
+        """The next deed, handed out once."""
+        return self._deeds.pop(0)
+
     def idle(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether a participant takes no step now, because of its own or of world-sim's state."""
+        stops = self._stops[name]
+        return bool(stops) and any(self._holds(fault, now_ns) for fault in stops)
+
+    def dies(self, name: ParticipantId, now_ns: int) -> bool:
+        """Whether the next step of a participant is the one in which it dies, or was."""
         return any(
-            self._stops(fault, now_ns)
-            for fault in chain(self._faults[name], self._faults[WORLD_SIM])
+            isinstance(fault, Kill) and fault.mid_step and _within(fault, now_ns)
+            for fault in self._faults[name]
         )
 
     def lost(self, name: ParticipantId, now_ns: int) -> bool:
@@ -111,12 +134,15 @@ class Outages:
         )
 
     def skew_ns(self, name: ParticipantId, now_ns: int) -> int:
-        """How far the clock of a participant is ahead."""
-        clocks = (fault for fault in self._faults[name] if isinstance(fault, Clock))
-        return sum(clock.skew_ns(now_ns) for clock in clocks if _within(clock, now_ns))
+        """How far the clock of a participant is ahead. No clock shows a time before the start."""
+        clocks = self._clocks[name]
+        if not clocks:
+            return 0
+        skew_ns = sum(clock.skew_ns(now_ns) for clock in clocks if _within(clock, now_ns))
+        return max(skew_ns, -now_ns)
 
-    def _stops(self, fault: OnProcesses, now_ns: int) -> bool:
-        if not fault.stops or not _within(fault, now_ns):
+    def _holds(self, fault: OnProcesses, now_ns: int) -> bool:
+        if not _within(fault, now_ns):
             return False
         return not isinstance(fault, Slow) or now_ns // self._period_ns % fault.every != 0
 

@@ -68,9 +68,10 @@ class Act(msgspec.Struct, frozen=True, array_like=True, gc=False):
     now_ns: int
     observation: Observation
     heard: tuple[tuple[ParticipantId, int], ...]
-    """The inbox by reference: source and sequence of each envelope, in order."""
+    """The inbox by reference: source and sequence of each envelope, in order; empty without outputs."""
     outputs: Outputs | None
-    """None: late, crashed or cut off."""
+    """None: late, crashed or cut off. Turn by turn it is asked again until it answers, with the same
+    inputs; now_ns stays when they were first given."""
     ruling: Ruling | None
     skew_ns: int = 0
     """How far the clock that it read was ahead of now_ns."""
@@ -85,7 +86,7 @@ class Batch(msgspec.Struct, frozen=True, array_like=True, tag="batch"):
     out_of_range: int
     """Receivers that an envelope did not reach for range."""
     absent: tuple[ParticipantId, ...] = ()
-    """Participants that were due and gave no outputs."""
+    """Participants that were asked and gave no outputs."""
     tolls: tuple[Toll, ...] = ()
     """What the scenario's faults had to do with the verdicts."""
     injected: tuple[Envelope, ...] = ()
@@ -157,7 +158,7 @@ class Mailbag:
     def inputs(self, act: Act) -> Inputs:
         """What the participant was given. Raises KeyError for an envelope that was never sent."""
         inbox = tuple(self._envelopes[reference] for reference in act.heard)
-        return Inputs(act.now_ns, act.observation, inbox)
+        return Inputs(act.now_ns + act.skew_ns, act.observation, inbox)
 
     def post(self, batch: Batch) -> None:
         """Note what was sent in a batch."""

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from kantor_protocol.grid import FREE, NOWHERE, free_way
 from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import SUPERVISOR, Observation, Outputs, ParticipantId, Pose
+from kantor_protocol.machine import SUPERVISOR, Body, Observation, Outputs, ParticipantId, Pose
 from kantor_protocol.packing import sum_pairs
 from kantor_protocol.scenario import Domain, Scenario, ScenarioError
 from kantor_protocol.walk import Walk
@@ -109,6 +109,7 @@ class _Body:
     def __init__(self, pose: Pose) -> None:
         self.pose = pose
         self.step = 0
+        self.epoch = 0
         self.moved_ns = 0
         self.energy_spent = 0
         self.found: list[int] = []
@@ -156,17 +157,27 @@ class World:
         return {name: self._sense(name) for name in self._bodies if name != SUPERVISOR}
 
     def observe(self, name: ParticipantId) -> Observation:
-        """What the world tells a participant; its finds are told once."""
+        """What the world tells a participant of its last step, or of the start."""
         body = self._bodies[name]
-        found, body.found = tuple(body.found), []
-        return Observation(body.step, body.pose, found, body.scan, body.bumped)
+        return Observation(body.step, body.pose, tuple(body.found), body.scan, body.bumped)
+
+    def body(self, name: ParticipantId) -> Body:
+        """What whoever takes a participant over has to know."""
+        body = self._bodies[name]
+        return Body(body.pose, body.step, body.energy_spent, body.epoch)
+
+    def begin(self, name: ParticipantId, epoch: int) -> bool:
+        """Note which incarnation drives a body from now on; whether it is another."""
+        body = self._bodies[name]
+        other, body.epoch = epoch != body.epoch, epoch
+        return other
 
     def accept(self, name: ParticipantId, now_ns: int, outputs: Outputs) -> Ruling:
         """Judge a step that was made at `now_ns` and let its sound parts happen."""
         body = self._bodies[name]
         if outputs.step <= body.step or now_ns < body.moved_ns:
             return Ruling(pose=body.pose, violations=("step",))
-        body.bumped = False
+        body.bumped, body.found = False, []
         violations = [] if self._moves(name, body, now_ns, outputs.pose) else ["speed"]
         if outputs.spent:
             violations += self._spend(body, outputs.spent)
