@@ -1,21 +1,24 @@
 """A robot as a process."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 from kantor_agent.core import Agent
 from kantor_protocol.credentials import Identity
-from kantor_protocol.machine import StateMachine
+from kantor_protocol.machine import Body, StateMachine
 from kantor_protocol.messages import Mission
 from kantor_protocol.process import participate
 
 
-def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str], None]) -> str:
+def run(
+    connect: str, identity: Identity, patience_s: float, say: Callable[[str], None], state: Path
+) -> str:
     """Be the robot of this identity until the mission is over; why it ended.
 
-    Raises BusError and NotWantedError.
+    state: folder of its diary. Raises BusError, NotWantedError and StateError.
     """
 
-    def build(mission: Mission) -> StateMachine:
+    def build(mission: Mission, _body: Body) -> StateMachine:
         starts_m = mission.starts.open("<f8", 2)
         x_m, y_m = starts_m[mission.scenario.robot_ids.index(identity.user)].tolist()
         if mission.frame is not None:
@@ -25,4 +28,4 @@ def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str]
         samples_m = mission.samples.open("<f8", 2)
         return Agent(identity.user, mission.scenario, mission.seed, (x_m, y_m), samples_m)
 
-    return participate(connect, identity, build, patience_s, say)
+    return participate(connect, identity, build, patience_s, say, state)
