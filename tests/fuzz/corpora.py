@@ -4,6 +4,7 @@ import functools
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from fuzz.mutations import (
 )
 from kantor_fleet.team import play
 from kantor_protocol import credentials
+from kantor_protocol.diary import DiaryFile
 from kantor_protocol.machine import Body, Inputs, Outputs, Pose
 from kantor_protocol.messages import (
     VERSION,
@@ -39,7 +41,7 @@ from kantor_protocol.messages import (
     decode_news,
     encode,
 )
-from kantor_protocol.scenario import Scenario, parse
+from kantor_protocol.scenario import Scenario
 from kantor_worldsim.journal import Journal
 from kantor_worldsim.records import Batch, Incident, Mailbag, Opening, Record, encode_record
 from kantor_worldsim.world import Site
@@ -321,6 +323,30 @@ def journals() -> Mutations:
             journal.close()
             contents.append(path.read_bytes())
     return files(contents)
+
+
+def diary_files() -> Mutations:
+    """Diaries on disk."""
+    given = played("ledger").inputs
+    with tempfile.TemporaryDirectory() as folder:
+        contents = []
+        for pages in (0, 1, 3):
+            path = Path(folder) / str(pages)
+            diary = DiaryFile(path, "run")
+            diary.begin(Body(Pose(1.0, 2.0)))
+            for inputs in given[:pages]:
+                diary.note(encode(inputs))
+            diary.close()
+            contents.append(path.read_bytes())
+    return files(contents)
+
+
+def diaries() -> Framed:
+    """What stands in the frames of a diary: its header, a page, another one, and a torn end."""
+    header = encode(("run", Body(Pose(1.0, 2.0))))
+    pages = [bytes(8) + encode(inputs) for inputs in played("ledger").inputs[:GOODS]]
+    goods = [(header, *pair, b"") for pair in pairwise(pages)]
+    return Framed(goods, MSGPACK_TOKENS, msgpack_spans)
 
 
 def logs_of_runs() -> Mutations:

@@ -40,7 +40,9 @@ class Grammar(NamedTuple):
 def msgpack_spans(content: bytes) -> tuple[Span, ...]:
     """Every value, containers whole, and the numbers in whatever is made of bytes."""
     spans: list[Span] = []
-    _walk(content, 0, spans)
+    at = 0
+    while at < len(content):
+        at = _walk(content, at, spans)
     return tuple(spans)
 
 
@@ -73,10 +75,16 @@ def _head(first: int) -> tuple[str, int | str]:
     if 0xA0 <= first <= 0xBF:
         return "skipped", first & 31
     wide: dict[int, tuple[str, int | str]] = {
-        **{0xC4: ("bytes", "1"), 0xC5: ("bytes", "2"), 0xC6: ("bytes", "4")},
-        **{0xD9: ("skipped", "1"), 0xDA: ("skipped", "2"), 0xDB: ("skipped", "4")},
-        **{0xDC: ("items", "2"), 0xDD: ("items", "4")},
-        **{0xCA: ("skipped", 4), 0xCB: ("skipped", 8)},
+        0xC4: ("bytes", "1"),
+        0xC5: ("bytes", "2"),
+        0xC6: ("bytes", "4"),
+        0xD9: ("skipped", "1"),
+        0xDA: ("skipped", "2"),
+        0xDB: ("skipped", "4"),
+        0xDC: ("items", "2"),
+        0xDD: ("items", "4"),
+        0xCA: ("skipped", 4),
+        0xCB: ("skipped", 8),
         **{0xCC + i: ("skipped", 1 << i) for i in range(4)},
         **{0xD0 + i: ("skipped", 1 << i) for i in range(4)},
     }
@@ -247,13 +255,16 @@ class Mutations:
 class Framed:
     """Inputs of several fields, each mutated for itself; msgpack holds them together."""
 
-    def __init__(self, goods: Sequence[tuple[bytes, ...]], tokens: tuple[bytes, ...]) -> None:
+    def __init__(
+        self,
+        goods: Sequence[tuple[bytes, ...]],
+        tokens: tuple[bytes, ...],
+        spans: Callable[[bytes], tuple[Span, ...]] = number_spans,
+    ) -> None:
         self._goods = goods
         fields = range(len(goods[0]))
         self._fields = [
-            Mutations(
-                Grammar(tuple(Good(good[i], number_spans(good[i])) for good in goods), tokens)
-            )
+            Mutations(Grammar(tuple(Good(good[i], spans(good[i])) for good in goods), tokens))
             for i in fields
         ]
 

@@ -7,7 +7,9 @@ answer that contradicts the input, a kernel that read or wrote beyond its arrays
 
 import functools
 import struct
+import zlib
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, cast
@@ -17,12 +19,13 @@ import numpy as np
 
 from fuzz import corpora
 from fuzz.mutations import unframe
-from grounds import exploration
 from kantor_fleet.experiment import Outcome
 from kantor_fleet.sweep.journal import Journal as RunsJournal
 from kantor_fleet.sweep.plan import Key, SweepError
 from kantor_fleet.team import participant
 from kantor_protocol import credentials, keys
+from kantor_protocol import diary as diary_module
+from kantor_protocol.diary import DiaryFile
 from kantor_protocol.evidence import Evidence, entries
 from kantor_protocol.grid import FREE, OCCUPIED, UNKNOWN
 from kantor_protocol.life import Life, Pages
@@ -87,12 +90,17 @@ def _refuses(error: type[Exception], decode: Callable[[bytes], object]) -> Decod
         try:
             decode(content)
         except error as refusal:
-            assert str(refusal), "a refusal without a word"
-            assert not isinstance(refusal, ScenarioError) or "\n" not in str(refusal), "two lines"
-            return False
+            return not _in_one_line(refusal)
         return True
 
     return attempt
+
+
+def _in_one_line(refusal: Exception) -> bool:
+    text = str(refusal)
+    assert text, "a refusal without a word"
+    assert "\n" not in text or not isinstance(refusal, ScenarioError), "a refusal in two lines"
+    return True
 
 
 # Messages.
@@ -338,7 +346,7 @@ def _parts_of_news(content: bytes) -> bool:
 
 
 def _parts_of_weights(content: bytes) -> bool:
-    sequence, base, size, low, high = reading.parts_of_weights(content, 0, len(content))
+    *_, low, high = reading.parts_of_weights(content, 0, len(content))
     assert high <= len(content)
     assert high < 0 or low <= high
     return high >= 0
@@ -405,6 +413,35 @@ def _life(name: str, me: str) -> Callable[[Path], Decode]:
         return _refuses(RefusedError, live)
 
     return start
+
+
+def _diary(folder: Path, *, framed: bool) -> Decode:
+    """A diary on disk: what is sound from its beginning on is read, and every page can be lived.
+
+    framed: length and checksum of every frame are right, whatever is in it.
+    """
+    path = folder / "diary"
+
+    def read(content: bytes) -> bool:
+        path.write_bytes(_in_frames(unframe(content)) if framed else content)
+        diary = DiaryFile(path, "run")
+        try:
+            pages = diary.read()
+        finally:
+            diary.close()
+        for page in pages.inputs if pages else ():
+            decode_inputs(page)
+        return pages is not None
+
+    return read
+
+
+def _in_frames(parts: tuple[bytes, ...]) -> bytes:
+    content, crc = diary_module._MAGIC, zlib.crc32(diary_module._MAGIC)
+    for part in parts[:-1]:
+        frame, crc = diary_module._frame(part, crc)
+        content += frame
+    return content + parts[-1]
 
 
 # Texts and files.
@@ -507,7 +544,10 @@ def _storm(folder: Path) -> Decode:
 def _key(content: bytes) -> bool:
     text = content.decode("utf-8", "surrogateescape")
     key = keys.parse(text)
-    assert key is None or "/".join(filter(None, key)) in text.replace("//", "/") or True
+    if key is not None:
+        fleet, name, kind, nonce = key
+        again = "/".join(("kantor/v1", fleet, name, kind, *((nonce,) if nonce else ())))
+        assert again in (text, text.removesuffix("/"))
     return key is not None
 
 
@@ -633,6 +673,8 @@ TARGETS: dict[str, Target] = {
     ),
     "life": Target(corpora.inputs, _life("ledger", "r1"), True),
     "life-on-map": Target(corpora.inputs, _life("burgard", "r1"), True),
+    "diary": Target(corpora.diaries, partial(_diary, framed=True)),
+    "diary-file": Target(corpora.diary_files, partial(_diary, framed=False)),
     "scenario-tree": Target(Trees, _same(_refuses(ScenarioError, _tree))),
     "scenario-text": Target(corpora.scenarios, _same(_refuses(ScenarioError, _parse))),
     "chaos-file": Target(corpora.storms, _storm),
