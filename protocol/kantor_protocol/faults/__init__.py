@@ -117,21 +117,44 @@ def complaints(
     for i, fault in enumerate(faults):
         for complaint in fault.complaints(scenario):
             yield f"faults[{i}].{complaint}"
-    known = [(f"the scenario's faults[{i}]", fault) for i, fault in enumerate(earlier)]
-    listed = [*known, *((f"faults[{i}]", fault) for i, fault in enumerate(faults))]
-    stopping = [(at, f) for at, f in listed if isinstance(f, OnProcesses) and f.stops]
-    for (there, one), (here, other) in combinations(stopping, 2):
-        for name in one.who:
-            if name in other.who and _overlap(one, other):
-                yield (
-                    f"{here}.who: {name} has a {kind_of(one)} then already, by {there}; "
-                    f"move one of the two"
-                )
-        for one_, other_, at in ((one, other, here), (other, one, there)):
-            if WORLD_SIM in one_.who and isinstance(other_, Kill) and _overlap(one_, other_):
-                yield f"{at}.from_s: world-sim is down then and can see nobody die; move it"
+    listed = [(f"the scenario's faults[{i}]", fault) for i, fault in enumerate(earlier)]
+    listed += [(f"faults[{i}]", fault) for i, fault in enumerate(faults)]
+    of_processes = [(at, fault) for at, fault in listed if isinstance(fault, OnProcesses)]
+    for (there, one), (here, other) in combinations(of_processes, 2):
+        yield from _overlapping(there, one, here, other)
+        for first, second in ((one, other), (other, one)):
+            yield from _unseen(there, first, here, second)
+            yield from _let_in(there, first, here, second)
 
 
-def _overlap(one: Fault, other: Fault) -> bool:
-    first, second = sorted((one, other), key=lambda fault: fault.from_ns)
-    return first.until_ns is None or second.from_ns < first.until_ns
+def _overlapping(there: str, one: OnProcesses, here: str, other: OnProcesses) -> Iterable[str]:
+    """Two faults that both stop a process; the second in the list is blamed."""
+    if not (one.stops and other.stops and (one.holds(other.from_ns) or other.holds(one.from_ns))):
+        return
+    for name in one.who:
+        if name in other.who:
+            yield (
+                f"{here}.who: {name} has a {kind_of(one)} then already, by {there}; "
+                f"move one of the two"
+            )
+
+
+def _unseen(there: str, outage: OnProcesses, here: str, kill: OnProcesses) -> Iterable[str]:
+    """Somebody who dies, or comes back, while world-sim is down."""
+    if WORLD_SIM not in outage.who or WORLD_SIM in kill.who or not isinstance(kill, Kill):
+        return
+    for key, moment_ns in (("from_s", kill.from_ns), ("until_s", kill.until_ns)):
+        if moment_ns is not None and outage.holds(moment_ns):
+            yield f"{here}: world-sim is down at {key} of a kill, see {there}; move it"
+
+
+def _let_in(there: str, impostor: OnProcesses, here: str, absence: OnProcesses) -> Iterable[str]:
+    """An impostor of somebody who is away."""
+    if not isinstance(impostor, Impostor) or not isinstance(absence, (Kill, Late)):
+        return
+    for name in impostor.who:
+        if name in absence.who and absence.holds(impostor.from_ns):
+            yield (
+                f"{here}: {name} is away when its impostor comes, who would be let in, "
+                f"see {there}; move it"
+            )

@@ -35,6 +35,10 @@ class Fault(Table, frozen=True, kw_only=True, tag_field="kind"):
         """When it is over, or None."""
         return None if self.until_s is None else round(self.until_s * 1e9)
 
+    def holds(self, now_ns: int) -> bool:
+        """Whether a time is in its window."""
+        return self.from_ns <= now_ns and (self.until_ns is None or now_ns < self.until_ns)
+
     def complaints(self, scenario: "Scenario") -> Iterable[str]:
         """Why it cannot apply to a scenario: `key: what, and the remedy`."""
         if self.until_ns is not None and self.until_ns <= self.from_ns:
