@@ -20,6 +20,7 @@ from fuzz.mutations import (
     Span,
     even_spans,
     msgpack_spans,
+    number_spans,
     pick,
     text_spans,
 )
@@ -95,6 +96,8 @@ DENSITY: dict[str, tuple[str, ...]] = {
     "ledger": (),
     "min": ("merge=min", "claims=false"),
     "centralized": ("coordination=centralized",),
+    "reborn": ('faults=[{kind="kill", who=["r1"], from_s=0.8, until_s=1.2, disk="lost"}]',),
+    "hostile": ('faults=[{kind="hostile", probability=0.5}]',),
     "spectral": ("planner=spectral", "planner.modes=3"),
 }
 MAP: dict[str, tuple[str, ...]] = {
@@ -154,7 +157,11 @@ def news_fields(name: str) -> Framed:
     goods = [
         (bytes((i % 3 + 1,)), n.have, n.logs, n.claims, n.registers) for i, n in enumerate(told)
     ]
-    return Framed(goods, LEB_TOKENS)
+    # Whoever knows of reborn participants has twice as many numbers.
+    reborn = [
+        (slot, have + bytes(len(number_spans(have))), *rest) for slot, have, *rest in goods[::4]
+    ]
+    return Framed([*goods, *reborn], LEB_TOKENS)
 
 
 def packed() -> Framed:

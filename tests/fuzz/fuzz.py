@@ -24,14 +24,14 @@ from typing import Any, NamedTuple
 if __name__ == "__main__":
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
-from fuzz.targets import TARGETS  # noqa: E402  the path comes first
+from fuzz.targets import TARGETS
 
 BATCH = 500
 """Inputs that one state of a decoder sees."""
 _WARM_BATCHES = 20
 """By then whatever is compiled, imported or kept once is there."""
-_STUCK_S = 60.0
-"""No input takes so long, however busy the machine is."""
+_STUCK_S = 300.0
+"""No input takes so long, however busy the machine is, and kernels to be compiled."""
 _ROOM_BYTES = 1 << 30
 """What a decoder may take at any time beyond what it begins with."""
 _GROWTH_BYTES = 32 << 20
@@ -172,6 +172,7 @@ def fuzz_all(
     try:
         while left or running:
             while left and len(running) < jobs:
+                TARGETS[left[-1]].inputs()  # missions are played once, for all that come after
                 running.append(_Process(left.pop(), seed, inputs, first))
             for process in list(running):
                 if (tally := process.look()) is not None:

@@ -52,6 +52,7 @@ from kantor_protocol.scenario import ScenarioError, from_tree, parse, to_toml, t
 from kantor_protocol.weights import Units, WeightsSubscriber
 from kantor_worldsim import density, maps, reading
 from kantor_worldsim.journal import read as read_journal
+from kantor_worldsim.reading import ACTS, ALL_HEARD, ALL_SENT, INJECTED, PAIRS, VERDICTS
 from kantor_worldsim.records import decode_record, encode_record
 from kantor_worldsim.world import units_of
 from mapping import on_map
@@ -206,7 +207,7 @@ def _learning(name: str, me: str = "r1", samples: int | None = None) -> Callable
 
         def take(content: bytes) -> bool:
             source, have, logs, claims, written = unframe(content)
-            place = source[0] % len(scenario.roster) if source else 0
+            place = source[0] % (3 * len(scenario.roster)) if source else 0
             before = _state(replica)
             taken = replica.learn(place, have, logs, claims, written)
             if not taken:
@@ -246,20 +247,20 @@ def _is_sound(replica: Replica) -> None:
 
 
 def _registers(_folder: Path) -> Decode:
-    replica = replica_of(
-        "r1", mission(*corpora.SHORT, *corpora.DENSITY["spectral"]), Units.of(30, 12), 12
-    )
-    registers = replica.registers
+    """Registers are read and learnt by themselves; what is sound can be read."""
+    scenario = mission(*corpora.SHORT, *corpora.DENSITY["spectral"])
+    registers = replica_of("r1", scenario, Units.of(30, 12), 12).registers
+    width = registers.values.shape[1]
 
     def take(content: bytes) -> bool:
         source, written = unframe(content)
-        sound = registers.sound(written)
+        sound = registers.sound(written, 3)
         if sound:
-            registers.learn(source[0] % 3 if source else 0, written)
+            registers.learn(source[0] % 3 if source else 0, written, 3)
             assert (registers.values.sum(axis=0) == registers.total).all()
             assert np.abs(registers.values).max() <= NUMBER_MAX
         for origin in range(3):
-            found = read_register(written, 3, registers.values.shape[1], origin)
+            found = read_register(written, 3, width, origin)
             assert found is not None or not sound, "a sound register that cannot be read"
         return sound
 
@@ -322,9 +323,8 @@ def _reader(_folder: Path) -> Decode:
         at = reading._read_batch(content, *tables._tables, tables._pose_bits, 3, 3, 12)
         assert at <= len(content), "read beyond the end"
         if at >= 0:
-            for table, rows in zip(
-                tables._tables[1:], sizes[[0, 0, 2, 3, 1, 4]].tolist(), strict=True
-            ):
+            counts = sizes[[ACTS, ACTS, ALL_HEARD, ALL_SENT, VERDICTS, PAIRS, INJECTED]].tolist()
+            for table, rows in zip(tables._tables[1:], counts, strict=True):
                 assert 0 <= rows <= table.shape[0]
         return at >= 0
 
@@ -332,8 +332,7 @@ def _reader(_folder: Path) -> Decode:
 
 
 def _parts_of_news(content: bytes) -> bool:
-    *_, end = reading.parts_of_news(content, 0, len(content))
-    have, have_end, logs, _ = reading.parts_of_news(content, 0, len(content))
+    epoch, have, have_end, logs, end = reading.parts_of_news(content, 0, len(content))
     assert end <= len(content)
     try:
         news = decode_news(content)
@@ -341,6 +340,7 @@ def _parts_of_news(content: bytes) -> bool:
         assert end < 0, "a referee takes for news what robots refuse"
         return False
     if end >= 0:
+        assert epoch == news.epoch
         assert (content[have:have_end], content[logs:end]) == (news.have, news.logs)
     return end >= 0
 
@@ -657,6 +657,7 @@ TARGETS: dict[str, Target] = {
     ),
     "learn-registers": Target(lambda: corpora.news_fields("spectral"), _learning("spectral"), True),
     "learn-map": Target(lambda: corpora.news_fields("market"), _learning("market"), True),
+    "learn-reborn": Target(lambda: corpora.news_fields("reborn"), _learning("reborn"), True),
     "registers": Target(_register_inputs, _registers, True),
     "read-logs": Target(lambda: corpora.news_fields("ledger"), _same(_reading_logs), True),
     "evidence": Target(corpora.scans, _evidence, True),
@@ -664,6 +665,7 @@ TARGETS: dict[str, Target] = {
     "parts-of-news": Target(corpora.news, _same(_parts_of_news), True),
     "parts-of-weights": Target(corpora.weights, _same(_parts_of_weights), True),
     "robot": Target(lambda: corpora.news("ledger"), _machine("ledger", "r1"), True),
+    "reborn": Target(lambda: corpora.news("reborn"), _machine("reborn", "r2"), True),
     "supervisor": Target(
         lambda: corpora.news("centralized"), _machine("centralized", "supervisor"), True
     ),
