@@ -281,6 +281,7 @@ def reproduce(
             "kme-fig7",
             "kme-fig8",
             "kme-all",
+            "resilience",
         ],
         tyro.conf.Positional,
     ] = "all",
