@@ -8,7 +8,7 @@ import pytest
 
 from kantor_agent.planners import PLANNERS
 from kantor_agent.planners.allocators import ALLOCATORS
-from kantor_fleet.catalog import find
+from kantor_fleet.catalog import find, path_of
 from kantor_fleet.team import play
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.metrics import Result
@@ -52,6 +52,17 @@ def test_the_planner_on_maps_in_the_readme_explores(monkeypatch: pytest.MonkeyPa
         assert (result.ended, result.complaints) == ("done", ())
         assert result.map is not None
         assert result.map.explored == 1.0
+
+
+def test_the_storm_in_the_readme_is_the_packaged_one() -> None:
+    """Thirty lines at most; a partition from 200 to 500 s, a robot and the supervisor killed, and it ends."""
+    text = path_of("storm").read_text(encoding="utf-8")
+    assert f"```toml\n{text}```" in README
+    assert len(text.splitlines()) <= 30
+
+    result = played(find("storm"))
+    assert (result.ended, result.complaints, result.restarts) == ("done", (), 2)
+    assert result.finished_tick is not None
 
 
 def test_every_file_that_the_readme_links_exists() -> None:
