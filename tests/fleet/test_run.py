@@ -267,5 +267,5 @@ def test_scenarios_are_listed_and_shown(kantor: "Kantor") -> None:
     (kantor.folder / "mine.toml").write_text(shown)
 
     assert listed.splitlines()[0].startswith("fleet ")
-    assert len(listed.splitlines()) == 11
+    assert len(listed.splitlines()) == 12
     assert in_process(kantor, "mine.toml", *SHORT).code == 1

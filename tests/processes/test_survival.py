@@ -357,7 +357,7 @@ def test_what_cannot_be_is_refused_with_a_line(kantor: "Kantor") -> None:
     assert kantor("run", "paper-single", "--exchange", "in-process", "--set", "limit_s=5").code == 1
     over = kantor.runs()[-1]
     for folder, complaint in (
-        ("nowhere", "no folder that a run left"),
+        ("nowhere", "no run to go on with"),
         (over, "its mission is over (limit)"),
     ):
         refused = kantor("worldsim", "--resume", folder)

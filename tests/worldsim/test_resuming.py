@@ -166,13 +166,13 @@ def test_an_ending_without_a_result_is_reached_again(
 def test_what_is_no_run_is_refused_with_a_line(
     cut_short: Cut, records: tuple[Record, ...], tmp_path: Path
 ) -> None:
-    with pytest.raises(ResumeError, match="no folder that a run left"):
+    with pytest.raises(ResumeError, match="no run to go on with"):
         Past.of(tmp_path / "nowhere")
     cut_short(tmp_path, records[:3])
     manifest = (tmp_path / MANIFEST).read_bytes()
     for broken, complaint in (
-        (b"{", "no folder that a run left"),
-        (b"\xff\xfe", "no folder that a run left"),
+        (b"{", "no run to go on with"),
+        (b"\xff\xfe", "no run to go on with"),
         (b"[]", "of another version"),
         (b'{"exchange": "wall"}', "of another version"),
     ):

@@ -90,7 +90,8 @@ class Past(NamedTuple):
             records = [record for _, record in read(folder / JOURNAL)]
             terms = msgspec.convert(manifest, Terms)
         except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            raise ResumeError(f"{folder}: no folder that a run left ({error})") from None
+            what = error.strerror if isinstance(error, OSError) else str(error)
+            raise ResumeError(f"{folder}: no run to go on with ({what}); give its folder") from None
         except msgspec.ValidationError as error:
             raise ResumeError(f"{folder / MANIFEST}: of another version: {error}") from None
         if not records or not isinstance(records[0], Opening):
