@@ -1,6 +1,7 @@
 """A robot as a process."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 from kantor_agent.core import Agent
 from kantor_protocol.credentials import Identity
@@ -9,10 +10,12 @@ from kantor_protocol.messages import Mission
 from kantor_protocol.process import participate
 
 
-def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str], None]) -> str:
+def run(
+    connect: str, identity: Identity, patience_s: float, say: Callable[[str], None], state: Path
+) -> str:
     """Be the robot of this identity until the mission is over; why it ended.
 
-    Raises BusError and NotWantedError.
+    state: folder of its diary. Raises BusError, NotWantedError and StateError.
     """
 
     def build(mission: Mission, body: Body) -> StateMachine:
@@ -23,4 +26,4 @@ def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str]
             return Mapper(me, scenario, seed, body, mission.frame)
         return Agent(me, scenario, seed, body, mission.samples.open("<f8", 2))
 
-    return participate(connect, identity, build, patience_s, say)
+    return participate(connect, identity, build, patience_s, say, state)

@@ -64,6 +64,7 @@ def worldsim(
     out: Path = Path("runs"),
     exact: bool = False,
     chaos: Path | None = None,
+    resume: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
 ) -> int:
     """World-sim by hand: host the bus, wait for the roster, run the mission, record it.
@@ -80,11 +81,17 @@ def worldsim(
         out: Where the run folder is made.
         exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
         chaos: A TOML file of [[faults]] that are added to the scenario's own.
+        resume: The folder of a run that was cut short: go on with its mission. Participants that wait
+            for it come back by themselves; give the same --listen, --credentials and --fleet.
         set: Override a key of the scenario.
     """
-    from kantor_fleet.by_hand import host_by_hand  # noqa: PLC0415
+    from kantor_fleet.by_hand import host_by_hand, resume_by_hand  # noqa: PLC0415
     from kantor_fleet.catalog import find  # noqa: PLC0415
 
+    if resume is not None:
+        if set or chaos is not None:
+            fail(Exit.USAGE, "--resume: the run has its scenario; leave out --set and --chaos")
+        return resume_by_hand(resume, listen, credentials, fleet)
     _check_seed(seed)
     _check_speed(speed)
     mission = find(scenario, set, chaos)
@@ -99,6 +106,7 @@ def agent(
     /,
     connect: str = "tcp/127.0.0.1:7447",
     credentials: Path = Path("credentials"),
+    state: Path = Path("state"),
     patience: float = 60.0,
 ) -> int:
     """A robot by hand. It needs only an endpoint, its id and its credentials.
@@ -107,6 +115,7 @@ def agent(
         id: Which robot, such as r1.
         connect: World-sim's endpoint, tcp/HOST:PORT.
         credentials: The credentials folder, or this robot's file.
+        state: Folder of its diary; started again with it, the robot goes on where it was.
         patience: Seconds to wait for world-sim to come up.
     """
     from kantor_agent.process import run as run_agent  # noqa: PLC0415
@@ -114,12 +123,13 @@ def agent(
 
     if id == "supervisor":
         fail(Exit.USAGE, "supervisor: not a robot; use `kantor supervisor`")
-    return participate_by_hand(run_agent, id, connect, credentials, patience)
+    return participate_by_hand(run_agent, id, connect, credentials, patience, state)
 
 
 def supervisor(
     connect: str = "tcp/127.0.0.1:7447",
     credentials: Path = Path("credentials"),
+    state: Path = Path("state"),
     patience: float = 60.0,
 ) -> int:
     """The supervisor by hand, for centralized scenarios.
@@ -127,12 +137,13 @@ def supervisor(
     Args:
         connect: World-sim's endpoint, tcp/HOST:PORT.
         credentials: The credentials folder, or the supervisor's file.
+        state: Folder of its diary.
         patience: Seconds to wait for world-sim to come up.
     """
     from kantor_fleet.by_hand import participate_by_hand  # noqa: PLC0415
     from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
 
-    return participate_by_hand(run_supervisor, "supervisor", connect, credentials, patience)
+    return participate_by_hand(run_supervisor, "supervisor", connect, credentials, patience, state)
 
 
 def sweep(

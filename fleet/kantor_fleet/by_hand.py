@@ -2,16 +2,21 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from kantor_fleet.exits import Exit, fail, warn
 from kantor_fleet.interrupts import Interrupts
 from kantor_protocol import bus, credentials
 from kantor_protocol.credentials import FLEET_PATTERN, Identity
 from kantor_protocol.machine import ParticipantId
-from kantor_protocol.process import NotWantedError
+from kantor_protocol.process import NotWantedError, StateError
 from kantor_protocol.scenario import Scenario
 
-RunParticipant = Callable[[str, Identity, float, Callable[[str], None]], str]
+if TYPE_CHECKING:
+    from kantor_worldsim.process import Plan
+    from kantor_worldsim.recording import Past, Recording
+
+RunParticipant = Callable[[str, Identity, float, Callable[[str], None], Path], str]
 
 
 def host_by_hand(
@@ -26,40 +31,93 @@ def host_by_hand(
     out: Path,
     exact_every: int | None,
 ) -> Exit:
-    """World-sim in this terminal. Raises ScenarioError, BusError, OSError."""
-    from kantor_fleet.preload import warm_up  # noqa: PLC0415  robots by hand do not need these
-    from kantor_fleet.progress import ProgressView  # noqa: PLC0415
-    from kantor_fleet.run import conclude, read_result, verdict  # noqa: PLC0415
-    from kantor_worldsim.process import Plan, run  # noqa: PLC0415
+    """World-sim in this terminal, for a new run. Raises ScenarioError, BusError, OSError."""
+    from kantor_worldsim.process import Plan  # noqa: PLC0415  robots by hand do not need these
     from kantor_worldsim.recording import Recording, folder_for  # noqa: PLC0415
     from kantor_worldsim.world import Site  # noqa: PLC0415
 
-    if not FLEET_PATTERN.fullmatch(fleet):
-        fail(Exit.USAGE, f"--fleet {fleet}: use lower-case letters, digits and dashes")
-    bus.check_endpoint(listen)
+    _check_faults(scenario, exchange)
     site = Site.of(scenario, seed)
     warn(site.warnings)
     plan = Plan(scenario, seed, site, exchange, speed, start_after_s)
+
+    def record() -> tuple[Path, "Recording"]:
+        folder = folder_for(scenario, seed, out)
+        return folder, Recording(scenario, seed, exchange, folder, exact_every, speed=speed)
+
+    return _host(plan, listen, secrets, fleet, record)
+
+
+def resume_by_hand(folder: Path, listen: str, secrets: Path, fleet: str) -> Exit:
+    """World-sim in this terminal, for a run that was cut short. Raises BusError, OSError."""
+    from kantor_worldsim.process import Plan  # noqa: PLC0415
+    from kantor_worldsim.recording import Past, Recording, ResumeError  # noqa: PLC0415
+
+    try:
+        past = Past.of(folder)
+    except ResumeError as error:
+        fail(Exit.USAGE, str(error))
+    terms, opening = past.terms, past.opening
+    scenario, seed, exchange = opening.scenario, opening.seed, terms.exchange
+    _check_faults(scenario, exchange)
+    plan = Plan(scenario, seed, opening.site, exchange, terms.speed)
+
+    def record() -> tuple[Path, "Recording"]:
+        every = terms.exact_every
+        return folder, Recording(scenario, seed, exchange, folder, every, past=past)
+
+    return _host(plan, listen, secrets, fleet, record, past)
+
+
+def _check_faults(scenario: Scenario, exchange: str) -> None:
+    from kantor_worldsim.process import needs_hands  # noqa: PLC0415
+
+    if (fault := needs_hands(scenario, exchange)) is not None:
+        fail(Exit.USAGE, f"{fault}: nobody here can do that to processes; use `kantor run`")
+
+
+def _host(
+    plan: "Plan",
+    listen: str,
+    secrets: Path,
+    fleet: str,
+    record: "Callable[[], tuple[Path, Recording]]",
+    past: "Past | None" = None,
+) -> Exit:
+    """Host a mission. record: opens the run folder, once the bus is there."""
+    from kantor_fleet.preload import warm_up  # noqa: PLC0415  robots by hand do not need these
+    from kantor_fleet.progress import ProgressView  # noqa: PLC0415
+    from kantor_fleet.run import conclude, read_result, verdict  # noqa: PLC0415
+    from kantor_worldsim.process import run  # noqa: PLC0415
+
+    scenario = plan.scenario
+    if not FLEET_PATTERN.fullmatch(fleet):
+        fail(Exit.USAGE, f"--fleet {fleet}: use lower-case letters, digits and dashes")
+    bus.check_endpoint(listen)
     identities = credentials.issue(secrets, fleet, scenario.roster)
     bus.init_log()
     with Interrupts() as interrupts, ProgressView(scenario.name) as view:
         warm_up()
         users = credentials.users_file(secrets)
         with bus.Host(identities[credentials.HOST], listen, users, scenario.roster) as host:
-            folder = folder_for(scenario, seed, out)
+            folder, recording = record()
             view.note(f"world-sim of fleet {fleet} at {listen}, credentials in {secrets}/")
             for name in scenario.roster:
                 verb = name if name == "supervisor" else f"agent {name}"
                 view.note(f"  kantor {verb} --connect {listen} --credentials {secrets}")
-            recording = Recording(scenario, seed, exchange, folder, exact_every)
-            run(host, plan, recording, interrupts, view.show)
+            run(host, plan, recording, interrupts, view.show, past)
     conclude(folder)
     result = read_result(folder)
     return interrupts.code or (verdict(result) if result is not None else Exit.PROCESS_FAILED)
 
 
 def participate_by_hand(
-    run: RunParticipant, name: ParticipantId, connect: str, place: Path, patience_s: float
+    run: RunParticipant,
+    name: ParticipantId,
+    connect: str,
+    place: Path,
+    patience_s: float,
+    state: Path,
 ) -> Exit:
     """A participant in this terminal. Raises BusError, CredentialsError."""
     bus.check_endpoint(connect)
@@ -73,8 +131,8 @@ def participate_by_hand(
         print(line, flush=True)
 
     try:
-        reason = run(connect, identity, patience_s, say)
-    except NotWantedError as error:
+        reason = run(connect, identity, patience_s, say, state)
+    except (NotWantedError, StateError) as error:
         fail(Exit.USAGE, str(error))
     say(f"{name}: mission over: {reason}")
     return Exit.DONE

@@ -211,6 +211,8 @@ def _run_processes(order: Order, interrupts: Interrupts) -> Exit:
                         view.show(message)
                     for name, failure in fleet.newly_failed():
                         view.note(f"{name} ended with {_told(failure)}; the others go on")
+                    if (ended := fleet.revive()) is not None:
+                        view.note(f"world-sim ended with {ended}; it goes on from its record")
                     if interrupts() and not asked:
                         asked = True
                         view.note("ending the mission")

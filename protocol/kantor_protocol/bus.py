@@ -5,7 +5,11 @@ control makes world-sim the only way from one participant to another: a particip
 keys and read its own `rx`, nothing else. The traps that the settings below avoid are in
 protocol/README.md.
 
-A callback only enqueues; all work is done by whoever calls `next`.
+A callback only enqueues; all work is done by whoever calls `next`. No queue grows without bound: what a
+slow reader has no room for is lost, as on any link.
+
+A client connects again by itself when world-sim comes back: its token and its subscription are declared
+anew, so that world-sim sees it join with the nonce that it had.
 """
 
 import contextlib
@@ -27,6 +31,8 @@ from kantor_protocol.messages import MESSAGE_BYTES_MAX
 
 LEASE_MS = 1000
 """A frozen or cut-off process is noticed after this."""
+QUEUE_MAX = 16_384
+"""Messages that wait for a reader."""
 _HANDSHAKE_S = 3.0
 _CLOSE_S = 5.0
 
@@ -137,7 +143,7 @@ class Host:
 
     def _on_message(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
-        if key is not None:
+        if key is not None and self._events.qsize() < QUEUE_MAX:
             self._events.put(Heard(key.name, sample.payload.to_bytes()))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
@@ -156,6 +162,8 @@ class Line:
         self.nonce = nonce
         self._session = session
         self._received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._block = zenoh.CongestionControl.BLOCK
+        self._drop = zenoh.CongestionControl.DROP
         self._tx, self._pose = keys.tx(fleet, name), keys.pose(fleet, name)
         self._weights = keys.weights(fleet, name)
         self._held: list[Any] = [
@@ -170,11 +178,10 @@ class Line:
         except queue.Empty:
             return None
 
-    def send(self, payload: bytes) -> None:
-        """Put on the own `tx`."""
-        self._session.put(
-            self._tx, payload, congestion_control=zenoh.CongestionControl.BLOCK, express=True
-        )
+    def send(self, payload: bytes, *, patiently: bool) -> None:
+        """Put on the own `tx`. patiently: wait for a full queue rather than drop."""
+        congestion = self._block if patiently else self._drop
+        self._session.put(self._tx, payload, congestion_control=congestion, express=True)
 
     def publish_pose(self, payload: bytes) -> None:
         """Tell observers the own pose."""
@@ -189,7 +196,8 @@ class Line:
         _close(self._session, self._held)
 
     def _on_message(self, sample: zenoh.Sample) -> None:
-        self._received.put(sample.payload.to_bytes())
+        if self._received.qsize() < QUEUE_MAX:
+            self._received.put(sample.payload.to_bytes())
 
 
 class Watch:
@@ -213,7 +221,8 @@ class Watch:
         _close(self._session, self._held)
 
     def _on_message(self, sample: zenoh.Sample) -> None:
-        self._received.put((str(sample.key_expr), sample.payload.to_bytes()))
+        if self._received.qsize() < QUEUE_MAX:
+            self._received.put((str(sample.key_expr), sample.payload.to_bytes()))
 
 
 @contextlib.contextmanager

@@ -1,26 +1,29 @@
 """The shell of a participant's process: it turns messages into steps and steps into messages.
 
-It makes no decision. In the lockstep exchange it steps when world-sim says so; in the wall exchange it
-steps when its own clock says so, with whatever has arrived by then, and waits for nobody.
+It makes no decision. In the lockstep exchange it steps when world-sim says so. In the wall exchange it
+steps when its own clock says so, with whatever has arrived by then, and waits for nobody; but only from where
+the world has accepted its last step. Until then it *holds*: it makes no move and spends nothing (the
+lost-link failsafe, which needs no peer), and says again now and then what it did last.
+
+It outlives its process (`life.py`): what it is given is noted in its diary ahead of each step. What cannot be
+noted is not done; it holds until it can be.
 """
 
+import contextlib
 import secrets
+import tempfile
 import time
+from collections import deque
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
 from kantor_protocol import bus
 from kantor_protocol.clock import clocks
 from kantor_protocol.credentials import Identity
-from kantor_protocol.machine import (
-    SUPERVISOR,
-    Body,
-    Envelope,
-    Inputs,
-    Outputs,
-    ParticipantId,
-    Pose,
-    StateMachine,
-)
+from kantor_protocol.diary import DiaryFile
+from kantor_protocol.life import Life
+from kantor_protocol.machine import SUPERVISOR, Body, Envelope, Inputs, Outputs, Pose, StateMachine
 from kantor_protocol.messages import (
     VERSION,
     Go,
@@ -38,52 +41,96 @@ from kantor_protocol.messages import (
 )
 
 Build = Callable[[Mission, Body], StateMachine]
-"""Makes the machine for a mission, as it is when it takes a body over."""
+"""Makes the machine for a mission as it is when it takes a body over."""
+
+AGAIN_S = 0.2
+"""After so long, what has not been heard is said again, and what could not be noted is tried again."""
+INBOX_MAX = 4096
+"""Envelopes that wait for a step of a participant that holds; the oldest make room."""
 
 
 class NotWantedError(RuntimeError):
     """World-sim does not let this process take part; the message says why."""
 
 
+class StateError(RuntimeError):
+    """There is nowhere to keep a diary; the message is one line with the remedy."""
+
+
 def participate(
-    connect: str, identity: Identity, build: Build, patience_s: float, say: Callable[[str], None]
+    connect: str,
+    identity: Identity,
+    build: Build,
+    patience_s: float,
+    say: Callable[[str], None],
+    state: Path,
 ) -> str:
     """Take part in missions until world-sim says stop; the reason it gave.
 
-    say: takes one line of news for a person. Raises BusError, NotWantedError.
+    say: takes one line of news for a person. state: folder of the diary. Raises BusError, NotWantedError,
+    StateError.
     """
+    _check_writable(state)
     nonce = secrets.token_hex(8)
     with bus.line(connect, identity, nonce, patience_s) as line:
         say(f"{identity.user}: on the bus at {connect}, waiting for a mission")
-        return _Participant(line, identity, build, say).run()
+        return _Participant(line, identity, build, say, state).run()
+
+
+def _check_writable(state: Path) -> None:
+    try:
+        state.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=state).close()
+    except OSError as error:
+        reason = error.strerror or error
+        raise StateError(
+            f"{state}: no diary can be kept there ({reason}); choose another --state"
+        ) from None
 
 
 class _Participant:
     def __init__(
-        self, line: bus.Line, identity: Identity, build: Build, say: Callable[[str], None]
+        self,
+        line: bus.Line,
+        identity: Identity,
+        build: Build,
+        say: Callable[[str], None],
+        state: Path,
     ) -> None:
         self._line = line
         self._me = identity.user
         self._build = build
         self._say = say
-        self._machine: StateMachine | None = None
+        self._path = state / f"{identity.user}.diary"
         self._mission: Mission | None = None
+        self._diary: DiaryFile | None = None
+        self._life: Life | None = None
+        self._owed: Inputs | None = None
+        """Lockstep: the turn that has not been answered."""
+        self._wall: _Wall | None = None
+        self._cannot = False
+        """The diary could not be written when that was last tried."""
         self.refused = 0
         """Messages from world-sim that could not be read."""
 
     def run(self) -> str:
         while True:
-            message = self._next(None)
+            message = self._next()
             if isinstance(message, Stop):
                 return message.reason
-            if isinstance(message, Go) and message.nonce == self._line.nonce:
-                reason = self._free_run(message)
-                if reason is not None:
-                    return reason
-            elif message is not None:
+            if message is not None:
                 self._take(message)
+            try:
+                self._act()
+            except OSError as error:
+                self._hold(error)
 
-    def _next(self, timeout_s: float | None) -> ToParticipant | None:
+    def _next(self) -> ToParticipant | None:
+        timeout_s = AGAIN_S if self._cannot else None
+        if self._wall is not None:
+            until_due_s = self._wall.until_due_s()
+            timeout_s = until_due_s if timeout_s is None else min(timeout_s, until_due_s)
+            timeout_s = min(timeout_s, AGAIN_S) if self._unheard else timeout_s
         payload = self._line.next(timeout_s)
         if payload is None:
             return None
@@ -94,72 +141,194 @@ class _Participant:
             return None
 
     def _take(self, message: ToParticipant) -> None:
-        if isinstance(message, Mission) and message.nonce == self._line.nonce:
-            self._prepare(message)
-        elif isinstance(message, Refusal) and message.nonce == self._line.nonce:
+        if isinstance(message, Turn):
+            if self._wall is not None:
+                self._wall.take(message.inputs)
+            else:
+                self._owed = message.inputs
+        elif isinstance(message, Stop) or message.nonce != self._line.nonce:
+            return
+        elif isinstance(message, Refusal):
             raise NotWantedError(f"{self._me}: {message.reason}")
-        elif isinstance(message, Turn) and self._machine is not None:
-            outputs = self._machine.step(message.inputs)
-            self._send(Report(VERSION, self._line.nonce, outputs), message.inputs.now_ns)
+        elif isinstance(message, Mission):
+            self._prepare(message)
+        elif self._mission is not None and self._life is not None:
+            self._go(message, self._mission)
 
     def _prepare(self, mission: Mission) -> None:
-        self._mission = mission
-        self._machine = self._build(mission, mission.body or _at_start(mission, self._me))
+        """Get ready for a mission; for the one that it has already, say so."""
+        ours = self._mission
+        if ours is not None and ours.run == mission.run and self._goes_as_far_as(mission.body):
+            self._tell_ready()
+            return
+        self._mission, self._life, self._wall, self._owed = mission, None, None, None
         self._say(f"{self._me}: mission {mission.scenario.name}, seed {mission.seed}")
-        self._line.send(encode(Ready(VERSION, self._line.nonce)))
 
-    def _send(self, report: Report, now_ns: int) -> None:
-        outputs = report.outputs
-        self._line.send(encode(report))
+    def _goes_as_far_as(self, body: Body | None) -> bool:
+        life = self._life
+        if life is None or body is None:
+            return body is None
+        return (life.epoch, life.step_count) >= (body.epoch, body.step)
+
+    def _act(self) -> None:
+        """Do what is due. Raises OSError if it cannot be noted."""
+        if self._mission is None:
+            return
+        if self._life is None:
+            self._live(self._mission)
+        if self._owed is not None and self._life is not None:
+            outputs, now_ns = self._life.step(self._owed), self._owed.now_ns
+            self._owed = None
+            self._line.send(encode(Report(VERSION, self._line.nonce, outputs)), patiently=True)
+            self._show(outputs, now_ns)
+        if self._wall is not None:
+            self._act_by_own_clock(self._wall)
+        self._cannot = False
+
+    def _hold(self, error: OSError) -> None:
+        if not self._cannot:
+            with contextlib.suppress(OSError):  # the log may be on the same disk
+                self._say(f"{self._me}: holds, its diary cannot be written: {error.strerror}")
+        self._cannot = True
+
+    def _live(self, mission: Mission) -> None:
+        """Go on from the diary, or begin one."""
+        if self._diary is not None:
+            self._diary.close()
+        self._diary = DiaryFile(self._path, mission.run)
+        body = mission.body or Body(_start(mission, self._me))
+        self._life = Life(partial(self._build, mission), self._diary, body)
+        if self._life.step_count:
+            came = "new incarnation" if self._life.epoch > body.epoch else "goes on"
+            self._say(f"{self._me}: {came}, epoch {self._life.epoch}, step {self._life.step_count}")
+        self._tell_ready()
+
+    def _tell_ready(self) -> None:
+        life = self._life
+        if life is not None:
+            now_ns = 0 if self._wall is None else self._wall.now_ns
+            ready = Ready(VERSION, self._line.nonce, life.epoch, life.step_count, now_ns)
+            self._line.send(encode(ready), patiently=True)
+
+    # Wall: the own clock.
+
+    def _go(self, go: Go, mission: Mission) -> None:
+        """Start the clock; or, if it runs, set the one that the machine reads."""
+        if self._wall is None and go.observation is not None:
+            self._wall = _Wall(mission, self._me, go)
+        elif self._wall is not None:
+            self._wall.skew_ns = go.skew_ns
+            if go.observation is not None:
+                self._wall.take(Inputs(go.now_ns, go.observation))
+            self._wall.said_ns = 0
+
+    @property
+    def _unheard(self) -> bool:
+        life, wall = self._life, self._wall
+        return life is not None and wall is not None and life.step_count > wall.accepted
+
+    def _act_by_own_clock(self, wall: "_Wall") -> None:
+        life, diary = self._life, self._diary
+        if life is None or diary is None:
+            return
+        now_ns = wall.now_ns
+        if wall.is_due(now_ns) and wall.accepted == life.step_count:
+            diary.skew_ns = wall.skew_ns
+            inputs = wall.inputs(now_ns)
+            outputs = life.step(inputs)
+            wall.inbox.clear()
+            self._report(diary.skew_ns, wall)
+            self._show(outputs, now_ns)
+        elif self._unheard and wall.silent_s >= AGAIN_S:
+            self._report(diary.skew_ns, wall)
+
+    def _report(self, skew_ns: int, wall: "_Wall") -> None:
+        """Say what it did last. skew_ns: of its clock when it did."""
+        if self._life is None or self._life.unheard is None:
+            return
+        inputs, outputs = self._life.unheard
+        heard = tuple((envelope.source, envelope.sequence) for envelope in inputs.inbox)
+        report = Report(
+            VERSION,
+            self._line.nonce,
+            outputs,
+            inputs.now_ns - skew_ns,
+            heard,
+            inputs.observation.step,
+            skew_ns,
+        )
+        # It is said again until it is heard, so it need not wait for a world that is slow to listen.
+        self._line.send(encode(report), patiently=False)
+        wall.said_ns = time.monotonic_ns()
+
+    def _show(self, outputs: Outputs, now_ns: int) -> None:
+        """Tell observers."""
         self._line.publish_pose(encode(PoseMessage(VERSION, outputs.step, now_ns, outputs.pose)))
         if outputs.weights:
             self._line.publish_weights(outputs.weights)
 
-    def _free_run(self, go: Go) -> str | None:
-        """Step by the own clock until told to stop; the reason, or None for another mission."""
-        mission, machine = self._mission, self._machine
-        if mission is None or machine is None or go.observation is None:
-            return None
-        scenario = mission.scenario
-        clock = clocks(scenario, mission.seed)[self._me]
-        origin = time.monotonic_ns() - round(go.now_ns / go.speed)
-        arrived: list[Envelope] = []
-        observation = go.observation
-        ordinal = 1
-        while clock.due_ns(ordinal) <= go.now_ns:
-            ordinal += 1
-        while True:
-            now_ns = round((time.monotonic_ns() - origin) * go.speed)
-            due_ns = clock.due_ns(ordinal)
-            if now_ns < due_ns:
-                message = self._next((due_ns - now_ns) * 1e-9 / go.speed)
-                if isinstance(message, Stop):
-                    return message.reason
-                if isinstance(message, Turn):
-                    arrived += message.inputs.inbox
-                    if message.inputs.observation.step >= observation.step:
-                        observation = message.inputs.observation
-                elif isinstance(message, Mission):
-                    self._take(message)
-                    return None
-                continue
-            inputs = Inputs(now_ns, observation, tuple(arrived))
-            arrived = []
-            self._send(self._report(machine.step(inputs), inputs), now_ns)
-            # A step that came too late is left out; a robot does not catch up in a burst.
-            while clock.due_ns(ordinal) <= now_ns:
-                ordinal += 1
 
-    def _report(self, outputs: Outputs, inputs: Inputs) -> Report:
-        heard = tuple((envelope.source, envelope.sequence) for envelope in inputs.inbox)
-        return Report(
-            VERSION, self._line.nonce, outputs, inputs.now_ns, heard, inputs.observation.step
-        )
+def _start(mission: Mission, name: str) -> Pose:
+    """Where a participant is at time 0."""
+    if name == SUPERVISOR:
+        return Pose(*mission.scenario.supervisor_m)
+    x_m, y_m = mission.starts.open("<f8", 2)[mission.scenario.robot_ids.index(name)].tolist()
+    return Pose(x_m, y_m)
 
 
-def _at_start(mission: Mission, me: ParticipantId) -> Body:
-    scenario = mission.scenario
-    if me == SUPERVISOR:
-        return Body(Pose(*scenario.supervisor_m))
-    x_m, y_m = mission.starts.open("<f8", 2)[scenario.robot_ids.index(me)].tolist()
-    return Body(Pose(x_m, y_m))
+class _Wall:
+    """A participant's own clock, and what has arrived since its last step."""
+
+    def __init__(self, mission: Mission, name: str, go: Go) -> None:
+        """The clock shows go.now_ns now."""
+        assert go.observation is not None
+        self.skew_ns = go.skew_ns
+        self.inbox: deque[Envelope] = deque(maxlen=INBOX_MAX)
+        self.said_ns = 0
+        """When it last reported, by the monotonic clock."""
+        self._observation = go.observation
+        self._clock = clocks(mission.scenario, mission.seed)[name]
+        self._speed = go.speed
+        self._origin_ns = time.monotonic_ns() - round(go.now_ns / go.speed)
+        self._ordinal = 1
+        self._skip(go.now_ns)
+
+    @property
+    def now_ns(self) -> int:
+        """True simulated time."""
+        return round((time.monotonic_ns() - self._origin_ns) * self._speed)
+
+    @property
+    def accepted(self) -> int:
+        """Its last step that the world has accepted, as far as it knows."""
+        return self._observation.step
+
+    @property
+    def silent_s(self) -> float:
+        """Real seconds since it last reported."""
+        return (time.monotonic_ns() - self.said_ns) * 1e-9
+
+    def until_due_s(self) -> float:
+        """Real seconds until its next step."""
+        return max(0.0, (self._clock.due_ns(self._ordinal) - self.now_ns) * 1e-9 / self._speed)
+
+    def is_due(self, now_ns: int) -> bool:
+        """Whether its next step is due; asked once for each. It does not catch up in a burst."""
+        if now_ns < self._clock.due_ns(self._ordinal):
+            return False
+        self._skip(now_ns)
+        return True
+
+    def _skip(self, now_ns: int) -> None:
+        while self._clock.due_ns(self._ordinal) <= now_ns:
+            self._ordinal += 1
+
+    def take(self, inputs: Inputs) -> None:
+        """Note what has arrived."""
+        self.inbox += inputs.inbox
+        if inputs.observation.step >= self._observation.step:
+            self._observation = inputs.observation
+
+    def inputs(self, now_ns: int) -> Inputs:
+        """What it goes by in its next step. A clock shows no time before the start."""
+        return Inputs(now_ns + self.skew_ns, self._observation, tuple(self.inbox))

@@ -1,6 +1,7 @@
 """The supervisor as a process."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 from kantor_protocol.credentials import Identity
 from kantor_protocol.machine import Body, StateMachine
@@ -9,10 +10,12 @@ from kantor_protocol.process import participate
 from kantor_supervisor.core import Supervisor
 
 
-def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str], None]) -> str:
+def run(
+    connect: str, identity: Identity, patience_s: float, say: Callable[[str], None], state: Path
+) -> str:
     """Be the supervisor until the mission is over; why it ended.
 
-    Raises BusError and NotWantedError.
+    state: folder of its diary. Raises BusError, NotWantedError and StateError.
     """
 
     def build(mission: Mission, body: Body) -> StateMachine:
@@ -23,4 +26,4 @@ def run(connect: str, identity: Identity, patience_s: float, say: Callable[[str]
             return Allocation(me, scenario, mission.seed, body, mission.frame)
         return Supervisor(me, scenario, body, mission.samples.shape[0])
 
-    return participate(connect, identity, build, patience_s, say)
+    return participate(connect, identity, build, patience_s, say, state)

@@ -50,17 +50,18 @@ class Journal:
     more. Room for the ending was set aside at the start.
     """
 
-    def __init__(self, path: Path | None = None) -> None:
-        """path: the file to create; None digests only."""
+    def __init__(self, path: Path | None = None, *, anew: bool = False) -> None:
+        """path: the file to create; None digests only. anew: beside the one that is there, see `replace`."""
         self.digest = Digest()
         self.cut: str | None = None
         """Why the file ends early, if it does."""
         self._file: IO[bytes] | None = None
         self._path = path
+        self._draft = path.with_name(f".{path.name}.draft") if path is not None and anew else None
         self._sequence = 0
         self._time_ns = 0
         if path is not None:
-            self._open(path)
+            self._open(self._draft or path)
 
     def _open(self, path: Path) -> None:
         self._reserve = path.with_name(".reserve")
@@ -97,6 +98,12 @@ class Journal:
         """Write one row of metrics, for viewers; it is not part of the digest."""
         if self._file is not None:
             self._write(METRICS_TOPIC, json.dumps(row._asdict()).encode())
+
+    def replace(self) -> None:
+        """Take the old file's place, once all that is in it has been written anew."""
+        draft, self._draft = self._draft, None
+        if draft is not None and self._path is not None and self.cut is None:
+            draft.replace(self._path)
 
     def close(self) -> None:
         """Finish the file, and give the reserve back, so that the result finds room."""

@@ -4,22 +4,23 @@ import contextlib
 import csv
 import json
 import platform
+import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import msgspec
 
 from kantor_protocol.scenario import Scenario, to_toml
 from kantor_worldsim.checkers import Checker
 from kantor_worldsim.exploration import Exploration
-from kantor_worldsim.journal import Journal, file_digest
+from kantor_worldsim.journal import Journal, file_digest, read
 from kantor_worldsim.metrics import Following, Metrics, Result
 from kantor_worldsim.reading import Reader
-from kantor_worldsim.records import Record
+from kantor_worldsim.records import Ending, Opening, Record
 from kantor_worldsim.survey import Survey
 
 JOURNAL = "run.mcap"
@@ -58,6 +59,50 @@ def metrics_of(
     return Metrics(exact_every, reader)
 
 
+class ResumeError(ValueError):
+    """A run folder from which no mission can go on; the message is one line with the remedy."""
+
+
+class Terms(msgspec.Struct, frozen=True):
+    """How a run is run, in its manifest."""
+
+    run: str
+    """Names it."""
+    exchange: str
+    speed: float
+    exact_every: int | None = None
+
+
+class Past(NamedTuple):
+    """What a run folder holds of a mission that was cut short."""
+
+    terms: Terms
+    opening: Opening
+    records: tuple[Record, ...]
+    """The opening and all that followed, without an ending."""
+    manifest: dict[str, Any]
+
+    @classmethod
+    def of(cls, folder: Path) -> "Past":
+        """Raises ResumeError."""
+        try:
+            manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+            records = [record for _, record in read(folder / JOURNAL)]
+            terms = msgspec.convert(manifest, Terms)
+        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            raise ResumeError(f"{folder}: no folder that a run left ({error})") from None
+        except msgspec.ValidationError as error:
+            raise ResumeError(f"{folder / MANIFEST}: of another version: {error}") from None
+        if not records or not isinstance(records[0], Opening):
+            raise ResumeError(f"{folder / JOURNAL}: nothing has happened in it; start the run anew")
+        last = records[-1]
+        if isinstance(last, Ending):
+            if "digest" in manifest and last.reason != "interrupted":
+                raise ResumeError(f"{folder}: its mission is over ({last.reason})")
+            records.pop()
+        return cls(terms, records[0], tuple(records), manifest)
+
+
 class Recording:
     """Follows a run: journal, metrics and checker; writes the run folder if there is one."""
 
@@ -69,8 +114,13 @@ class Recording:
         folder: Path | None = None,
         exact_every: int | None = None,
         monotonic: Callable[[], float] = time.monotonic,
+        speed: float = 1.0,
+        past: Past | None = None,
     ) -> None:
-        """folder: an existing folder for the run's files; None keeps nothing. exact_every: see Metrics."""
+        """folder: an existing folder for the run's files; None keeps nothing. exact_every: see Metrics.
+
+        speed: wall, simulated seconds in a real one. past: what the folder has of this run already.
+        """
         self._reader = Reader()
         survey = Survey(self._reader) if scenario.mapping else None
         self.metrics = metrics_of(scenario, exact_every, self._reader, survey)
@@ -85,12 +135,27 @@ class Recording:
         self._started = monotonic()
         self._rows = 0
         self._table: _Table | None = None
-        if folder is not None:
+        self.run = secrets.token_hex(8) if past is None else past.terms.run
+        """Names the run."""
+        if folder is not None and past is not None:
+            resumed = past.manifest.get("resumed", 0) + 1
+            self._manifest = past.manifest | {"resumed": resumed}
+        elif folder is not None:
             _write_text(folder / SCENARIO, to_toml(scenario))
             self._manifest = _manifest(scenario, seed, exchange)
+            self._manifest |= {"run": self.run, "speed": speed, "exact_every": exact_every}
+        if folder is not None:
             _write_json(folder / MANIFEST, self._manifest)
             self._table = _Table(folder / METRICS, self.metrics.columns)
-        self.journal = Journal(None if folder is None else folder / JOURNAL)
+        self.journal = Journal(None if folder is None else folder / JOURNAL, anew=past is not None)
+        if past is not None:
+            self._follow(past.records)
+
+    def _follow(self, records: Iterable[Record]) -> None:
+        """Catch up. The old journal is there until all of it is in the new one."""
+        for record in records:
+            self.take(record)
+        self.journal.replace()
 
     def take(self, record: Record) -> None:
         """Follow one record."""

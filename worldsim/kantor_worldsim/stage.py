@@ -11,7 +11,15 @@ from collections.abc import Callable, Iterable
 import msgspec
 
 from kantor_protocol.faults import Kill, OnProcesses
-from kantor_protocol.machine import WORLD_SIM, Body, Inputs, Outputs, ParticipantId, State
+from kantor_protocol.machine import (
+    WORLD_SIM,
+    Body,
+    Inputs,
+    Observation,
+    Outputs,
+    ParticipantId,
+    State,
+)
 from kantor_protocol.messages import RefusedError, check_outputs
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.channel import Channel, Sent, Verdict
@@ -69,6 +77,7 @@ class Stage:
         self._resting: set[ParticipantId] = set()
         self._acted: set[ParticipantId] = set()
         self._unanswered: dict[ParticipantId, Step] = {}
+        self._died_ns: dict[ParticipantId, int] = {}
         self._kept: list[Record] | None = [] if _may_be_killed(scenario) else None
         self.gone: set[ParticipantId] = set()
         """Participants that have left and will not come back. Who is killed for good is among them;
@@ -144,6 +153,10 @@ class Stage:
         """What whoever takes a participant over has to know."""
         return self._world.body(name)
 
+    def look(self, name: ParticipantId) -> Observation:
+        """What the world tells a participant of itself."""
+        return self._world.observe(name)
+
     def acted(self, name: ParticipantId) -> bool:
         """Whether a participant has ever stepped in this mission."""
         return name in self._acted
@@ -192,13 +205,15 @@ class Stage:
         """Put on record what befell a process, and let it have its effect on who is left, and where."""
         now_ns, who, what, index, _, epoch = msgspec.structs.astuple(incident)
         self.now_ns, self.done_ns = max(self.now_ns, now_ns), now_ns
+        if what == "kill":
+            self._died_ns[who] = now_ns
         fault = self.scenario.faults[index] if index >= 0 else None
         self.deeds += fault is not None
         if isinstance(fault, Kill) and fault.until_ns is None:
             self.gone = self.gone | {who}
         if what in {"start", "join"} and who != WORLD_SIM:
             if isinstance(fault, OnProcesses):  # what reached nobody
-                self.channel.lose(who, fault.from_ns, now_ns)
+                self.channel.lose(who, self._died_ns.get(who, fault.from_ns), now_ns)
             if self._world.begin(who, epoch):
                 self._resting.discard(who)
         self._tell(incident)

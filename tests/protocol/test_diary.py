@@ -1,0 +1,230 @@
+"""Diaries on disk: whole, cut, altered, of another run, on a full disk, with another process at them."""
+
+import multiprocessing
+import os
+import resource
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kantor_protocol.diary import DiaryFile, tear
+from kantor_protocol.life import Life, Pages
+from kantor_protocol.machine import Body, Inputs, Observation, Outputs, Pose
+from kantor_protocol.messages import encode
+from strategies import INPUTS, examples
+
+BIRTH = Body(Pose(1.0, 2.0), step=3, energy_spent=2, epoch=1)
+
+
+def page(step: int) -> bytes:
+    """What is noted before the step after this one."""
+    return encode(Inputs(step * 10, Observation(step, Pose(float(step), 0.0))))
+
+
+PAGES = [page(step) for step in range(3, 9)]
+
+
+def written(path: Path, pages: list[bytes], run: str = "run") -> None:
+    """A diary that somebody left."""
+    diary = DiaryFile(path, run)
+    diary.begin(BIRTH)
+    for content in pages:
+        diary.note(content)
+    diary.close()
+
+
+def found(path: Path, run: str = "run") -> Pages | None:
+    """What whoever comes next finds."""
+    diary = DiaryFile(path, run)
+    pages = diary.read()
+    diary.close()
+    return pages
+
+
+@given(st.lists(INPUTS, max_size=6))
+@examples(30)
+def test_what_is_noted_is_read(inputs: list[Inputs]) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "r1.diary"
+        written(path, [encode(given_) for given_ in inputs])
+
+        assert found(path) == Pages(BIRTH, [encode(given_) for given_ in inputs])
+
+
+def test_a_diary_is_continued_where_it_ends(tmp_path: Path) -> None:
+    path = tmp_path / "r1.diary"
+    written(path, PAGES[:2])
+    again = DiaryFile(path, "run")
+    again.read()
+    again.skew_ns = -7
+    again.note(PAGES[2])
+    again.close()
+
+    last = DiaryFile(path, "run")
+    assert last.read() == Pages(BIRTH, PAGES[:3])
+    assert last.skew_ns == -7
+
+
+@given(st.data())
+@examples(200)
+def test_any_cut_and_any_flipped_bit_leave_a_prefix(data: st.DataObject) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "r1.diary"
+        written(path, PAGES)
+        content = bytearray(path.read_bytes())
+        bit = data.draw(st.integers(0, 8 * len(content) - 1) | st.none())
+        if bit is not None:
+            content[bit // 8] ^= 1 << bit % 8
+        tail = data.draw(st.binary(max_size=20))
+        path.write_bytes(content[: data.draw(st.integers(0, len(content)))] + tail)
+
+        first = found(path)
+        assert first is None or (first.birth, first.inputs) == (
+            BIRTH,
+            PAGES[: len(first.inputs)],
+        )
+        assert found(path) == first
+
+
+@given(st.binary(max_size=300))
+@examples(200)
+def test_no_file_is_taken_for_a_diary_that_is_none(content: bytes) -> None:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "r1.diary"
+        path.write_bytes(content)
+        assert found(path) is None
+        path.write_bytes(b"kantor diary 1\n" + content)
+        assert found(path) is None
+
+
+def test_a_cut_diary_is_continued_after_its_last_sound_page(tmp_path: Path) -> None:
+    path = tmp_path / "r1.diary"
+    written(path, PAGES[:3])
+    with path.open("ab") as file:
+        file.truncate(path.stat().st_size - 3)
+    again = DiaryFile(path, "run")
+    again.read()
+    again.note(PAGES[4])
+    again.close()
+
+    assert found(path) == Pages(BIRTH, [*PAGES[:2], PAGES[4]])
+
+
+def test_a_diary_of_another_run_or_of_none_is_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "r1.diary"
+    assert found(path) is None
+    written(path, PAGES, run="yesterday's")
+    assert found(path) is None
+    written(path, PAGES[:1])
+    assert found(path) == Pages(BIRTH, PAGES[:1])
+    assert [file.name for file in tmp_path.iterdir()] == ["r1.diary"]
+
+
+@pytest.mark.parametrize(("step", "left"), [(9, 5), (8, 4), (4, 0), (3, 0), (12, 6)])
+def test_torn_it_lacks_a_step_and_ends_in_the_middle_of_a_page(
+    tmp_path: Path, step: int, left: int
+) -> None:
+    path = tmp_path / "r1.diary"
+    written(path, PAGES)
+    whole = path.stat().st_size
+    tear(path, step)
+
+    assert (path.stat().st_size == whole) == (left == len(PAGES))
+    assert found(path) == Pages(BIRTH, PAGES[:left])
+    tear(path, 0)
+    tear(path, 0)
+    assert found(path) == Pages(BIRTH, [])
+
+
+def found_beside(path: Path) -> list[bytes]:
+    """The pages in a diary that is still being written."""
+    copy = path.with_name("copy")
+    copy.write_bytes(path.read_bytes())
+    pages = found(copy)
+    return [] if pages is None else list(pages.inputs)
+
+
+@contextmanager
+def room_for(size: int) -> Iterator[None]:
+    """No file may grow beyond a size, as if the disk were full."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("spare", [0, 1, 9, 30])
+def test_a_full_disk_takes_no_page_and_no_half_of_one(tmp_path: Path, spare: int) -> None:
+    """The page is refused with an error, and fits when there is room again."""
+    path = tmp_path / "r1.diary"
+    diary = DiaryFile(path, "run")
+    diary.begin(BIRTH)
+    diary.note(PAGES[0])
+    with room_for(path.stat().st_size + spare), pytest.raises(OSError, match="File too large"):
+        diary.note(PAGES[1])
+    assert found_beside(path) == PAGES[:1]
+    diary.note(PAGES[1])
+    diary.note(PAGES[2])
+    diary.close()
+
+    assert found(path) == Pages(BIRTH, PAGES[:3])
+
+
+def test_a_full_disk_keeps_the_old_diary_when_a_new_one_does_not_fit(tmp_path: Path) -> None:
+    path = tmp_path / "r1.diary"
+    written(path, PAGES[:1])
+    diary = DiaryFile(path, "run")
+    with room_for(20), pytest.raises(OSError, match="File too large"):
+        diary.begin(BIRTH)
+
+    assert found(path) == Pages(BIRTH, PAGES[:1])
+    assert [file.name for file in tmp_path.iterdir()] == ["r1.diary"]
+
+
+class Counter:
+    """A machine that counts its steps."""
+
+    def __init__(self, body: Body) -> None:
+        self._step = body.step
+
+    def step(self, inputs: Inputs, /) -> Outputs:
+        self._step += 1
+        return Outputs(self._step, inputs.observation.pose)
+
+
+def keep_frozen(path: Path, ready: Callable[[], None]) -> None:
+    """A predecessor that was stopped in the middle of its life."""
+    life = Life(Counter, DiaryFile(path, "run"), Body(Pose(0.0, 0.0)))
+    life.step(Inputs(1, Observation(0, Pose(0.0, 0.0))))
+    ready()
+    signal.pause()
+
+
+def test_two_writers_never_share_a_diary(tmp_path: Path) -> None:
+    """A frozen predecessor has the file: its successor is a new incarnation with a file of its own."""
+    path = tmp_path / "r1.diary"
+    context = multiprocessing.get_context("spawn")
+    ready = context.Event()
+    frozen = context.Process(target=keep_frozen, args=(path, ready.set))
+    frozen.start()
+    assert ready.wait(60)
+    try:
+        body = Body(Pose(0.0, 0.0), step=1)
+        successor = Life(Counter, DiaryFile(path, "run"), body)
+        assert (successor.epoch, successor.step_count) == (1, 1)
+        os.kill(frozen.pid or 0, signal.SIGKILL)
+        frozen.join()
+        successor.step(Inputs(2, Observation(1, Pose(0.0, 0.0))))
+        third = Life(Counter, DiaryFile(path, "run"), body)
+        assert (third.epoch, third.step_count) == (1, 1)
+    finally:
+        frozen.kill()
+        frozen.join()
