@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 KANTOR := $(BIN)/kantor
 
-.PHONY: help demo test check lint types contracts format paper bench clean
+.PHONY: help demo test check lint types contracts format paper bench campaign mutants clean
 
 help:
 	@echo "make demo    set up, then five robot processes explore on the bus and leave a picture"
@@ -12,6 +12,8 @@ help:
 	@echo "make check   lint, types and import contracts"
 	@echo "make paper   the first paper's figures with a verdict beside each number (kantor reproduce all)"
 	@echo "make bench   speed, as ratios in one run"
+	@echo "make campaign  2000 drawn missions full of faults, every referee on"
+	@echo "make mutants planted bugs, and which referee catches each: docs/mutants.md"
 
 demo: $(VENV)/.installed $(VENV)/.kernels
 	$(KANTOR) run fleet --exchange wall --speed 4
@@ -40,6 +42,12 @@ paper: $(VENV)/.developing $(VENV)/.kernels
 
 bench: $(VENV)/.installed $(VENV)/.kernels
 	$(BIN)/python benchmarks/run.py
+
+campaign: $(VENV)/.installed $(VENV)/.kernels
+	$(KANTOR) campaign
+
+mutants: $(VENV)/.developing $(VENV)/.kernels
+	$(BIN)/python tests/campaign/mutants.py
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("kantor needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'

@@ -5,7 +5,7 @@ Positions are in the world frame, in metres.
 
 from array import array
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,14 +16,15 @@ from matplotlib.collections import EllipseCollection, LineCollection, PathCollec
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.patches import Rectangle
 
-from kantor_fleet.style import EMPTY, FAINT, FOUND, INK, MISSED, TEAM, TEXT_PT, team_colours
+from kantor_fleet.style import EMPTY, FAINT, FOUND, INK, KILLED, MISSED, TEAM, TEXT_PT, team_colours
+from kantor_protocol.faults import Late
 from kantor_protocol.grid import FREE
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import SUPERVISOR, ParticipantId, State
 from kantor_protocol.packing import Pairs
 from kantor_protocol.walk import Walk
 from kantor_worldsim.recording import metrics_of
-from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
+from kantor_worldsim.records import Act, Batch, Incident, Opening, Record
 from kantor_worldsim.survey import Survey
 
 _WEIGHT = ListedColormap(colormaps["YlOrBr"](np.linspace(0.2, 0.65, 256)))
@@ -64,6 +65,20 @@ class Trail:
         return np.array([*self._kept, *self.end_m]).reshape(-1, 2)
 
 
+class Outage(NamedTuple):
+    """A time in which a process did nothing."""
+
+    who: ParticipantId
+    what: str
+    """How it began: kill, pause, fill, leave."""
+    from_s: float
+    until_s: float | None
+    """None: it did not come back."""
+
+
+_ENDS = {"start", "resume", "free", "join"}
+
+
 class Run:
     """What the picture needs to know of a run."""
 
@@ -76,6 +91,16 @@ class Run:
         grain_m = _GRAIN * self._diagonal_m
         starts_m = zip(self.scenario.robot_ids, self.site.starts_m.tolist(), strict=True)
         self.trails = {name: Trail(x_m, y_m, grain_m) for name, (x_m, y_m) in starts_m}
+        self.outages: list[Outage] = []
+        """In order of their ends; those without an end come last."""
+        self.deaths_m: list[tuple[float, float]] = []
+        """Where robots were when they were killed."""
+        self._away: dict[ParticipantId, tuple[str, float]] = {
+            name: ("late", 0.0)
+            for fault in self.scenario.faults
+            if isinstance(fault, Late)
+            for name in fault.who
+        }
         self._units = opening.units
         self._left = np.full(self.site.samples_m.shape[0], self._units.sample, dtype=np.int64)
         self._finished_ns: dict[ParticipantId, int] = {}
@@ -92,6 +117,8 @@ class Run:
         run = cls(opening)
         for record in following:
             run.follow(record)
+        for name, (what, from_s) in run._away.items():
+            run.outages.append(Outage(name, what, from_s, None))
         return run
 
     @property
@@ -123,11 +150,23 @@ class Run:
     def follow(self, record: Record) -> None:
         """Take in one record after the opening."""
         self.metrics.take(record)
-        if isinstance(record, Batch | Ending):
+        if isinstance(record, Incident):
+            self._befall(record)
+        if not isinstance(record, Opening):
             self.end_ns = max(self.end_ns, record.now_ns)
         if isinstance(record, Batch):
             for act in record.acts:
                 self._follow_act(act)
+
+    def _befall(self, incident: Incident) -> None:
+        name, what, now_s = incident.who, incident.what, incident.now_ns * 1e-9
+        if what in {"kill", "pause", "fill", "leave"}:
+            self._away.setdefault(name, (what, now_s))
+            if what == "kill" and name in self.trails:
+                self.deaths_m.append(self.trails[name].end_m)
+        elif what in _ENDS and name in self._away:
+            before, from_s = self._away.pop(name)
+            self.outages.append(Outage(name, before, from_s, now_s))
 
     def _follow_act(self, act: Act) -> None:
         outputs, ruling = act.outputs, act.ruling
@@ -234,6 +273,15 @@ def draw_trails(axes: Axes, run: Run) -> None:
     )
     _add_marks(axes, ends_m, s=size, c=colours, edgecolors=INK, lw=edge, zorder=5.0)
     axes.plot([], [], "o", ms=7.0, mfc="white", mec=INK, mew=1.0, label="end")
+
+
+def draw_deaths(axes: Axes, run: Run) -> None:
+    """Where robots were when they were killed."""
+    if run.deaths_m:
+        xy_m = np.array(run.deaths_m)
+        style: dict[str, Any] = {"marker": "X", "edgecolors": "white", "label": "killed"}
+        size = _mark_size(xy_m.shape[0], 110.0)
+        _add_marks(axes, xy_m, s=size, c=KILLED, lw=0.8, zorder=5.5, **style)
 
 
 def draw_samples(axes: Axes, run: Run, *, scale: bool = True) -> None:

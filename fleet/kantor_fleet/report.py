@@ -8,15 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from kantor_fleet.picture import (
     Run,
     draw_bumps,
+    draw_deaths,
     draw_domain,
     draw_known,
     draw_radio,
@@ -27,10 +30,12 @@ from kantor_fleet.picture import (
     thinned,
 )
 from kantor_fleet.style import (
+    CUT,
     FAINT,
     FIRST,
     FOUND,
     INK,
+    KILLED,
     SECOND,
     TEXT_PT,
     THIRD,
@@ -40,6 +45,8 @@ from kantor_fleet.style import (
     team_colours,
     tidy,
 )
+from kantor_protocol.faults import OneWay, Partition
+from kantor_protocol.machine import SUPERVISOR, WORLD_SIM
 from kantor_worldsim.exploration import Exploration, MapRow
 from kantor_worldsim.metrics import Row
 from kantor_worldsim.records import Record
@@ -52,6 +59,9 @@ _GAP = "   ·   "
 _ENDED = {"done": "energy spent", "limit": "time limit", "cut": "record cut"}
 """Why a run ended that did not finish."""
 _ROWS_SHOWN = 4_000
+_ROWS_NAMED, _LINES_SHOWN = 8, 40
+"""Of processes that were away, by name; lines where somebody went away."""
+_DEADLY = {"kill", "leave"}
 
 
 def draw(records: Iterable[Record], path: Path, exact: Sequence[tuple[float, float]] = ()) -> None:
@@ -128,6 +138,7 @@ def _draw_map(place: SubFigure, run: Run) -> None:
         draw_domain(axes, run)
         draw_samples(axes, run)
     draw_trails(axes, run)
+    draw_deaths(axes, run)
     draw_targets(axes, run)
     draw_supervisor(axes, run)
     draw_radio(axes, run)
@@ -159,9 +170,10 @@ def _finish_curves(place: SubFigure, diagrams: Sequence[Axes], run: Run) -> None
     diagrams[-1].set_xlabel("simulated time, s", size=TEXT_PT, color=INK)
     end_s = max(run.end_ns, run.scenario.period_ns) * 1e-9
     diagrams[-1].set_xlim(0.0, 1.02 * end_s)  # so that what happens at the very end is seen
-    moments = _mark_moments(diagrams, run)
+    moments = [*_mark_moments(diagrams, run), *_mark_cuts(diagrams, run, end_s)]
+    moments += _mark_outages(diagrams, run, end_s)
     if moments:
-        add_legend(place, moments)
+        add_legend(place, moments, widest=3)
 
 
 def _draw_exploration(place: SubFigure, run: Run, exploration: Exploration) -> None:
@@ -256,6 +268,45 @@ def _mark_moments(diagrams: Sequence[Axes], run: Run) -> list[Line2D]:
             lines[0].set_label(f"{name}, {at_s:.1f} s")
             marks.append(lines[0])
     return marks
+
+
+def _mark_cuts(diagrams: Sequence[Axes], run: Run, end_s: float) -> list[Patch]:
+    """Shade the times in which a fault cut links; one patch for the legend."""
+    cuts = [fault for fault in run.scenario.faults if isinstance(fault, Partition | OneWay)]
+    cuts = [fault for fault in cuts if fault.from_s < end_s]
+    for fault in cuts:
+        until_s = end_s if fault.until_s is None else min(fault.until_s, end_s)
+        for axes in diagrams:
+            axes.axvspan(fault.from_s, until_s, color=CUT, alpha=0.25, lw=0.0, zorder=0.1)
+    return [Patch(color=CUT, alpha=0.25, lw=0.0, label="links cut")] if cuts else []
+
+
+def _mark_outages(diagrams: Sequence[Axes], run: Run, end_s: float) -> list[Artist]:
+    """When processes did nothing: a bar for each over the upper edge of the first diagram, and thin lines.
+
+    What the supervisor or world-sim misses concerns everybody, so it is shaded all the way down.
+    """
+    if not run.outages:
+        return []
+    names = [*run.scenario.roster, WORLD_SIM]
+    rows = sorted({outage.who for outage in run.outages}, key=names.index)
+    height = min(0.05, 0.5 / len(rows))
+    top = diagrams[0]
+    for who, what, from_s, until_s in run.outages:
+        last_s, row = (end_s if until_s is None else until_s), rows.index(who)
+        colour = KILLED if what in _DEADLY else FAINT
+        low, high = 1.0 - height * (row + 0.9), 1.0 - height * (row + 0.1)
+        top.axvspan(from_s, last_s, low, high, color=colour, alpha=0.8, lw=0.0, zorder=1.2)
+        if len(rows) <= _ROWS_NAMED:
+            style: dict[str, Any] = {"size": TEXT_PT - 2.5, "color": colour, "va": "bottom"}
+            top.text(last_s, low, f" {who}", transform=top.get_xaxis_transform(), **style)
+        for axes in diagrams if who in {SUPERVISOR, WORLD_SIM} else ():
+            axes.axvspan(from_s, last_s, color=colour, alpha=0.1, lw=0.0, zorder=0.1)
+        for axes in diagrams if len(run.outages) <= _LINES_SHOWN else ():
+            axes.axvline(from_s, color=colour, lw=0.6, alpha=0.7, zorder=1.0)
+    kinds = {outage.what in _DEADLY for outage in run.outages}
+    marks = ((True, KILLED, "killed"), (False, FAINT, "paused or away"))
+    return [Patch(color=c, alpha=0.8, lw=0.0, label=text) for k, c, text in marks if k in kinds]
 
 
 def _add_line(

@@ -13,6 +13,10 @@ from matplotlib.figure import SubFigure
 TEXT_PT, SMALL_PT, TITLE_PT = 9.5, 8.5, 12.5
 INK, FAINT, EMPTY = "#222222", "#8c8c8c", "#d9d9d9"
 FOUND, MISSED = "#00875a", "#111111"
+KILLED = "#c1121f"
+"""Where, and when, a process was killed."""
+CUT = "#9aa5b1"
+"""The time in which links were cut."""
 FIRST, SECOND, THIRD = INK, "#3f90da", "#e76300"
 """The lines of a diagram, in this order."""
 TEAM = (
@@ -56,12 +60,12 @@ def add_caption(axes: Axes, handles: Sequence[Artist], columns: int = 3) -> None
     )
 
 
-def add_legend(place: SubFigure, handles: Sequence[Artist]) -> None:
-    """The legend of a part of the picture, below it, in one row or two."""
+def add_legend(place: SubFigure, handles: Sequence[Artist], widest: int = 6) -> None:
+    """The legend of a part of the picture, below it, in one row of at most so many, or in two."""
     legend = place.legend(
         handles=handles,
         loc="outside lower center",
-        ncols=len(handles) if len(handles) <= 6 else 4,
+        ncols=len(handles) if len(handles) <= widest else -(-len(handles) // 2),
         frameon=False,
         fontsize=TEXT_PT,
         handlelength=1.6,

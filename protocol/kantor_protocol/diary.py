@@ -167,7 +167,7 @@ def _sound(content: bytes) -> _Sound | None:
     try:
         first, end, crc = next(frames)
         header = msgspec.msgpack.decode(first, type=_Header)
-    except (StopIteration, msgspec.MsgspecError):
+    except (StopIteration, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return None
     pages, ends, skew_ns = [], [end], 0
     for frame, end, frame_crc in frames:

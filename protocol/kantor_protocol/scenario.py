@@ -461,8 +461,11 @@ def to_tree(scenario: Table) -> dict[str, Any]:
     return tree
 
 
-def to_toml(scenario: Scenario) -> str:
-    """The scenario as TOML text that `parse` reads back as an equal one."""
+def to_toml(scenario: Scenario, *, brief: bool = False) -> str:
+    """The scenario as TOML text that `parse` reads back as an equal one.
+
+    brief: without what is as it is by default.
+    """
 
     def literal(value: Any) -> str:
         if isinstance(value, bool):
@@ -476,8 +479,8 @@ def to_toml(scenario: Scenario) -> str:
     def body(table: dict[str, Any]) -> list[str]:
         return [f"{key} = {literal(value)}" for key, value in table.items()]
 
-    tree = to_tree(scenario)
-    rows = {key: tree.pop(key) for key in ("density", "faults")}
+    tree = _without_defaults(scenario) if brief else to_tree(scenario)
+    rows = {key: tree.pop(key, []) for key in ("density", "faults")}
     lines = body({k: v for k, v in tree.items() if not isinstance(v, dict)})
     for key, table in tree.items():
         if isinstance(table, dict) and table:
@@ -486,6 +489,25 @@ def to_toml(scenario: Scenario) -> str:
         for table in tables:
             lines += ["", f"[[{key}]]", *body(table)]
     return "\n".join(lines) + "\n"
+
+
+def _without_defaults(table: Table) -> dict[str, Any]:
+    """A table as plain ones, as briefly as `from_tree` understands it."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, Table):
+            return _without_defaults(value)
+        if isinstance(value, list | tuple):
+            return [plain(item) for item in value]
+        return value
+
+    kind = table.__struct_config__
+    tree = {} if kind.tag is None else {str(kind.tag_field): kind.tag}
+    for field in msgspec.structs.fields(table):
+        value = getattr(table, field.name)
+        if value != field.default:
+            tree[field.name] = plain(value)
+    return tree
 
 
 def _override(tree: dict[str, Any], override: str) -> None:

@@ -41,7 +41,7 @@ class WeightsMessage(msgspec.Struct, frozen=True, array_like=True, tag=20, gc=Fa
 
     version: int
     sequence: int
-    """Counts from 1 in a run."""
+    """Counts from 1 in an incarnation."""
     base: int
     """0: a keyframe. Otherwise the sequence that the changes apply to."""
     size: int

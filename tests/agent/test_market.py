@@ -773,7 +773,7 @@ def test_seller_lets_go_only_of_what_the_heir_holds_for_good(
 ) -> None:
     """r0 has named r1 in its memo 60."""
     market = Market(mission(), 0, 0)
-    market._form._tour = [_Holding(W), _Holding(E, heir=1, named=60, until=70)]
+    market._form._tour = [_Holding(W), _Holding(E, heir=1, named=60, until=62)]
 
     market.assign(situation(terrain_of(*HALL), [member(0, 5)], [word], 61))
 

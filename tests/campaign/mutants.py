@@ -21,7 +21,6 @@ import pytest
 from kantor_agent import core as agent_core
 from kantor_agent.belief import Belief
 from kantor_agent.core import Agent
-from kantor_agent.pace import Pace
 from kantor_fleet.campaign.draw import draw
 from kantor_fleet.campaign.mission import Trial, attempt
 from kantor_fleet.experiment import Case
@@ -444,7 +443,7 @@ def sound_message_refused(patch: Patch) -> None:
     due = _now_and_then(100)
 
     def make(take: Any) -> Any:
-        return lambda self, envelope, learn: not due() and take(self, envelope, learn)
+        return lambda self, *arguments: not due() and take(self, *arguments)
 
     _wrap(patch, Radio, "_take", make)
 
@@ -481,7 +480,7 @@ def supervisor_never_heard_again(patch: Patch) -> None:
             if getattr(self, "_lonely", False):
                 self._unheard_steps = 1000
             envelope = say(self, *arguments)
-            self._lonely = self._supervised and envelope.target == EVERYBODY
+            self._lonely = self._supervisor >= 0 and envelope.target == EVERYBODY
             return envelope
 
         return said
@@ -549,11 +548,11 @@ def speed_limit_one_percent_too_high(patch: Patch) -> None:
 
         return made
 
-    def faster(elapsed_s: Any) -> Any:
-        return lambda self, now_ns: 1.01 * elapsed_s(self, now_ns)
+    def faster(explore: Any) -> Any:
+        return lambda self, dt_s: explore(self, 1.01 * dt_s)
 
     _wrap(patch, World, "__init__", make)
-    _wrap(patch, Pace, "elapsed_s", faster)
+    _wrap(patch, Agent, "_explore", faster)
 
 
 @mutant(
@@ -561,14 +560,14 @@ def speed_limit_one_percent_too_high(patch: Patch) -> None:
 )
 def a_new_incarnation_leaps(patch: Patch) -> None:
     def make(init: Any) -> Any:
-        def made(self: Pace, period_ns: int, body: Body) -> None:
-            init(self, period_ns, body)
-            self._before_ns = 0
-            self._period_ns = 10 * period_ns
+        def made(self: Agent, *arguments: Any) -> None:
+            init(self, *arguments)
+            if self._step:
+                self._now_ns, self._period_ns = 0, 10 * self._period_ns
 
         return made
 
-    _wrap(patch, Pace, "__init__", make)
+    _wrap(patch, Agent, "__init__", make)
 
 
 @mutant("a weight rises now and then", _density)

@@ -21,7 +21,7 @@ from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import Observation, Outputs, Pose, State
 from kantor_protocol.scenario import parse
 from kantor_worldsim.loop import in_process, simulate
-from kantor_worldsim.records import Act, Batch, Ending, Opening, Record
+from kantor_worldsim.records import Act, Batch, Ending, Incident, Opening, Record
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Ruling, Site
 
@@ -305,6 +305,48 @@ def test_moments_are_in_time_not_in_steps() -> None:
     assert followed([opening, *batches[:2]]).finish_s is None
     assert followed([opening, *batches]).contact_s == pytest.approx(0.7)
     assert followed([opening, *batches]).finish_s == pytest.approx(0.7)
+
+
+STRUCK = (
+    "coordination=centralized",
+    (
+        "faults=[{kind='kill', who=['r2'], from_s=1.0, until_s=1.9, disk='lost'},"
+        "{kind='kill', who=['supervisor'], from_s=1.5}, {kind='pause', who=['worldsim'], from_s=2.4,"
+        "until_s=2.9}, {kind='late', who=['r1'], until_s=0.4},"
+        "{kind='partition', shape='halves', from_s=0.5, until_s=1000.0}]"
+    ),
+)
+
+
+def test_outages_are_when_processes_did_nothing() -> None:
+    """From what stopped them to what had them go on; where a robot was when it died."""
+    records = play(*STRUCK)
+    run = followed(records)
+    where = next(
+        act.ruling.pose
+        for record in reversed(records)
+        for act in (record.acts if isinstance(record, Batch) and record.now_ns < 10**9 else ())
+        if act.name == "r2" and act.ruling
+    )
+
+    assert [
+        (who, what, round(from_s, 6), until_s and round(until_s, 6))
+        for who, what, from_s, until_s in run.outages
+    ] == [
+        ("r1", "late", 0.0, 0.4),
+        ("r2", "kill", 1.0, 1.9),
+        ("worldsim", "pause", 2.4, 2.9),
+        ("supervisor", "kill", 1.5, None),
+    ]
+    assert run.deaths_m == [(where.x_m, where.y_m)]
+
+
+def test_outages_and_cuts_are_drawn(tmp_path: Path) -> None:
+    """The picture of a run under faults is not that of the same run with them left out."""
+    records = play(*STRUCK)
+    calm = [record for record in records if not isinstance(record, Incident)]
+
+    assert picture(records, tmp_path / "struck.png") != picture(calm, tmp_path / "calm.png")
 
 
 def test_very_long_record_is_drawn(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import resource
 import signal
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.diary import DiaryFile, tear
+from kantor_protocol.diary import _MAGIC, DiaryFile, _frame, tear
 from kantor_protocol.life import Life, Pages
 from kantor_protocol.machine import Body, Inputs, Observation, Outputs, Pose
 from kantor_protocol.messages import encode
@@ -101,6 +102,17 @@ def test_no_file_is_taken_for_a_diary_that_is_none(content: bytes) -> None:
         assert found(path) is None
         path.write_bytes(b"kantor diary 1\n" + content)
         assert found(path) is None
+
+
+@pytest.mark.parametrize(
+    "header", [b"", b"\xc1", b"\x92\xa1\xff\x90", b"\x91" * 5000, b"\x92\xa0\xc0"]
+)
+def test_a_header_that_says_nothing_is_no_header(tmp_path: Path, header: bytes) -> None:
+    """Its checksum is right."""
+    path = tmp_path / "r1.diary"
+    frame, _ = _frame(header, zlib.crc32(_MAGIC))
+    path.write_bytes(_MAGIC + frame)
+    assert found(path) is None
 
 
 def test_a_cut_diary_is_continued_after_its_last_sound_page(tmp_path: Path) -> None:

@@ -338,7 +338,7 @@ STORMS = (
     pace=st.sampled_from(list(PACES)),
     from_ms=st.integers(0, 4000),
     span_ms=st.integers(1, 1500),
-    others=st.sampled_from([None, (0.35, 0.75), (-0.25, 0.1)]),
+    others=st.sampled_from([None, (0.35, 0.75), (-0.25, 0.1), (-0.03, 0.25)]),
 )
 def test_world_sim_goes_on_from_its_record(
     pace: str, from_ms: int, span_ms: int, others: tuple[float, float] | None

@@ -1,9 +1,9 @@
 """What must happen some day: quiet about sound runs that come to rest, and each rule can be broken."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 
 import msgspec
+import numpy as np
 import pytest
 
 from kantor_fleet.team import team
@@ -100,28 +100,24 @@ def acts(records: Sequence[Record], name: str) -> list[Act]:
     return [act for r in records if isinstance(r, Batch) for act in r.acts if act.name == name]
 
 
-@dataclass
-class Edit:
-    """Changes acts of a record."""
+def altered(records: Sequence[Record], change: Callable[[Act], Act]) -> list[Record]:
+    """The records with every act changed."""
+    return [
+        msgspec.structs.replace(r, acts=tuple(map(change, r.acts))) if isinstance(r, Batch) else r
+        for r in records
+    ]
 
-    records: Sequence[Record]
-    done: list[Record] = field(default_factory=list)
 
-    def acts(self, name: str, **values: object) -> list[Record]:
-        """Everything that a participant returned, changed."""
+def returning(records: Sequence[Record], name: str, **values: object) -> list[Record]:
+    """The records with everything that a participant returned changed."""
 
-        def change(act: Act) -> Act:
-            if act.name != name or act.outputs is None:
-                return act
-            told = msgspec.structs.replace(act.outputs, **values)
-            return msgspec.structs.replace(act, outputs=told)
+    def change(act: Act) -> Act:
+        if act.name != name or act.outputs is None:
+            return act
+        told = msgspec.structs.replace(act.outputs, **values)
+        return msgspec.structs.replace(act, outputs=told)
 
-        return [
-            msgspec.structs.replace(r, acts=tuple(map(change, r.acts)))
-            if isinstance(r, Batch)
-            else r
-            for r in self.records
-        ]
+    return altered(records, change)
 
 
 def said(have: Sequence[int], act: Act) -> object:
@@ -135,8 +131,6 @@ def said(have: Sequence[int], act: Act) -> object:
 
 
 def _uints(values: Sequence[int]) -> bytes:
-    import numpy as np  # noqa: PLC0415
-
     buffer, at = np.zeros(10 * len(values), dtype=np.uint8), 0
     for value in values:
         at = put_uint(buffer, at, value)
@@ -154,8 +148,8 @@ def test_who_never_learns_is_named() -> None:
     last = acts(records, "r2")[-1]
     less = [have_of(last)[0] - 1, *have_of(last)[1:]]
 
-    assert rules(Edit(records).acts("r2", outbox=said(less, last))) == {"L1"}
-    assert rules(Edit(records).acts("r2", lowered=b"")) == {"L1"}
+    assert rules(returning(records, "r2", outbox=said(less, last))) == {"L1"}
+    assert rules(returning(records, "r2", lowered=b"")) == {"L1"}
 
 
 def test_mission_without_an_end_is_named() -> None:
@@ -180,11 +174,7 @@ def test_who_does_not_turn_to_others_is_named(target: str) -> None:
         told = msgspec.structs.replace(act.outputs, outbox=box)
         return msgspec.structs.replace(act, outputs=told)
 
-    stubborn = [
-        msgspec.structs.replace(r, acts=tuple(map(change, r.acts))) if isinstance(r, Batch) else r
-        for r in records
-    ]
-    assert rules(stubborn) == {"L3"}
+    assert rules(altered(records, change)) == {"L3"}
 
 
 def test_lost_entries_are_named() -> None:
@@ -194,6 +184,6 @@ def test_lost_entries_are_named() -> None:
     for name in ("r1", "r2", "r3"):
         last = acts(records, name)[-1]
         have = have_of(last)
-        told = Edit(told).acts(name, outbox=said([have[0], have[1] - 1, have[2]], last))
+        told = returning(told, name, outbox=said([have[0], have[1] - 1, have[2]], last))
 
     assert rules(told) == {"I8"}

@@ -18,7 +18,7 @@ from kantor_protocol.packing import put_int, put_uint
 from kantor_protocol.replica import read_have, read_logs
 from kantor_worldsim.checkers import Checker, check
 from kantor_worldsim.map_checker import MapRules
-from kantor_worldsim.records import Act, Batch, Opening, Record
+from kantor_worldsim.records import Act, Batch, Incident, Opening, Record
 from mapping import ROOMS, explored, on_map, site_of
 
 Records = Sequence[Record]
@@ -432,3 +432,44 @@ def test_checker_stands_what_nobody_can_read() -> None:
         checker.take(told)
 
     assert checker.count > 0
+
+
+STRUCK = {
+    "robot forgets": "{kind='kill', who=['r2'], from_s=0.75, until_s=1.5, disk='lost'}",
+    "robots forget twice": (
+        "{kind='kill', who=['r2'], from_s=0.75, until_s=1.5, disk='lost'},"
+        "{kind='kill', who=['r1', 'r2'], from_s=1.9, until_s=2.5, disk='torn'}"
+    ),
+    "world dies": (
+        "{kind='kill', who=['worldsim'], from_s=0.75, until_s=1.5}, {kind='late', who=['r1'],"
+        "until_s=0.6}, {kind='hostile', probability=0.5}"
+    ),
+}
+
+
+@pytest.mark.parametrize("struck", STRUCK)
+@pytest.mark.parametrize("planner", ["frontier", "kmeans"])
+def test_no_complaint_about_maps_whatever_befalls_processes(struck: str, planner: str) -> None:
+    """A new incarnation begins with an empty chart and a log of its own."""
+    records = explored(f"faults=[{STRUCK[struck]}]", f"planner.name={planner}")
+
+    assert check(records).complaints == []
+
+
+def test_supervisor_that_forgets_is_not_accused() -> None:
+    """What its former incarnation held is not asked of it."""
+    fault = "{kind='kill', who=['supervisor'], from_s=0.75, until_s=1.5, disk='torn'}"
+    records = explored(f"faults=[{fault}]", "coordination=centralized")
+
+    assert check(records).complaints == []
+
+
+def test_robot_that_goes_on_with_its_old_log_is_named() -> None:
+    """Two incarnations never share a log."""
+    fault = "{kind='kill', who=['r2'], from_s=0.75, until_s=1.5}"
+    records = explored(f"faults=[{fault}]")
+    start = next(r for r in records if isinstance(r, Incident) and r.what == "start")
+    reborn = msgspec.structs.replace(start, epoch=1)
+    told = [reborn if record is start else record for record in records]
+
+    assert {"map", "epoch"} <= {each.partition(":")[0] for each in check(told).complaints}

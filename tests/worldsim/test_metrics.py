@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from kantor_fleet.catalog import find
+from kantor_fleet.run import summary
 from kantor_fleet.team import team
 from kantor_protocol.machine import (
     EVERYBODY,
@@ -24,10 +25,11 @@ from kantor_protocol.packing import Pairs
 from kantor_protocol.scenario import Scenario, parse
 from kantor_protocol.weights import WeightsSubscriber
 from kantor_worldsim.channel import DROPPED, Verdict
+from kantor_worldsim.checkers import FORGED_FIRST
 from kantor_worldsim.loop import in_process, simulate
-from kantor_worldsim.metrics import Metrics, Result, Row
+from kantor_worldsim.metrics import Metrics, Rejoining, Result, Row
 from kantor_worldsim.recording import Recording
-from kantor_worldsim.records import Act, Batch, Ending, Opening, Record, opening_of
+from kantor_worldsim.records import Act, Batch, Ending, Incident, Opening, Record, opening_of
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Ruling, Site
 from strategies import mission
@@ -386,6 +388,86 @@ def test_absences_and_refused_messages_are_counted() -> None:
 
     assert result_of(line.metrics).absences == 2
     assert result_of(line.metrics).messages_refused == 3
+
+
+STRUCK = (
+    (
+        "faults=[{kind='kill', who=['r2'], from_s=0.55, until_s=1.12, disk='lost'},"
+        "{kind='kill', who=['r1'], from_s=0.5, until_s=1.15}, {kind='late', who=['r3'], until_s=0.4},"
+        "{kind='pause', who=['r3'], from_s=1.0, until_s=1.5}, {kind='impostor', who=['r1'], from_s=2.0},"
+        "{kind='clock', who=['r3'], from_s=2.0, until_s=2.2, offset_s=-1.0},"
+        "{kind='slow', who=['r1'], from_s=2.0, until_s=2.5, every=2},"
+        "{kind='full-disk', who=['r2'], from_s=2.0, until_s=2.5}, {kind='hostile', probability=0.2},"
+        "{kind='kill', who=['worldsim'], from_s=3.0, until_s=3.1},"
+        "{kind='kill', who=['r2'], from_s=1000.0}]"
+    ),
+    "limit_s=2000",
+)
+
+
+def test_what_befell_processes_is_counted(played: Play) -> None:
+    """By fault and deed; who came back, as which incarnation, and how soon it stepped again."""
+    records = played(*STRUCK)
+    result = result_of(measured(records))
+
+    def told(name: str) -> dict[str, int]:
+        counts = msgspec.structs.asdict(result.faults[name])
+        return {deed: number for deed, number in counts.items() if number}
+
+    assert told("0 kill") == {"killed": 1, "started": 1}
+    assert told("2 late") == {"started": 1}
+    assert told("3 pause") == {"paused": 1, "resumed": 1}
+    assert told("4 impostor") == {"refused": 1}
+    assert told("5 clock") == {"skewed": 1, "righted": 1}
+    assert told("6 slow") == {"slowed": 1, "quickened": 1}
+    assert told("7 full-disk") == {"filled": 1, "freed": 1}
+    assert set(told("8 hostile")) == {"forged"}
+    assert told("9 kill") == {"killed": 1, "started": 1}
+    assert told("10 kill") == {}
+    assert (result.restarts, result.incarnations, result.violations) == (3, 1, 0)
+    assert result.rejoin_s is not None
+    assert result.rejoin_s.count == 2
+    assert result.rejoin_s.max_s == pytest.approx(0.08)  # killed at 0.55 s: at 1.12 s, 1.2 s
+    assert result.messages_refused == sum(
+        verdict.sequence >= FORGED_FIRST and verdict.due_ns != DROPPED
+        for record in records
+        if isinstance(record, Batch)
+        for verdict in record.verdicts
+    ) - _unheard(records)
+    assert "1 new incarnation" in summary(result)
+
+
+def _unheard(records: Sequence[Record]) -> int:
+    """What was forged and reached somebody who was dead, or at rest for ever."""
+    batches = [record for record in records if isinstance(record, Batch)]
+    heard = sum(n >= FORGED_FIRST for b in batches for act in b.acts for _, n in act.heard)
+    ruled = [v for b in batches for v in b.verdicts if v.due_ns != DROPPED]
+    return sum(verdict.sequence >= FORGED_FIRST for verdict in ruled) - heard
+
+
+def test_times_to_rejoin_are_quantiles_that_happened() -> None:
+    """The median and the 99th percentile are among the times."""
+    hundred = Rejoining.of([10_000_000 * (i + 1) for i in range(100)])
+
+    assert hundred == Rejoining(count=100, median_s=0.51, p99_s=1.0, max_s=1.0)
+    assert Rejoining.of([5_000_000]) == Rejoining(count=1, median_s=0.005, p99_s=0.005, max_s=0.005)
+    assert Rejoining.of([]) is None
+
+
+def test_view_of_a_new_incarnation_is_full_again(played: Play) -> None:
+    """What it had learnt counts no more, until it learns it again."""
+    records = played(*STRUCK, "merge=min", "claims=false")
+    metrics = Metrics()
+    before = after = 0
+    for record in records:
+        before = int(metrics._tally.views[1].sum()) if isinstance(record, Incident) else before
+        metrics.take(record)
+        if isinstance(record, Incident) and record.epoch:
+            after = int(metrics._tally.views[1].sum())
+            break
+
+    assert before < after == metrics._units.whole
+    assert metrics._tally.least.tolist() == metrics._tally.views.min(axis=0).tolist()
 
 
 def test_unfinished_team_has_no_finishing_tick() -> None:

@@ -219,7 +219,10 @@ class _Mission:
 
     def _dies(self, due_ns: int, name: ParticipantId) -> bool:
         """Whether a participant dies in this step. Who has a turn to answer is dead already."""
-        return self._outages.dies(name, due_ns) and not self._stage.unanswered(name)
+        outages = self._outages
+        if not outages.dies(name, due_ns) or outages.idle(WORLD_SIM, due_ns):
+            return False
+        return self._stage.unanswered(name) is None
 
     def _cut_short(
         self, due: list[tuple[int, ParticipantId]], outputs: Mapping[ParticipantId, Outputs]

@@ -362,8 +362,9 @@ class _Doorway:
         self.host.send(name, encode(message), patiently=True)
 
     def tell(self, _record: object) -> None:
-        """Publish progress now and then."""
-        self._tell("running", "")
+        """Publish progress now and then, once the mission has begun."""
+        if self._clock is not None:
+            self._tell("running", "")
 
     def tell_progress(self, phase: str, detail: str) -> None:
         """Publish progress now."""

@@ -106,6 +106,8 @@ class Stage:
                 stage._repeat(record)
             except KeyError as error:
                 raise ForeignRecordError(f"record {number}: {error} is not under way") from None
+            except IndexError:
+                raise ForeignRecordError(f"record {number}: no such fault") from None
             if told != [record]:
                 raise ForeignRecordError(f"record {number}: does not follow from those before it")
             told.clear()

@@ -164,7 +164,8 @@ def _attempt(case: Case) -> dict[str, Any]:
         "digest": result.digest,
         "complaints": complaints,
         "struck": dict(follower.struck.counts),
-        "seen": follower.sightings.counts | {f"{rule} judged": 1 for rule in sorted(follower.judged)},
+        "seen": follower.sightings.counts
+        | {f"{rule} judged": 1 for rule in sorted(follower.judged)},
         "twice": int(twice),
         "cut": _CUTS if cut else 0,
     }

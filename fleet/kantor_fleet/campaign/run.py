@@ -167,7 +167,7 @@ def _report(folder: Path, broken: Broken) -> None:
     smallest, still = shrink(case, trial.rule or "", _SHRINK_S)
     place = folder / f"seed-{seed}"
     place.mkdir(parents=True, exist_ok=True)
-    (place / SMALLEST).write_text(to_toml(smallest), encoding="utf-8")
+    (place / SMALLEST).write_text(to_toml(smallest, brief=True), encoding="utf-8")
     print(
         f"  smallest   {_size(case.scenario)} -> {_size(smallest)}: {printable(still.violation or 'none')}"
     )

@@ -1,0 +1,94 @@
+"""What the wall's relay keeps for a participant, and what it believes of what that has heard."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kantor_protocol.machine import Envelope
+from kantor_protocol.process import INBOX_MAX
+from kantor_protocol.scenario import Scenario
+from kantor_worldsim.outages import deeds_of
+from kantor_worldsim.process import _Mail, _world_starts_ns, needs_hands
+from strategies import examples, mission
+
+
+def envelope(sequence: int) -> Envelope:
+    return Envelope("r1", sequence, "", b"")
+
+
+NUMBERS = st.lists(st.integers(0, 5), max_size=12)
+
+
+@given(handed=NUMBERS, kept=st.lists(st.booleans(), min_size=12, max_size=12))
+@examples(300)
+def test_whatever_part_of_what_was_handed_out_arrived_is_believed(
+    handed: list[int], kept: list[bool]
+) -> None:
+    """A full queue drops some; the rest is in order. Numbers come twice, as duplicates do."""
+    mail = _Mail()
+    mail.waiting += [envelope(number) for number in handed]
+    assert [e.sequence for e in mail.hand()] == handed
+    arrived = [number for number, stays in zip(handed, kept, strict=False) if stays]
+    heard = mail.heard(tuple(("r1", number) for number in arrived))
+
+    assert heard is not None
+    assert [e.sequence for e in heard] == arrived
+    assert len(mail.handed) <= len(handed) - len(arrived)
+
+
+@given(handed=NUMBERS, told=NUMBERS)
+@examples(300)
+def test_nothing_else_is_believed(handed: list[int], told: list[int]) -> None:
+    """Against the rule in words: an inbox is a subsequence of what was handed out."""
+    mail = _Mail()
+    mail.waiting += [envelope(number) for number in handed]
+    mail.hand()
+    rest = iter(handed)
+    possible = all(number in rest for number in told)
+
+    assert (mail.heard(tuple(("r1", number) for number in told)) is not None) == possible
+    if not possible:
+        assert [e.sequence for e in mail.handed] == handed
+
+
+def test_what_waits_for_who_does_not_listen_is_bounded() -> None:
+    mail = _Mail()
+    mail.waiting += [envelope(i) for i in range(3 * INBOX_MAX)]
+    first = mail.hand()
+    mail.waiting += [envelope(i) for i in range(3 * INBOX_MAX, 5 * INBOX_MAX)]
+    assert mail.hand() == ()
+    assert len(first) == len(mail.waiting) == INBOX_MAX
+    mail.heard(tuple((e.source, e.sequence) for e in first))
+    assert [e.sequence for e in mail.hand()] == list(range(4 * INBOX_MAX, 5 * INBOX_MAX))
+    assert len(mail.waiting) == 0
+
+
+def beset(*faults: str) -> Scenario:
+    return mission(f"faults=[{', '.join(faults)}]")
+
+
+KILL = '{kind="kill", who=["r1"], from_s=1, until_s=2}'
+PAUSE = '{kind="pause", who=["r2"], from_s=1, until_s=2}'
+CLOCK = '{kind="clock", who=["r2"], offset_s=3}'
+DROP = '{kind="drop", probability=0.5}'
+
+
+def test_faults_of_real_processes_need_hands() -> None:
+    """Turn by turn a pause needs none; a clock is set by a message."""
+    assert needs_hands(beset(DROP, CLOCK), "wall") is None
+    assert needs_hands(beset(DROP, PAUSE), "lockstep") is None
+    assert needs_hands(beset(DROP, PAUSE), "wall") == "faults[1]: pause"
+    assert needs_hands(beset(CLOCK, DROP, KILL), "lockstep") == "faults[2]: kill"
+
+
+def test_a_killed_world_sim_knows_when_it_was_to_come_back() -> None:
+    """Other deeds may be due before."""
+    deeds = deeds_of(
+        beset(
+            '{kind="kill", who=["worldsim"], from_s=3, until_s=5}',
+            '{kind="pause", who=["r2"], from_s=2, until_s=4}',
+        )
+    )
+    starts = [_world_starts_ns(deeds, done) for done in range(len(deeds) + 1)]
+
+    assert [deed.what for deed in deeds] == ["pause", "kill", "resume", "start"]
+    assert starts == [None, None, 5 * 10**9, 5 * 10**9, None]
