@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from multiprocessing.util import get_temp_dir
 from pathlib import Path
 from typing import NamedTuple
 
@@ -424,6 +425,7 @@ def _report(flight: Flight, order: Soak) -> None:
 @contextmanager
 def _own_temporary_folder() -> Iterator[Path]:
     """Everything temporary of this process and its children is below it, and nobody else's."""
+    get_temp_dir()  # what multiprocessing has of its own goes when this process does
     before = tempfile.tempdir, os.environ.get("TMPDIR")
     with tempfile.TemporaryDirectory(prefix="kantor-") as folder:
         tempfile.tempdir = os.environ["TMPDIR"] = folder
@@ -437,5 +439,5 @@ def _own_temporary_folder() -> Iterator[Path]:
 
 
 def _entries(folder: Path) -> set[str]:
-    """What is in a folder, but for what belongs to the fork server as long as it lives."""
-    return {path.name for path in folder.iterdir() if not path.name.startswith("pymp-")}
+    """What is in a folder."""
+    return {path.name for path in folder.iterdir()}
