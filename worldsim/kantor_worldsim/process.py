@@ -672,6 +672,8 @@ class _Deeds:
         deeds = deeds_of(plan.scenario)
         for deed in deeds[: stage.deeds]:
             self._keep_count(deed)
+        for name in sorted(self._slow):
+            self._order(Order("thaw", name))  # the process before this one may have held it
         self.world_starts_ns = _world_starts_ns(deeds, stage.deeds)
         """When world-sim is to start again, if a fault has killed it."""
 

@@ -9,8 +9,10 @@ from typing import NamedTuple
 from kantor_fleet.local import Fleet
 from kantor_protocol.machine import SUPERVISOR, WORLD_SIM
 
-WARM_UP_S = 4.0
-"""A process's memory counts from then on: its machine is built, and has stepped."""
+WARM_UP_PERIODS = 100
+"""A process's memory counts from then on in its life."""
+LONG_PERIODS = 150
+"""A life that goes on for so long then tells whether memory is flat."""
 FLAT_MB = 4.0
 """So much may a kind of process grow over a thousand periods, all its lives together: its logs do."""
 SETTLED = 3
@@ -25,10 +27,10 @@ _KINDS = {SUPERVISOR: "supervisor", WORLD_SIM: "world-sim"}
 
 
 class Grown(NamedTuple):
-    """How a kind of process has grown, over all lives that were longer than warming up."""
+    """How a kind of process has grown, over all long lives."""
 
     lives: int = 0
-    periods: float = 0.0
+    periods: int = 0
     """Of those lives, after warming up."""
     grown_mb: float = 0.0
     """Of all lives together."""
@@ -54,34 +56,37 @@ class Grown(NamedTuple):
 
 class _Life(NamedTuple):
     kind: str
-    since_s: float
-    samples: list[tuple[float, float]]
-    """Real time and megabytes, once warm."""
+    since: int
+    """Periods of the mission."""
+    samples: list[tuple[int, float]]
+    """Periods of the mission, and megabytes."""
+
+    @property
+    def warm(self) -> list[tuple[int, float]]:
+        """Samples that count. The last may be of a process that was just then torn down."""
+        return [sample for sample in self.samples[:-1] if sample[0] >= self.since + WARM_UP_PERIODS]
 
 
 class Watch:
     """Samples the processes of one fleet."""
 
-    def __init__(self, fleet: Fleet, periods_per_s: float) -> None:
-        """periods_per_s: of the mission, in real time."""
+    def __init__(self, fleet: Fleet) -> None:
+        """Look at it now and then."""
         self._fleet = fleet
-        self._periods_per_s = periods_per_s
         self._lives: dict[int, _Life] = {}
         self._due_s = 0.0
 
-    def look(self) -> None:
-        """Sample everybody, if it is time."""
+    def look(self, periods: int) -> None:
+        """Sample everybody, if it is time. periods: of the mission so far."""
         now_s = time.monotonic()
         if now_s < self._due_s:
             return
         self._due_s = now_s + _EVERY_S
         for name, pid in self._pids().items():
             mb = resident_mb(pid)
-            if mb is None:
-                continue
-            life = self._lives.setdefault(pid, _Life(_KINDS.get(name, "robot"), now_s, []))
-            if now_s - life.since_s >= WARM_UP_S:
-                life.samples.append((now_s, mb))
+            if mb is not None:
+                life = self._lives.setdefault(pid, _Life(_KINDS.get(name, "robot"), periods, []))
+                life.samples.append((periods, mb))
 
     def _pids(self) -> Mapping[str, int]:
         fleet = self._fleet
@@ -92,13 +97,11 @@ class Watch:
         """By kind of process."""
         total: dict[str, Grown] = {}
         for life in self._lives.values():
-            if len(life.samples) < 2:
-                continue
-            (from_s, from_mb), (until_s, until_mb) = life.samples[0], life.samples[-1]
-            grown_mb = until_mb - from_mb
-            peak_mb = max(mb for _, mb in life.samples)
-            one = Grown(1, (until_s - from_s) * self._periods_per_s, grown_mb, grown_mb, peak_mb)
-            total[life.kind] = total.get(life.kind, Grown()) + one
+            warm = life.warm
+            if warm and warm[-1][0] - warm[0][0] >= LONG_PERIODS:
+                grown_mb, peak_mb = warm[-1][1] - warm[0][1], max(mb for _, mb in warm)
+                one = Grown(1, warm[-1][0] - warm[0][0], grown_mb, grown_mb, peak_mb)
+                total[life.kind] = total.get(life.kind, Grown()) + one
         return total
 
 

@@ -161,10 +161,12 @@ def _run(order: Order, stopped: Interrupts) -> tuple[list[str], dict[str, Grown]
     give_up_s = time.monotonic() + scenario.limit_ns * 1e-9 / order.speed + _GRACE_S
     failures: list[str] = []
     with local_fleet(order) as fleet:
-        watch = Watch(fleet, order.speed / scenario.clock.period_s)
+        watch = Watch(fleet)
+        periods = 0
         try:
-            for _ in watch_progress(fleet):
-                watch.look()
+            for progress in watch_progress(fleet):
+                periods = progress.now_ns // scenario.period_ns if progress else periods
+                watch.look(periods)
                 failures += _newly_failed(fleet)
                 late = time.monotonic() >= give_up_s
                 if late or stopped():
@@ -256,7 +258,8 @@ def _back_s(
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """How long everybody who was started again took, in real seconds: participants, and world-sim.
 
-    Deeds are done one after the other, so a start is ordered when it is due and the deed before is done.
+    Deeds are done one after the other, so a participant's start is ordered when it is due and the deed
+    before is done. Clocks of participants run on while world-sim is down, and it goes on by them.
     """
     due_ns = {
         (deed.fault, deed.who): deed.at_ns for deed in deeds_of(scenario) if deed.what == "start"
@@ -271,7 +274,8 @@ def _back_s(
             if record.what == "kill":
                 killed.add(who)
             elif record.what == "start" and who in killed:
-                ordered_ns[who] = max(before_ns, due_ns[record.fault, who])
+                due = due_ns[record.fault, who]
+                ordered_ns[who] = due if who == WORLD_SIM else max(before_ns, due)
             before_ns = record.now_ns
         elif isinstance(record, Batch) and ordered_ns:
             acted = {act.name for act in record.acts if act.outputs is not None}
@@ -372,7 +376,7 @@ class Totals:
                 f"a life, peak {grown.peak_mb:.0f} MB)"
             )
         if (lasting := self._lasting.grown_mb) is not None:
-            yield f"  memory     campaign {lasting[0]:+.1f} MB, fork server {lasting[1]:+.1f} MB"
+            yield f"  memory     from the third mission on: campaign {lasting[0]:+.1f} MB, fork server {lasting[1]:+.1f} MB"
         yield (
             f"  memory     {'flat' if self._is_flat else 'NOT FLAT'}: bounds {FLAT_MB:g} MB in 1000 "
             f"periods, {FLAT_LASTING_MB:g} MB of what outlives missions"

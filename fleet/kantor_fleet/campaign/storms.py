@@ -27,6 +27,8 @@ SPEED = 8.0
 """Simulated seconds in a real one."""
 LOCKSTEP_EVERY = 6
 """One mission in so many is run in lockstep, the others on the wall."""
+_LONGER = 5.0
+"""In lockstep, where no clock has to be waited for, a storm is so many times as long."""
 
 _ROBOT_KILLS, _SUPERVISOR_KILLS, _WORLD_SIM_KILLS = 10, 3, 1.4
 _ROBOT_PAUSES, _SUPERVISOR_PAUSES, _WORLD_SIM_PAUSES = 9, 2, 0.6
@@ -59,23 +61,24 @@ def is_lockstep(seed: int) -> bool:
 
 def storm(seed: int, speed: float = SPEED, storm_s: float = STORM_S) -> Scenario:
     """The scenario of a seed; the mission is then run with the same seed. storm_s: real seconds."""
-    scenario = _lingering(from_tree(_team(seed, speed, storm_s), f"seed {seed}"), speed)
-    timetable = _Timetable(Dice(seed, _SUBJECT + 1), scenario, speed, storm_s)
+    pace = speed * (_LONGER if is_lockstep(seed) else 1.0)
+    scenario = _lingering(from_tree(_team(seed, speed, pace, storm_s), f"seed {seed}"), speed)
+    timetable = _Timetable(Dice(seed, _SUBJECT + 1), scenario, pace, storm_s)
     faults: list[Fault] = list(timetable.draw())
     for number, kind in enumerate(KINDS):
         if not issubclass(KINDS[kind], OnProcesses):
-            at = Setting(scenario, speed * storm_s, Dice(seed, _SUBJECT + 10 + number))
+            at = Setting(scenario, pace * storm_s, Dice(seed, _SUBJECT + 10 + number))
             faults += _of_links(at, kind)
     # Once more through the parser: what a campaign runs is what a user can write.
     whole = msgspec.structs.replace(scenario, faults=tuple(faults))
     return from_tree(to_tree(whole), f"seed {seed}")
 
 
-def _team(seed: int, speed: float, storm_s: float) -> Tree:
+def _team(seed: int, speed: float, pace: float, storm_s: float) -> Tree:
     dice = Dice(seed, _SUBJECT)
     robots, merge = dice.whole(4, 6), dice.one_of(["ledger", "min"])
     period_s = short(speed * dice.between(0.09, 0.14))
-    steps = max(20, round(_SPENDING_SHARE * speed * storm_s / period_s))
+    steps = max(20, round(_SPENDING_SHARE * pace * storm_s / period_s))
     side_m = dice.between(100.0, 400.0)
     spread = dice.between(0.0, 0.2) if dice.coin() else 0.0
     return {
@@ -84,7 +87,7 @@ def _team(seed: int, speed: float, storm_s: float) -> Tree:
         "coordination": "centralized",
         "merge": merge,
         "claims": merge == "ledger" and dice.coin(),
-        "limit_s": short(speed * (storm_s + _REST_S)),
+        "limit_s": short(pace * (storm_s + _REST_S)),
         "domain": {"min_m": [0.0, 0.0], "max_m": [side_m, side_m]},
         "robots": {"count": robots},
         "starts": {"random": True},
@@ -128,9 +131,9 @@ def _of_links(at: Setting, kind: str) -> Iterator[Fault]:
 class _Timetable:
     """When which process is hit. Times in here are real seconds since the start."""
 
-    def __init__(self, dice: Dice, scenario: Scenario, speed: float, storm_s: float) -> None:
+    def __init__(self, dice: Dice, scenario: Scenario, pace: float, storm_s: float) -> None:
         self._dice, self._scenario = dice, scenario
-        self._speed, self._storm_s = speed, storm_s
+        self._pace, self._storm_s = pace, storm_s
         names = (*scenario.roster, WORLD_SIM)
         self._taken: dict[ParticipantId, list[tuple[float, float]]] = {name: [] for name in names}
         self._faults: list[Fault] = []
@@ -245,9 +248,9 @@ class _Timetable:
         takes_s: float | None = 0.0,
     ) -> bool:
         """Note a fault, unless it cannot be there with the others."""
-        tree: Tree = {"kind": kind, "who": [name], "from_s": short(from_s * self._speed)} | more
+        tree: Tree = {"kind": kind, "who": [name], "from_s": short(from_s * self._pace)} | more
         if until_s is not None and until_s < math.inf:
-            tree["until_s"] = short(until_s * self._speed)
+            tree["until_s"] = short(until_s * self._pace)
         fault = msgspec.convert(tree, KINDS[kind])
         if any(of_faults.complaints([fault], self._scenario, self._faults)):
             return False
