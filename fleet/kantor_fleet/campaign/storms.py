@@ -214,6 +214,7 @@ class _Timetable:
         **more: object,
     ) -> bool:
         """Somewhere in the storm, if there is room. takes_s: real time that one without an end takes."""
+        length_s = None if length_s is None else min(length_s, self._storm_s / 3.0)
         room_s = length_s or takes_s
         for _ in range(_TRIES):
             from_s = _CALM_START_S + self._dice.unit() * (self._storm_s - _CALM_START_S - room_s)
