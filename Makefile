@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 KANTOR := $(BIN)/kantor
 
-.PHONY: help demo test check lint types contracts format paper bench campaign mutants clean
+.PHONY: help demo test check lint types contracts format paper bench campaign mutants fuzz clean
 
 help:
 	@echo "make demo    set up, then five robot processes explore on the bus and leave a picture"
@@ -13,7 +13,8 @@ help:
 	@echo "make paper   the first paper's figures with a verdict beside each number (kantor reproduce all)"
 	@echo "make bench   speed, as ratios in one run"
 	@echo "make campaign  2000 drawn missions full of faults, every referee on"
-	@echo "make mutants planted bugs, and which referee catches each: docs/mutants.md"
+	@echo "make mutants  planted bugs, and which referee catches each: docs/mutants.md"
+	@echo "make fuzz    a million inputs for every decoder"
 
 demo: $(VENV)/.installed $(VENV)/.kernels
 	$(KANTOR) run fleet --exchange wall --speed 4
@@ -48,6 +49,9 @@ campaign: $(VENV)/.installed $(VENV)/.kernels
 
 mutants: $(VENV)/.developing $(VENV)/.kernels
 	$(BIN)/python tests/campaign/mutants.py
+
+fuzz: $(VENV)/.developing $(VENV)/.kernels
+	$(BIN)/python tests/fuzz/fuzz.py
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit("kantor needs Python 3.11 or newer" if sys.version_info < (3, 11) else 0)'

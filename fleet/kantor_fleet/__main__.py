@@ -308,6 +308,7 @@ def reproduce(
             "kme-fig7",
             "kme-fig8",
             "kme-all",
+            "resilience",
         ],
         tyro.conf.Positional,
     ] = "all",

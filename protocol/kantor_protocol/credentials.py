@@ -76,7 +76,7 @@ def find(place: Path, user: ParticipantId) -> Identity:
 def _read(path: Path) -> Identity | None:
     try:
         return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), Identity)
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, msgspec.ValidationError):
+    except (OSError, ValueError, RecursionError):  # not to be read, no text, no TOML, no identity
         return None
 
 

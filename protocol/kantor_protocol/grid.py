@@ -58,9 +58,8 @@ class Frame(msgspec.Struct, frozen=True, array_like=True):
     def cell_of(self, x_m: float, y_m: float) -> int:
         """The cell at a place in the world, or NOWHERE."""
         u, v = self.uv(x_m, y_m)
-        column, row = math.floor(u), math.floor(v)
-        if 0 <= row < self.rows and 0 <= column < self.columns:
-            return row * self.columns + column
+        if 0.0 <= u < self.columns and 0.0 <= v < self.rows:  # not so for what is no number
+            return int(v) * self.columns + int(u)
         return NOWHERE
 
     def centre_of(self, cell: int) -> tuple[float, float]:

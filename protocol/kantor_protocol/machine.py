@@ -8,9 +8,10 @@ The records are out of the garbage collector's sight (`gc=False`): frozen values
 
 import enum
 from collections.abc import Callable, Mapping
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import msgspec
+from msgspec import Meta
 
 ParticipantId = str
 """`r1`, `r2`, … for robots, `supervisor` for the supervisor."""
@@ -85,7 +86,7 @@ class Observation(msgspec.Struct, frozen=True, array_like=True, gc=False):
 class Inputs(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What reached a participant since its last step."""
 
-    now_ns: int
+    now_ns: Annotated[int, Meta(ge=-(2**62), le=2**62)]
     observation: Observation
     inbox: tuple[Envelope, ...] = ()
     """In order of arrival."""

@@ -442,6 +442,8 @@ def from_tree(tree: dict[str, Any], origin: str) -> Scenario:
         scenario = msgspec.convert(tree, Scenario)
     except msgspec.ValidationError as error:
         raise ScenarioError(f"{origin}: {_readable(str(error), tree)}") from None
+    except UnicodeEncodeError:  # a shell passes on whatever bytes it is given
+        raise ScenarioError(f"{origin}: a text in it is not UTF-8; write it so") from None
     for complaint in _complaints(scenario):
         raise ScenarioError(f"{origin}: {complaint}")
     return scenario

@@ -693,12 +693,19 @@ def lost_step_count(patch: Patch) -> None:
 
 
 def _ignoring(patch: Patch, kind: type) -> None:
-    def make(holds: Any) -> Any:
-        return lambda self, fault, now_ns: (
-            not isinstance(fault, kind) and holds(self, fault, now_ns)
-        )
+    """Whoever runs the mission lets those act whom such a fault stops."""
 
-    _wrap(patch, Outages, "_holds", make)
+    def make(init: Any) -> Any:
+        def made(self: Outages, *arguments: Any, **named: Any) -> None:
+            init(self, *arguments, **named)
+            self._stops = {
+                name: [fault for fault in faults if not isinstance(fault, kind)]
+                for name, faults in self._stops.items()
+            }
+
+        return made
+
+    _wrap(patch, Outages, "__init__", make)
 
 
 @mutant("the dead go on acting", _has(Kill))

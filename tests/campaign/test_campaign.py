@@ -23,7 +23,7 @@ from kantor_protocol.scenario import load
 from kantor_worldsim.journal import read
 from kantor_worldsim.recording import JOURNAL
 
-FRESH = 150
+FRESH = 120
 """Seeds that nobody has run before: those of today."""
 
 BUGS = {mutant.name: mutant for mutant in MUTANTS}

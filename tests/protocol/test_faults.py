@@ -1,6 +1,7 @@
 """Faults as data: read, written, and refused in one line when they cannot apply."""
 
-from itertools import permutations
+from collections.abc import Sequence
+from itertools import combinations, permutations
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,64 @@ queue_bytes = 0
 [[faults]]
 kind = "range"
 range_m = 12.0
+
+[[faults]]
+kind = "hostile"
+probability = 0.1
+
+[[faults]]
+kind = "kill"
+who = ["r1", "r2"]
+from_s = 1.0
+until_s = 2.0
+disk = "torn"
+mid_step = true
+
+[[faults]]
+kind = "pause"
+who = ["r1"]
+from_s = 2.0
+until_s = 3.0
+
+[[faults]]
+kind = "late"
+who = ["r3"]
+until_s = 0.5
+
+[[faults]]
+kind = "slow"
+who = ["r3"]
+from_s = 4.0
+every = 3
+
+[[faults]]
+kind = "full-disk"
+who = ["r1", "r2"]
+from_s = 5.0
+until_s = 6.0
+
+[[faults]]
+kind = "clock"
+who = ["r1", "r3"]
+from_s = 0.5
+offset_s = -3.0
+rate_ppm = 100.0
+
+[[faults]]
+kind = "impostor"
+who = ["r2"]
+from_s = 3.0
+
+[[faults]]
+kind = "kill"
+who = ["worldsim"]
+from_s = 8.0
+until_s = 9.0
 """
+
+
+Entry = dict[str, Any]
+"""A fault as a table."""
 
 
 def refusal(text: str, *overrides: str) -> str:
@@ -199,6 +257,97 @@ REFUSED = {
         {"kind": "range", "range_m": 1.0, "factor": 0.5},
         "faults[0].range_m: set either range_m or factor",
     ),
+    "nothing hostile": (
+        {"kind": "hostile", "probability": 0.0},
+        "faults[0].probability: expected `float` > 0.0",
+    ),
+    "kill of whom": ({"kind": "kill"}, "faults[0].who: missing; set it"),
+    "kill of nobody": ({"kind": "kill", "who": []}, "faults[0].who: expected `array` of length >="),
+    "kill of a stranger": (
+        {"kind": "kill", "who": ["r1", "r9"]},
+        "faults[0].who: r9 is not in the team; known: r1 to r3",
+    ),
+    "kill of no supervisor": (
+        {"kind": "kill", "who": ["supervisor"]},
+        "faults[0].who: supervisor is not in the team; known: r1 to r3",
+    ),
+    "killed twice at once": (
+        {"kind": "kill", "who": ["r1", "r1"]},
+        "faults[0].who: r1 is named twice; name it once",
+    ),
+    "kill before the start": (
+        {"kind": "kill", "who": ["r1"], "from_s": -1},
+        "faults[0].from_s: expected `float` >= 0.0",
+    ),
+    "kill after the end": (
+        {"kind": "kill", "who": ["r1"], "from_s": 17},
+        "faults[0].from_s: 17 s is never reached; the mission is cut at 16.5 s",
+    ),
+    "start before the kill": (
+        {"kind": "kill", "who": ["r1"], "from_s": 3, "until_s": 2},
+        "faults[0].until_s: 2 s is not after from_s, 3 s; set a later end",
+    ),
+    "unknown disk": (
+        {"kind": "kill", "who": ["r1"], "disk": "burnt"},
+        "faults[0].disk: 'burnt' is not known; known: kept, torn, lost",
+    ),
+    "kill of the world for good": (
+        {"kind": "kill", "who": ["worldsim"], "from_s": 1},
+        "faults[0].until_s: missing; a mission cannot end without world-sim",
+    ),
+    "world that forgets": (
+        {"kind": "kill", "who": ["worldsim"], "until_s": 1, "disk": "lost"},
+        "faults[0].disk: only for participants; leave it out for worldsim",
+    ),
+    "world killed in a step": (
+        {"kind": "kill", "who": ["worldsim"], "until_s": 1, "mid_step": True},
+        "faults[0].mid_step: only for participants; leave it out for worldsim",
+    ),
+    "endless pause": (
+        {"kind": "pause", "who": ["r1"]},
+        "faults[0].until_s: missing; a pause needs an end",
+    ),
+    "endlessly full": (
+        {"kind": "full-disk", "who": ["r1"]},
+        "faults[0].until_s: missing; a full-disk needs an end",
+    ),
+    "full disk of the world": (
+        {"kind": "full-disk", "who": ["worldsim"], "until_s": 1},
+        "faults[0].who: worldsim is not in the team; known: r1 to r3",
+    ),
+    "endlessly late": (
+        {"kind": "late", "who": ["r1"]},
+        "faults[0].until_s: missing; a late needs an end",
+    ),
+    "late in the middle": (
+        {"kind": "late", "who": ["r1"], "from_s": 1, "until_s": 2},
+        "faults[0].from_s: a late joiner is missing from the start; leave it out",
+    ),
+    "everybody late": (
+        {"kind": "late", "who": ["r3", "r1", "r2"], "until_s": 2},
+        "faults[0].who: nobody would be there at the start; leave out a robot",
+    ),
+    "slow as ever": (
+        {"kind": "slow", "who": ["r1"], "every": 1},
+        "faults[0].every: expected `int` >= 2",
+    ),
+    "slow without a rate": ({"kind": "slow", "who": ["r1"]}, "faults[0].every: missing; set it"),
+    "right clock": (
+        {"kind": "clock", "who": ["r1"], "rate_ppm": 0.4},
+        "faults[0].offset_s: the clock is right; set it, or rate_ppm",
+    ),
+    "clock of another day": (
+        {"kind": "clock", "who": ["r1"], "offset_s": 4000.0},
+        "faults[0].offset_s: expected `float` <= 3600.0",
+    ),
+    "impostor that stays": (
+        {"kind": "impostor", "who": ["r1"], "from_s": 1, "until_s": 2},
+        "faults[0].until_s: an impostor asks once, at from_s; leave it out",
+    ),
+    "impostor of the world": (
+        {"kind": "impostor", "who": ["worldsim"]},
+        "faults[0].who: worldsim is not in the team; known: r1 to r3",
+    ),
     "half of infinity": (
         {"kind": "range", "factor": 0.5},
         "faults[0].factor: radio.range_m is infinite and stays so; set range_m",
@@ -220,7 +369,8 @@ def test_what_cannot_apply_is_refused(name: str) -> None:
 def test_the_entry_is_counted() -> None:
     text = EVERY_KIND + '[[faults]]\nkind = "drop"\nprobability = 1\nuntil_s = 0\n'
 
-    assert refusal(text).startswith("faults[11].until_s: 0 s is not after from_s, 0 s")
+    place = EVERY_KIND.count("[[faults]]")
+    assert refusal(text).startswith(f"faults[{place}].until_s: 0 s is not after from_s, 0 s")
 
 
 def test_range_must_shrink() -> None:
@@ -240,6 +390,119 @@ def test_nowhere_is_in_no_range() -> None:
     """A supervisor without a place on the map."""
     with pytest.raises(ScenarioError, match="the supervisor has no place on the map"):
         exploration("coordination=centralized", fault(kind="range", range_m=5.0))
+
+
+# Two that cannot go together.
+
+
+def process(kind: str, who: str, *window: float, **more: Any) -> Entry:
+    """An entry that befalls one process within a window."""
+    return {
+        "kind": kind,
+        "who": [who],
+        **dict(zip(("from_s", "until_s"), window, strict=False)),
+        **more,
+    }
+
+
+def kill(who: str, *window: float, **more: Any) -> Entry:
+    return process("kill", who, *window, **more)
+
+
+TOGETHER = {
+    "two kills": (
+        (kill("r1", 1, 3), kill("r1", 2, 4)),
+        "faults[1].who: r1 has a kill then already, by faults[0]; move one of the two",
+    ),
+    "listed late": (
+        (kill("r1", 2, 4), kill("r1", 1, 3)),
+        "faults[1].who: r1 has a kill then already, by faults[0]; move one of the two",
+    ),
+    "kill of the dead": (
+        (kill("r2", 1), kill("r1", 1), kill("r2", 9, 10)),
+        "faults[2].who: r2 has a kill then already, by faults[0]; move one of the two",
+    ),
+    "pause of the dead": (
+        (kill("r1", 1, 3), process("pause", "r1", 2, 4)),
+        "faults[1].who: r1 has a kill then already, by faults[0]; move one of the two",
+    ),
+    "kill of whom is not there": (
+        (process("late", "r1", 0, 2), kill("r1", 1, 3)),
+        "faults[1].who: r1 has a late then already, by faults[0]; move one of the two",
+    ),
+    "paused and slow": (
+        (process("slow", "r1", every=2), process("pause", "r1", 2, 4)),
+        "faults[1].who: r1 has a slow then already, by faults[0]; move one of the two",
+    ),
+    "full disk of the dead": (
+        (process("full-disk", "r1", 1, 3), kill("r1", 2)),
+        "faults[1].who: r1 has a full-disk then already, by faults[0]; move one of the two",
+    ),
+    "two ends of the world": (
+        (kill("worldsim", 1, 3), process("pause", "worldsim", 2, 4)),
+        "faults[1].who: worldsim has a kill then already, by faults[0]; move one of the two",
+    ),
+    "unseen death": (
+        (kill("worldsim", 1, 3), kill("r1", 2, 4)),
+        "faults[1]: world-sim is down at from_s of a kill, see faults[0]; move it",
+    ),
+    "unseen return": (
+        (kill("r1", 1, 3), process("pause", "worldsim", 2, 4)),
+        "faults[1]: world-sim is down at until_s of a kill, see faults[0]; move it",
+    ),
+    "impostor of the dead": (
+        (process("impostor", "r1", 2), kill("r1", 1, 3)),
+        "faults[1]: r1 is away when its impostor comes, who would be let in, see faults[0]; move it",
+    ),
+}
+
+
+def said_of(faults: Sequence[Entry], *overrides: str) -> str:
+    """What is wrong with a list of faults; empty if nothing is."""
+    try:
+        from_tree({**to_tree(mission(*overrides)), "faults": list(faults)}, "small")
+    except ScenarioError as error:
+        return str(error).removeprefix("small: ")
+    return ""
+
+
+@pytest.mark.parametrize("name", TOGETHER)
+def test_what_cannot_go_together_is_refused(name: str) -> None:
+    faults, says = TOGETHER[name]
+
+    assert said_of(faults) == says
+
+
+@pytest.mark.parametrize(
+    "faults",
+    [
+        (kill("r1", 1, 3), kill("r1", 3, 4)),
+        (kill("r1", 1, 3), kill("r2", 2, 4)),
+        (kill("r1", 1, 3), process("clock", "r1", 2, 4, offset_s=1.0)),
+        (kill("r1", 1, 3), process("impostor", "r1", 3)),
+        (kill("worldsim", 1, 3), kill("r1", 3, 4)),
+        (kill("r1", 1, 5), process("pause", "worldsim", 2, 4)),
+        (process("pause", "worldsim", 1, 3), process("pause", "r1", 2, 4)),
+    ],
+)
+def test_what_can_go_together_is_a_mission(faults: tuple[Entry, ...]) -> None:
+    assert said_of(faults) == ""
+
+
+WINDOWS = st.tuples(st.integers(0, 8), st.integers(1, 4)).map(lambda w: (w[0], w[0] + w[1]))
+
+
+@examples(100)
+@given(windows=st.lists(WINDOWS, min_size=1, max_size=4), pauses=st.sets(st.integers(0, 3)))
+def test_nobody_is_stopped_twice_at_once(windows: list[tuple[int, int]], pauses: set[int]) -> None:
+    """Refused if, and only if, two windows share a moment."""
+    faults = [
+        process("pause" if i in pauses else "kill", "r2", *window)
+        for i, window in enumerate(windows)
+    ]
+    shared = any(one[0] < two[1] and two[0] < one[1] for one, two in combinations(windows, 2))
+
+    assert bool(said_of(faults)) == shared
 
 
 # Partitions.
@@ -304,6 +567,18 @@ def test_a_file_adds_its_faults_behind(tmp_path: Path) -> None:
 
     assert storm.faults == (*own.faults, *parse(SMALL + EVERY_KIND, "small").faults)
     assert parse(to_toml(storm), "written") == storm
+
+
+def test_a_file_cannot_kill_who_is_dead_already(tmp_path: Path) -> None:
+    """By the scenario's own faults, which are in order."""
+    own = mission(fault(kind="kill", who=["r1"], from_s=1, until_s=3))
+    with pytest.raises(ScenarioError) as caught:
+        chaos(tmp_path, "[[faults]]\nkind='kill'\nwho=['r2', 'r1']\nfrom_s=2\nuntil_s=4", own)
+
+    assert str(caught.value) == (
+        f"{tmp_path / 'storm.toml'}: faults[0].who: r1 has a kill then already, "
+        f"by the scenario's faults[0]; move one of the two"
+    )
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from kantor_protocol.keyed import Purpose, generator
 from kantor_protocol.scenario import Domain, Gaussian, Scenario, ScenarioError, is_image
+from kantor_worldsim.maps import UNREADABLE
 
 Points = npt.NDArray[np.float64]
 
@@ -102,7 +103,7 @@ def _from_image(
             grey = np.asarray(image.convert("F"), dtype=np.float64)
     except FileNotFoundError:
         raise ScenarioError(f"{key}.file: {file}: no such file") from None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except (*UNREADABLE, Image.DecompressionBombError) as error:
         raise ScenarioError(f"{key}.file: {file}: not a readable image: {error}") from None
     if not np.isfinite(grey).all() or grey.min() < 0.0 or grey.sum() <= 0.0:
         raise ScenarioError(f"{key}.file: {file}: no bright pixel; white is dense, black is empty")
@@ -121,7 +122,7 @@ def _points(key: str, file: str) -> Points:
         points = _csv(path) if path.suffix.lower() == ".csv" else _npy(path)
     except FileNotFoundError:
         raise ScenarioError(f"{key}.file: {file}: no such file") from None
-    except (OSError, ValueError, SyntaxError, TokenError, MemoryError) as error:
+    except (*UNREADABLE, TokenError) as error:
         problem = str(error).splitlines()[0]
         raise ScenarioError(f"{key}.file: {file}: not a table of x, y: {problem}") from None
     if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind not in "fiu":

@@ -36,9 +36,9 @@ _GREY_UNKNOWN = 205
 """What map_saver writes for unknown cells: (255 - 205) / 255 = 0.196 occupied."""
 
 _FORMATS = ("BMP", "JPEG", "PNG", "PPM", "TIFF")
-_UNREADABLE = (
+UNREADABLE = (
     *(OSError, ValueError, SyntaxError, EOFError, struct.error, MemoryError),
-    *(TypeError, KeyError, IndexError, OverflowError),  # Pillow on mangled headers
+    *(TypeError, KeyError, IndexError, OverflowError),  # Pillow and numpy on mangled headers
 )
 
 
@@ -210,7 +210,7 @@ def _picture(path: Path, place: str) -> _Picture:
         raise ScenarioError(f"{place} {path}: no such file") from None
     except ScenarioError:
         raise
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         raise ScenarioError(f"{place} {path}: not a readable image: {error}") from None
 
 

@@ -119,7 +119,7 @@ def run(
     else:
         doorway.open(lambda: stage.done_ns)
         reason = simulate(stage, _Lockstep(doorway), plan.seed, stopped)
-    doorway.dismiss(reason)
+    doorway.dismiss(reason, 0.0 if past is None else _COME_BACK_S)
     recording.refused_at_door = doorway.refused
     result = recording.finish()
     doorway.tell_progress("over", reason)
@@ -234,11 +234,18 @@ class _Doorway:
             return self._hear(event)
         return None
 
-    def dismiss(self, reason: str) -> None:
-        """Tell everybody that the mission is over."""
-        for name in self._plan.scenario.roster:
-            if self._admission.player(name) is not None:
+    def dismiss(self, reason: str, patience_s: float) -> None:
+        """Tell everybody that the mission is over. patience_s: for those that have yet to come back."""
+        give_up = time.monotonic() + patience_s
+        waiting = set(self._plan.scenario.roster)
+        while waiting:
+            for name in sorted(filter(self.is_there, waiting)):
                 self.host.send(name, encode(Stop(VERSION, reason)), patiently=True)
+                waiting.discard(name)
+            waiting -= self.excused
+            if time.monotonic() >= give_up:
+                return
+            self.next(_POLL_S)
 
     def _mind_own_absence(self) -> None:
         """Who left while world-sim itself was frozen gets time to come back."""

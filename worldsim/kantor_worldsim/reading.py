@@ -287,7 +287,9 @@ def _read_envelope(tables: Tables, row: np.ndarray, at: int) -> int:
     row[SOURCE], at = _place(tables, at)
     row[SEQUENCE], at = _number(tables.payload, at)
     row[TARGET], at = _place(tables, at)
-    _, size, at = head_of(tables.payload, at)
+    kind, size, at = head_of(tables.payload, at)
+    if kind != BYTES or at < 0:
+        return _MALFORMED
     row[BODY], row[BODY_END] = at, at + size
     return at + size
 

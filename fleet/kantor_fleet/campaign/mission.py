@@ -10,6 +10,7 @@ import msgspec
 
 from kantor_fleet.campaign.dice import Dice
 from kantor_fleet.campaign.draw import sort_of
+from kantor_fleet.campaign.joins import differing
 from kantor_fleet.campaign.sightings import Sightings
 from kantor_fleet.campaign.struck import Struck
 from kantor_fleet.experiment import Case, Outcome, reason
@@ -25,7 +26,8 @@ from kantor_worldsim.world import Site
 TWICE_EVERY = 20
 """One seed in so many is executed twice, for the same digest."""
 CUT_EVERY = 25
-"""One in so many has its journal cut anywhere, for a record that is still sound."""
+"""One in so many has its journal cut anywhere, for a record that is still sound, and its messages learned in
+another order."""
 _CUTS = 3
 _SUBJECT = 1000
 
@@ -56,6 +58,8 @@ class Trial(Outcome, frozen=True, kw_only=True):
     """1: executed twice."""
     cut: int = 0
     """How often its journal was cut."""
+    joined: int = 0
+    """1: all that was said in it was learned in another order."""
 
     @property
     def violation(self) -> str | None:
@@ -157,6 +161,8 @@ def _attempt(case: Case) -> dict[str, Any]:
         complaints = tuple(_differing(scenario, seed, result.digest))
     if cut and not complaints:
         complaints = tuple(_cut_open(seed, follower.payloads))
+    if cut and not complaints:
+        complaints = tuple(differing(scenario, seed, map(decode_record, follower.payloads)))
     return {
         "ended": ended,
         "steps": follower.steps,
@@ -168,6 +174,7 @@ def _attempt(case: Case) -> dict[str, Any]:
         | {f"{rule} judged": 1 for rule in sorted(follower.judged)},
         "twice": int(twice),
         "cut": _CUTS if cut else 0,
+        "joined": int(cut and not scenario.mapping),
     }
 
 

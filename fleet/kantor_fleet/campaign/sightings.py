@@ -31,6 +31,11 @@ class _Sight:
         self.scenario: Scenario = opening.scenario
         self.seen: Counter[str] = Counter()
 
+    @classmethod
+    def can_be(cls, _scenario: Scenario) -> bool:
+        """Whether there is anything to look for in a mission."""
+        return True
+
     def act(self, act: Act, outputs: Outputs) -> None:
         """Somebody stepped."""
 
@@ -142,6 +147,10 @@ class _Memory(_Sight):
 
     names = ("late joiner knows all that was known", "log of a former incarnation came back")
 
+    @classmethod
+    def can_be(cls, scenario: Scenario) -> bool:
+        return any(isinstance(fault, Kill | Late) for fault in scenario.faults)
+
     def __init__(self, opening: Opening) -> None:
         super().__init__(opening)
         self._bodies: dict[ParticipantId, bytes] = {}
@@ -190,11 +199,13 @@ class _Goals(_Sight):
 
     names = ("merge that removes the current goal", "one goal of two, left to one by a claim")
 
+    @classmethod
+    def can_be(cls, scenario: Scenario) -> bool:
+        return scenario.planner.name == "transport" and scenario.samples.diffusion_m == 0.0
+
     def __init__(self, opening: Opening) -> None:
         super().__init__(opening)
-        standing = self.scenario.samples.diffusion_m == 0.0
-        transport = self.scenario.planner.name == "transport" and standing
-        places = opening.site.samples_m.tolist() if transport else []
+        places = opening.site.samples_m.tolist()
         self._samples = {(x, y): i for i, (x, y) in enumerate(places)}
         self._goals: dict[ParticipantId, Pair | None] = {}
         self._pairs = Pairs()
@@ -224,6 +235,10 @@ class _Sides(_Sight):
     """What two sides of a partition did without knowing of each other."""
 
     names = ("partition healed after both sides consumed one sample",)
+
+    @classmethod
+    def can_be(cls, scenario: Scenario) -> bool:
+        return any(isinstance(fault, Partition) for fault in scenario.faults)
 
     def __init__(self, opening: Opening) -> None:
         super().__init__(opening)
@@ -313,6 +328,7 @@ class Sightings:
     def __init__(self) -> None:
         self._sights: list[_Sight] = []
         self._acting: list[Callable[[Act, Outputs], None]] = []
+        self._batching: list[Callable[[Batch], None]] = []
 
     def take(self, record: Record) -> None:
         """Follow one record."""
@@ -321,14 +337,15 @@ class Sightings:
                 if act.outputs is not None:
                     for look in self._acting:
                         look(act, act.outputs)
-            for sight in self._sights:
-                sight.batch(record)
+            for follow in self._batching:
+                follow(record)
         elif isinstance(record, Incident):
             for sight in self._sights:
                 sight.incident(record)
         elif isinstance(record, Opening):
-            self._sights = [sight(record) for sight in _SIGHTS]
+            self._sights = [sight(record) for sight in _SIGHTS if sight.can_be(record.scenario)]
             self._acting = [s.act for s in self._sights if type(s).act is not _Sight.act]
+            self._batching = [s.batch for s in self._sights if type(s).batch is not _Sight.batch]
 
     @property
     def counts(self) -> dict[str, int]:

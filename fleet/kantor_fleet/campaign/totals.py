@@ -26,6 +26,7 @@ class Totals:
         self.robot_hours = 0.0
         self.twice = 0
         self.cuts = 0
+        self.joined = 0
         self.sorts: Counter[str] = Counter()
         self.planners: Counter[str] = Counter()
         self.ended: Counter[str] = Counter()
@@ -44,6 +45,7 @@ class Totals:
         self.robot_hours += trial.simulated_s * trial.robots / 3600.0
         self.twice += trial.twice
         self.cuts += trial.cut
+        self.joined += trial.joined
         self.sorts[trial.sort] += 1
         self.planners[trial.planner + ("*" if trial.centralized else "")] += 1
         self.ended[trial.ended] += 1
@@ -70,7 +72,8 @@ class Totals:
         yield f"  planners   {_listed(self.planners)}  (* with a supervisor)"
         yield (
             f"  simulated  {self.robot_hours:.1f} robot-hours, {self.steps} robot-steps; "
-            f"{self.twice} missions executed twice, {self.cuts} journals cut"
+            f"{self.twice} missions executed twice, {self.cuts} journals cut, "
+            f"{self.joined} records learned in another order"
         )
         yield (
             f"  faults     {on_links} copies of messages touched, {on_processes} processes hit, "

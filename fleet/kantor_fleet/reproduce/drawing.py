@@ -1,6 +1,7 @@
 """The paper's figures, drawn from records and rows. A run that is drawn has seed 0 unless told."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -139,6 +140,43 @@ def diffusion(
         )
     tidy(axes, "diffusion rate v, m a tick", "detected, %")
     add_caption(axes, axes.get_legend_handles_labels()[0])
+    return figure
+
+
+class Course(NamedTuple):
+    """A line of means."""
+
+    x: Sequence[float]
+    estimates: Sequence[tuple[float, float, float]]
+    """Mean, and the ends of its interval."""
+
+
+class Panel(NamedTuple):
+    """A diagram of lines."""
+
+    x_label: str
+    y_label: str
+    courses: Mapping[str, Course]
+
+
+def resilience(panels: Sequence[Panel], columns: int) -> Figure:
+    """Means with 95 % intervals against three kinds of faults; a row for each measure."""
+    figure = Figure(
+        figsize=(3.9 * columns, 3.3 * (len(panels) // columns) + 0.4), layout=new_layout()
+    )
+    places = figure.subplots(len(panels) // columns, columns, squeeze=False, sharey="row")
+    for letter, axes, panel in zip("abcdefgh", places.flat, panels, strict=False):
+        for (name, course), colour in zip(panel.courses.items(), (SECOND, THIRD), strict=False):
+            mean, low, high = np.array(course.estimates).T
+            axes.fill_between(course.x, low, high, color=colour, alpha=0.22, lw=0.0)
+            axes.plot(course.x, mean, color=colour, marker="o", ms=4.0, lw=1.6, label=name)
+        axes.set_xticks(panel.courses[next(iter(panel.courses))].x)
+        tidy(axes, panel.x_label, panel.y_label if axes in places[:, 0] else "")
+        write_title(axes, f"({letter})")
+    for row in places:
+        if "tick" in row[0].get_ylabel():
+            row[0].set_ylim(bottom=0.0)
+    legend_below(figure, places[0, 0])
     return figure
 
 

@@ -8,6 +8,7 @@ from kantor_fleet.catalog import find
 from kantor_fleet.experiment import Case, Outcome, reason
 from kantor_fleet.sweep.plan import Key, plan
 from kantor_fleet.team import play, team
+from kantor_protocol.life import Mortal
 from kantor_protocol.machine import SUPERVISOR, Inputs, Outputs, StateMachine
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.metrics import Row
@@ -91,12 +92,17 @@ def fly(case: Case) -> Flight:
 def _fly(case: Case) -> Flight:
     scenario, seed = case.scenario, case.seed
     site = Site.of(scenario, seed)
-    machines = {name: _Timed(machine) for name, machine in team(scenario, seed, site).items()}
+    machines = team(scenario, seed, site)
+    timed = {
+        name: _Timed(machine)
+        for name, machine in machines.items()
+        if not isinstance(machine, Mortal)  # one that is killed is told so by its own name
+    }
     recording = Recording(
         scenario, seed, "in-process", exact_every=EXACT_EVERY if case.exact else None
     )
-    play(scenario, seed, site, [recording.take], machines=machines)
-    spent_ns = sum(timed.spent_ns for name, timed in machines.items() if name != SUPERVISOR)
+    play(scenario, seed, site, [recording.take], machines=machines | timed)
+    spent_ns = sum(each.spent_ns for name, each in timed.items() if name != SUPERVISOR)
     result = recording.finish()
     rows = recording.metrics.rows
     mapping = scenario.map is not None

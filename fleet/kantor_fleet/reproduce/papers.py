@@ -1,9 +1,9 @@
 """The figures of all papers by name."""
 
-from kantor_fleet.reproduce import burgard, kabir_lee, kme
+from kantor_fleet.reproduce import burgard, kabir_lee, kme, resilience
 from kantor_fleet.reproduce.figure import Figure
 
-FIGURES = kabir_lee.FIGURES | burgard.FIGURES | kme.FIGURES
+FIGURES = kabir_lee.FIGURES | burgard.FIGURES | kme.FIGURES | resilience.FIGURES
 
 
 def figures(name: str) -> dict[str, Figure]:

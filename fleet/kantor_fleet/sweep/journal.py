@@ -16,6 +16,7 @@ from kantor_fleet.experiment import Outcome
 from kantor_fleet.sweep.plan import Key, SweepError
 
 _FORMAT = 1
+_UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
 
 
 class _Header(msgspec.Struct, frozen=True):
@@ -93,7 +94,7 @@ class Journal:
     def _check(self, first: bytes) -> None:
         try:
             header = msgspec.json.decode(first, type=_Header)
-        except msgspec.MsgspecError:
+        except _UNREADABLE:
             raise SweepError(f"{self._path}: no journal of a sweep; give another --out") from None
         if header != self._header:
             raise SweepError(
@@ -105,7 +106,7 @@ class Journal:
         try:
             run = msgspec.json.decode(line, type=_Line)
             outcome = msgspec.json.decode(run.outcome, type=self._kind)
-        except msgspec.MsgspecError as error:
+        except _UNREADABLE as error:
             raise SweepError(
                 f"{self._path}: line {number} is no run ({error}); remove it"
             ) from None
