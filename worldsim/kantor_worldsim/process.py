@@ -113,6 +113,7 @@ def run(
         stage = Stage.resumed(plan.scenario, plan.seed, plan.site, past.records, listeners)
         doorway.recall(past.records)
     doorway.stage = stage
+    stage.forget()
     doorway.gather(plan.patience_s if past is None else RETURN_S)
     if plan.exchange == "wall":
         reason = _Relay(doorway, stage, plan, resumed=past is not None).run()
