@@ -237,6 +237,8 @@ class _Doorway:
 
     def dismiss(self, reason: str, patience_s: float) -> None:
         """Tell everybody that the mission is over. patience_s: for those that have yet to come back."""
+        self._clock = None  # the record has ended
+        self._doubtful.clear()
         give_up = time.monotonic() + patience_s
         waiting = set(self._plan.scenario.roster)
         while waiting:
