@@ -29,17 +29,24 @@ from kantor_worldsim.world import Site, World
 
 def verify(folder: Path) -> Exit:
     """Print a verdict on each thing that can be verified; NOT_MET if any differs."""
+    found = verdicts(folder)
+    for held, line in found:
+        print(f"{'ok  ' if held else 'FAIL'}  {line}")
+    return Exit.DONE if all(held for held, _ in found) else Exit.NOT_MET
+
+
+def verdicts(folder: Path) -> "list[Verdict]":
+    """A verdict on each thing that can be verified."""
     manifest = _manifest(folder)
     try:
         records = list(read(folder / JOURNAL))
     except FileNotFoundError:
         fail(Exit.USAGE, f"{folder / JOURNAL}: no such file; give a folder that a run left")
     if not records or not isinstance(records[0][1], Opening):
-        print(f"FAIL  {JOURNAL}: no opening record in it")
-        return Exit.NOT_MET
-    verdicts = list(_verdicts_on_file(folder, manifest, records))
+        return [(False, f"{JOURNAL}: no opening record in it")]
+    found = list(_verdicts_on_file(folder, manifest, records))
     try:
-        verdicts += [
+        found += [
             _verdict_of_checker(manifest, records),
             _verdict_of_execution(manifest, records),
         ]
@@ -48,10 +55,8 @@ def verify(folder: Path) -> Exit:
         ScenarioError,
         ValueError,
     ) as error:  # an opening that nothing can start from
-        verdicts.append((False, f"{JOURNAL}: its opening is no use: {str(error).splitlines()[0]}"))
-    for held, line in verdicts:
-        print(f"{'ok  ' if held else 'FAIL'}  {line}")
-    return Exit.DONE if all(held for held, _ in verdicts) else Exit.NOT_MET
+        found.append((False, f"{JOURNAL}: its opening is no use: {str(error).splitlines()[0]}"))
+    return found
 
 
 def _manifest(folder: Path) -> dict[str, Any]:
@@ -67,12 +72,13 @@ def _manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-_Verdict = tuple[bool, str]
+Verdict = tuple[bool, str]
+"""Whether it held, and a line about it."""
 
 
 def _verdicts_on_file(
     folder: Path, manifest: dict[str, Any], records: list[tuple[bytes, Record]]
-) -> Iterator[_Verdict]:
+) -> Iterator[Verdict]:
     if "digest" not in manifest:
         yield True, f"{JOURNAL}: the run was killed; {len(records)} records up to then"
         return
@@ -88,7 +94,7 @@ def _verdicts_on_file(
     yield same, f"digest of {digest.records} records: {digest.hex}"
 
 
-def _verdict_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> _Verdict:
+def _verdict_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Verdict:
     virtual = manifest.get("exchange") != "wall"
     checker = check((record for _, record in records), virtual=virtual)
     if not checker.count:
@@ -96,9 +102,7 @@ def _verdict_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Rec
     return False, f"checker: {checker.count} complaints, first: {checker.complaints[0]}"
 
 
-def _verdict_of_execution(
-    manifest: dict[str, Any], records: list[tuple[bytes, Record]]
-) -> _Verdict:
+def _verdict_of_execution(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Verdict:
     opening = records[0][1]
     assert isinstance(opening, Opening)
     if manifest.get("exchange") == "wall" or any(_chance(opening.scenario, records)):
@@ -116,7 +120,7 @@ def _chance(scenario: Scenario, records: list[tuple[bytes, Record]]) -> Iterator
             yield not all(outages.dies(name, record.now_ns) for name in record.absent)
 
 
-def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict:
+def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
     """The whole run anew, in process, record by record."""
     scenario, seed = opening.scenario, opening.seed
     world = scenario.map
@@ -144,7 +148,7 @@ def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict
     return True, f"executed again: {compared} records, every byte the same"
 
 
-def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> _Verdict:
+def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
     """Every participant anew, each from the inbox that it had."""
     team = _Team(opening)
     steps = 0

@@ -113,6 +113,7 @@ def run(
         stage = Stage.resumed(plan.scenario, plan.seed, plan.site, past.records, listeners)
         doorway.recall(past.records)
     doorway.stage = stage
+    stage.forget()
     doorway.gather(plan.patience_s if past is None else RETURN_S)
     if plan.exchange == "wall":
         reason = _Relay(doorway, stage, plan, resumed=past is not None).run()
@@ -236,6 +237,8 @@ class _Doorway:
 
     def dismiss(self, reason: str, patience_s: float) -> None:
         """Tell everybody that the mission is over. patience_s: for those that have yet to come back."""
+        self._clock = None  # the record has ended
+        self._doubtful.clear()
         give_up = time.monotonic() + patience_s
         waiting = set(self._plan.scenario.roster)
         while waiting:
@@ -679,6 +682,8 @@ class _Deeds:
         deeds = deeds_of(plan.scenario)
         for deed in deeds[: stage.deeds]:
             self._keep_count(deed)
+        for name in sorted(self._slow):
+            self._order(Order("thaw", name))  # the process before this one may have held it
         self.world_starts_ns = _world_starts_ns(deeds, stage.deeds)
         """When world-sim is to start again, if a fault has killed it."""
 

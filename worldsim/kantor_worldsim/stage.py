@@ -119,6 +119,10 @@ class Stage:
         assert self._kept is not None
         return Stage.resumed(self.scenario, self.seed, self._site, self._kept, self._listeners)
 
+    def forget(self) -> None:
+        """Keep no records: a process that is killed is not rebuilt in memory."""
+        self._kept = None
+
     def _repeat(self, record: Record) -> None:
         if isinstance(record, Batch):
             self.settle(record.now_ns, [self._recalled(act) for act in record.acts])

@@ -231,7 +231,7 @@ def _radio(seed: int, tree: Tree) -> Tree:
     return radio
 
 
-class _Setting(NamedTuple):
+class Setting(NamedTuple):
     """What faults are drawn for."""
 
     scenario: Scenario
@@ -241,10 +241,12 @@ class _Setting(NamedTuple):
 
     @property
     def roster(self) -> tuple[ParticipantId, ...]:
+        """Everybody."""
         return self.scenario.roster
 
     @property
     def period_s(self) -> float:
+        """Nominal."""
         return self.scenario.clock.period_s
 
     def window(self, longest_s: float) -> Tree:
@@ -266,7 +268,7 @@ class _Setting(NamedTuple):
         return {"who": list(others) or self.dice.some_of(self.roster)}
 
 
-def _partition(at: _Setting) -> Tree:
+def _partition(at: Setting) -> Tree:
     dice = at.dice
     shape = dice.one_of(["halves", "ring", "bridge", "isolate", "groups"])
     tree: Tree = {"shape": shape, **at.window(0.8 * at.calm_s)}
@@ -284,12 +286,12 @@ def _partition(at: _Setting) -> Tree:
     return tree
 
 
-def _one_way(at: _Setting) -> Tree:
+def _one_way(at: Setting) -> Tree:
     ends = at.dice.one_of([("senders",), ("receivers",), ("senders", "receivers")])
     return at.window(at.calm_s) | {end: at.dice.some_of(at.roster) for end in ends}
 
 
-def _burst(at: _Setting) -> Tree:
+def _burst(at: Setting) -> Tree:
     return {
         "good_s": at.dice.scale(at.period_s, 30.0 * at.period_s),
         "bad_s": at.dice.scale(at.period_s, 30.0 * at.period_s),
@@ -298,12 +300,12 @@ def _burst(at: _Setting) -> Tree:
     }
 
 
-def _bandwidth(at: _Setting) -> Tree:
+def _bandwidth(at: Setting) -> Tree:
     tree: Tree = {"bytes_per_s": short(at.dice.scale(10.0, 1000.0) / at.period_s)}
     return tree | ({"queue_bytes": round(at.dice.scale(10, 3000))} if at.dice.coin() else {})
 
 
-def _range(at: _Setting) -> Tree:
+def _range(at: Setting) -> Tree:
     scenario = at.scenario
     reach_m = scenario.supervisor.range_m if scenario.centralized else scenario.radio.range_m
     if reach_m < 1e9 and at.dice.coin():
@@ -311,7 +313,7 @@ def _range(at: _Setting) -> Tree:
     return {"range_m": short(min(reach_m, 200.0) * at.dice.between(0.0, 0.9))}
 
 
-def _kill(at: _Setting) -> Tree:
+def _kill(at: Setting) -> Tree:
     dice = at.dice
     who = at.who(WORLD_SIM)
     tree = at.window(0.3 * at.calm_s) | who
@@ -323,11 +325,11 @@ def _kill(at: _Setting) -> Tree:
     return tree | {"disk": disk, "mid_step": dice.coin(0.4)}
 
 
-def _late(at: _Setting) -> Tree:
+def _late(at: Setting) -> Tree:
     return {"until_s": short(at.dice.between(0.05, 0.8) * at.calm_s), **at.who()}
 
 
-def _clock_fault(at: _Setting) -> Tree:
+def _clock_fault(at: Setting) -> Tree:
     dice = at.dice
     tree = at.window(at.calm_s) | at.who()
     sign = dice.one_of([-1.0, 1.0])
@@ -338,7 +340,7 @@ def _clock_fault(at: _Setting) -> Tree:
     return tree
 
 
-_DRAWN: dict[str, Callable[[_Setting], Tree]] = {
+_DRAWN: dict[str, Callable[[Setting], Tree]] = {
     "drop": lambda at: {"probability": at.dice.between(0.05, 0.6)} | at.links(),
     "burst": lambda at: _burst(at) | at.links(),
     "delay": lambda at: {
@@ -387,16 +389,16 @@ def _faults(seed: int, scenario: Scenario, calm_s: float) -> Iterable[Fault]:
     bias = Dice(seed, _FAULTS).between(0.05, 0.5)
     taken: list[Fault] = []
     for number, kind in enumerate(KINDS):
-        at = _Setting(scenario, calm_s, Dice(seed, _A_CLASS + number))
+        at = Setting(scenario, calm_s, Dice(seed, _A_CLASS + number))
         if not at.dice.coin(bias):
             continue
         for _ in range(at.dice.whole(1, _MANY.get(kind, 2))):
-            fault = next(_candidates(at, kind, taken), None)
+            fault = next(candidates(at, kind, taken), None)
             taken += [] if fault is None else [fault]
     return taken
 
 
-def _candidates(at: _Setting, kind: str, taken: list[Fault]) -> Iterator[Fault]:
+def candidates(at: Setting, kind: str, taken: list[Fault]) -> Iterator[Fault]:
     """Faults of a class that can be there with the others."""
     for _ in range(_TRIES):
         tree = {"kind": kind, **_DRAWN[kind](at)}

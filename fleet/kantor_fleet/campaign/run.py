@@ -160,7 +160,7 @@ def _report(folder: Path, broken: Broken) -> None:
     print(f"VIOLATION  seed {seed} ({trial.sort})")
     for complaint in (trial.violation or "", *trial.complaints[1:]):
         print(f"  {printable(complaint)}")
-    print(f"  commit     {_commit()}, sources {code()[:16]}")
+    print(f"  commit     {commit()}, sources {code()[:16]}")
     print(f"  replay     kantor campaign --replay {seed}")
     case = Case(draw(seed), seed)
     print(f"  shrinking  for up to {_SHRINK_S:.0f} s", flush=True)
@@ -211,7 +211,7 @@ def _draws() -> str:
     return digest.hexdigest()
 
 
-def _commit() -> str:
+def commit() -> str:
     """What git says of the sources, if they are under git."""
     git = shutil.which("git")
     if git is None:

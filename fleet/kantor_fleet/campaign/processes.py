@@ -1,0 +1,447 @@
+"""`kantor campaign --processes`: missions on real processes over the bus, under storms of real signals.
+
+World-sim, robots and the supervisor are processes of their own. They are killed, frozen, starved and doubled
+as a seed says, world-sim too, and every mission has to come to its end with every rule kept: as it was seen,
+and read again from its file alone.
+"""
+
+import os
+import shutil
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from multiprocessing.util import get_temp_dir
+from pathlib import Path
+from typing import NamedTuple
+
+from kantor_fleet.campaign.memory import (
+    FLAT_LASTING_MB,
+    FLAT_MB,
+    Grown,
+    Lasting,
+    Watch,
+    grandchildren,
+)
+from kantor_fleet.campaign.run import commit
+from kantor_fleet.campaign.storms import is_lockstep, storm
+from kantor_fleet.campaign.struck import CLASSES, Struck
+from kantor_fleet.exits import Exit
+from kantor_fleet.experiment import code
+from kantor_fleet.interrupts import Interrupts
+from kantor_fleet.local import Fleet, Order, local_fleet, watch_progress
+from kantor_fleet.preload import warm_up
+from kantor_fleet.progress import printable
+from kantor_fleet.run import read_result
+from kantor_fleet.team import play
+from kantor_fleet.verify import verdicts
+from kantor_protocol.bus import BusError
+from kantor_protocol.machine import WORLD_SIM, ParticipantId
+from kantor_protocol.scenario import Scenario, to_toml
+from kantor_worldsim.journal import Digest, read
+from kantor_worldsim.liveness import Liveness
+from kantor_worldsim.outages import deeds_of
+from kantor_worldsim.recording import JOURNAL, SCENARIO
+from kantor_worldsim.records import Batch, Incident, Record, encode_record
+from kantor_worldsim.world import Site
+
+FOLDER = "processes"
+REJOIN_S = 2.0
+"""Of a hundred restarts 99 have to be back by then."""
+_GRACE_S = 120.0
+"""What a mission may take beyond its limit: a start, and a world that starts again and again."""
+_ORPHANS_S = 2.0
+"""How long a process that was killed may be seen yet."""
+
+
+class Terms(NamedTuple):
+    """How storms are drawn and missions are run."""
+
+    speed: float
+    """Simulated seconds in a real one."""
+    storm_s: float
+    """Real seconds in which anything may go wrong."""
+
+
+class Soak(NamedTuple):
+    """A campaign on processes, and what is wanted of it."""
+
+    seeds: Sequence[int]
+    folder: Path
+    terms: Terms
+    minutes: float | None = None
+    """Real time after which no further mission begins."""
+
+
+class Flight(NamedTuple):
+    """What came of a mission."""
+
+    seed: int
+    exchange: str
+    ended: str
+    wall_s: float
+    complaints: tuple[str, ...]
+    struck: Counter[str]
+    """Processes, or copies of messages, by class of faults."""
+    rejoined_s: tuple[float, ...] = ()
+    """Of participants: real time from the order to start to the first step that the world accepted."""
+    resumed_s: tuple[float, ...] = ()
+    """Of world-sim: until anybody's step was accepted."""
+    steps: int = 0
+    incarnations: int = 0
+    judged: frozenset[str] = frozenset()
+    """Rules of liveness that the record could have broken."""
+    grown: dict[str, Grown] = {}  # noqa: RUF012  nobody writes to it
+
+
+def soak(order: Soak) -> Exit:
+    """Fly mission after mission, up to the first that breaks a rule; what to exit with."""
+    started_s = time.monotonic()
+    totals = Totals()
+    with Interrupts() as interrupts, _own_temporary_folder() as temporary:
+        print(f"warming up; {order.terms.storm_s:g} s of storm in each mission", flush=True)
+        warm_up()
+        for seed in order.seeds:
+            spent_s = time.monotonic() - started_s
+            if order.minutes is not None and spent_s >= 60.0 * order.minutes:
+                break
+            place = order.folder / FOLDER / f"seed-{seed}"
+            flight = fly(seed, order.terms, place, interrupts, temporary)
+            if interrupts():
+                break
+            totals.add(flight)
+            print(_line(flight, totals, time.monotonic() - started_s), flush=True)
+            if flight.complaints:
+                break
+            shutil.rmtree(place)
+    for line in totals.lines(time.monotonic() - started_s):
+        print(line)
+    if totals.broken is not None:
+        _report(totals.broken, order)
+    return interrupts.code or (Exit.DONE if totals.met else Exit.NOT_MET)
+
+
+def replay(seed: int, folder: Path, terms: Terms) -> Exit:
+    """Fly the mission of one seed, and leave its run folder."""
+    with Interrupts() as interrupts, _own_temporary_folder() as temporary:
+        warm_up()
+        place = folder / FOLDER / f"seed-{seed}"
+        flight = fly(seed, terms, place, interrupts, temporary)
+    totals = Totals()
+    totals.add(flight)
+    print(_line(flight, totals, flight.wall_s))
+    for complaint in flight.complaints:
+        print(f"  VIOLATION  {printable(complaint)}")
+    print(f"  {place}/  ({', '.join(sorted(path.name for path in place.iterdir()))})")
+    return interrupts.code or (Exit.NOT_MET if flight.complaints else Exit.DONE)
+
+
+def fly(seed: int, terms: Terms, folder: Path, stopped: Interrupts, temporary: Path) -> Flight:
+    """One mission, judged. folder: for its files, made anew. temporary: where nothing may be left."""
+    started_s = time.monotonic()
+    scenario = storm(seed, terms.speed, terms.storm_s)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    exchange = "lockstep" if is_lockstep(seed) else "wall"
+    order = Order(scenario, seed, exchange, terms.speed, folder)
+    before = _entries(temporary)
+    failures, grown = _run(order, stopped)
+    failures += [f"orphan: process {pid} is there yet" for pid in _orphans()]
+    failures += [f"leftover: {name} in {temporary}" for name in _entries(temporary) - before]
+    if stopped():
+        return Flight(seed, exchange, "interrupted", 0.0, (), Counter())
+    judged = _judged(order, failures)
+    return judged._replace(wall_s=time.monotonic() - started_s, grown=grown)
+
+
+def _run(order: Order, stopped: Interrupts) -> tuple[list[str], dict[str, Grown]]:
+    """Run the fleet to its end; what failed, and how it has grown."""
+    scenario = order.scenario
+    give_up_s = time.monotonic() + scenario.limit_ns * 1e-9 / order.speed + _GRACE_S
+    failures: list[str] = []
+    with local_fleet(order) as fleet:
+        watch = Watch(fleet)
+        periods = 0
+        try:
+            for progress in watch_progress(fleet):
+                periods = progress.now_ns // scenario.period_ns if progress else periods
+                watch.look(periods)
+                failures += _newly_failed(fleet)
+                late = time.monotonic() >= give_up_s
+                if late or stopped():
+                    failures += ["end: the mission hangs"] if late else []
+                    fleet.stop()
+                    break
+        except BusError as error:
+            failures.append(f"bus: {error}")
+        fleet.disband()
+        failures += _newly_failed(fleet)
+        if fleet.world_sim.exitcode:
+            failures.append(f"process: world-sim ended with {fleet.world_sim.exitcode}")
+    return failures, watch.grown()
+
+
+def _newly_failed(fleet: Fleet) -> list[str]:
+    failed = [f"process: {name} ended with {failure}" for name, failure in fleet.newly_failed()]
+    if (ended := fleet.revive()) is not None:
+        failed.append(f"process: world-sim ended with {ended}")
+    return failed
+
+
+def _orphans() -> list[int]:
+    """Processes of a fleet that should be gone."""
+    give_up_s = time.monotonic() + _ORPHANS_S
+    while (left := grandchildren()) and time.monotonic() < give_up_s:
+        time.sleep(0.05)
+    return left
+
+
+def _judged(order: Order, failures: list[str]) -> Flight:
+    """A mission by what it has left on file."""
+    folder, scenario = order.folder, order.scenario
+    result = read_result(folder)
+    if result is None:
+        failures.append("result: there is none")
+        return Flight(order.seed, order.exchange, "crashed", 0.0, tuple(failures), Counter())
+    records = [record for _, record in read(folder / JOURNAL)]
+    struck, liveness = Struck(), Liveness()
+    for record in records:
+        struck.take(record)
+        liveness.take(record)
+    complaints = [*failures, *result.complaints]
+    if result.ended != "done" or result.record != "whole":
+        complaints.append(f"end: {result.ended}; record {result.record}")
+    complaints += [f"verify: {line}" for held, line in verdicts(folder) if not held]
+    complaints += liveness.complaints
+    complaints += [f"{i.who}: let in" for i in _incidents(records) if i.what == "let in"]
+    rejoined_s: tuple[float, ...] = ()
+    resumed_s: tuple[float, ...] = ()
+    if order.exchange == "lockstep":
+        complaints += _differing(scenario, order.seed, result.digest)
+    else:
+        rejoined_s, resumed_s = _back_s(scenario, records, order.speed)
+    return Flight(
+        order.seed,
+        order.exchange,
+        result.ended,
+        0.0,
+        tuple(complaints[:10]),
+        struck.counts,
+        rejoined_s,
+        resumed_s,
+        sum(act.outputs is not None for r in records if isinstance(r, Batch) for act in r.acts),
+        result.incarnations,
+        frozenset(liveness.judged),
+    )
+
+
+def _incidents(records: Sequence[Record]) -> list[Incident]:
+    return [record for record in records if isinstance(record, Incident)]
+
+
+def _differing(scenario: Scenario, seed: int, digest: str) -> Iterator[str]:
+    """The mission of a lockstep run once more, in this process."""
+    alone = Digest()
+    play(
+        scenario,
+        seed,
+        Site.of(scenario, seed),
+        [lambda record: alone.add(encode_record(record))],
+    )
+    if alone.hex != digest:
+        yield f"digest: {digest} over the bus, {alone.hex} in process"
+
+
+def _back_s(
+    scenario: Scenario, records: Sequence[Record], speed: float
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """How long everybody who was started again took, in real seconds: participants, and world-sim.
+
+    Deeds are done one after the other, so a participant's start is ordered when it is due and the deed
+    before is done. Clocks of participants run on while world-sim is down, and it goes on by them.
+    """
+    due_ns = {
+        (deed.fault, deed.who): deed.at_ns for deed in deeds_of(scenario) if deed.what == "start"
+    }
+    killed: set[ParticipantId] = set()
+    ordered_ns: dict[ParticipantId, int] = {}
+    back_s: dict[bool, list[float]] = {False: [], True: []}
+    before_ns = 0
+    for record in records:
+        if isinstance(record, Incident) and record.fault >= 0:
+            who = record.who
+            if record.what == "kill":
+                killed.add(who)
+            elif record.what == "start" and who in killed:
+                due = due_ns[record.fault, who]
+                ordered_ns[who] = due if who == WORLD_SIM else max(before_ns, due)
+            before_ns = record.now_ns
+        elif isinstance(record, Batch) and ordered_ns:
+            acted = {act.name for act in record.acts if act.outputs is not None}
+            for who in (acted | ({WORLD_SIM} if acted else set())) & ordered_ns.keys():
+                waited_ns = record.now_ns - ordered_ns.pop(who)
+                back_s[who == WORLD_SIM].append(waited_ns * 1e-9 / speed)
+    return tuple(back_s[False]), tuple(back_s[True])
+
+
+class Totals:
+    """Sums over missions."""
+
+    def __init__(self) -> None:
+        self.broken: Flight | None = None
+        self.struck: Counter[str] = Counter()
+        """On the wall, and in lockstep where that is a signal as well."""
+        self._missions: Counter[str] = Counter()
+        self._judged: Counter[str] = Counter()
+        self._rejoined_s: list[float] = []
+        self._resumed_s: list[float] = []
+        self._grown: dict[str, Grown] = {}
+        self._lasting = Lasting()
+        self._steps = self._incarnations = 0
+
+    def add(self, flight: Flight) -> None:
+        """One more mission."""
+        self.broken = flight if flight.complaints else self.broken
+        real = dict(flight.struck)
+        if flight.exchange == "lockstep":  # nobody is stopped there, only left out
+            real = {name: n for name, n in real.items() if not name.startswith(("pause", "slow"))}
+        self.struck.update(real)
+        self._missions[flight.exchange] += 1
+        self._judged.update(flight.judged)
+        self._rejoined_s += flight.rejoined_s
+        self._resumed_s += flight.resumed_s
+        self._steps += flight.steps
+        self._incarnations += flight.incarnations
+        for kind, grown in flight.grown.items():
+            self._grown[kind] = self._grown.get(kind, Grown()) + grown
+        self._lasting.look()
+
+    @property
+    def met(self) -> bool:
+        """No rule was broken, whoever was started again was back in time, and memory was flat."""
+        rejoined_s = _quantile(self._rejoined_s, 0.99)
+        return self.broken is None and rejoined_s < REJOIN_S and self._is_flat
+
+    @property
+    def _is_flat(self) -> bool:
+        lasting = self._lasting.grown_mb or (0.0, 0.0)
+        flat = all(grown.mb_per_1000 <= FLAT_MB for grown in self._grown.values())
+        return flat and max(lasting) <= FLAT_LASTING_MB
+
+    def signals(self) -> str:
+        """How often the four signals were sent that matter most."""
+        robots, supervisor, world = (
+            [self.struck[f"{kind}{who}"] for kind in ("kill", "pause")]
+            for who in ("", " supervisor", " worldsim")
+        )
+        return (
+            f"SIGKILL {robots[0] + supervisor[0] + world[0]} "
+            f"(robots {robots[0]}, supervisor {supervisor[0]}, world-sim {world[0]}), "
+            f"SIGSTOP {robots[1] + supervisor[1] + world[1]} "
+            f"(robots {robots[1]}, supervisor {supervisor[1]}, world-sim {world[1]})"
+        )
+
+    def lines(self, wall_s: float) -> Iterator[str]:
+        """In words. wall_s: real time of this command."""
+        missions, broken = self._missions.total(), int(self.broken is not None)
+        yield (
+            f"{missions} missions ({self._missions['wall']} on the wall, "
+            f"{self._missions['lockstep']} in lockstep) in {wall_s / 60.0:.1f} min, "
+            f"{broken} with violations; {self._steps} steps"
+        )
+        yield f"  signals    {self.signals()}"
+        others = [
+            f"{name} {self.struck[name]}"
+            for name in CLASSES
+            if self.struck[name] and name.partition(" ")[0] not in {"kill", "pause"}
+        ]
+        yield f"  others     {', '.join(others)}"
+        kinds = [f"{self.struck[f'kill {how}']} {how}" for how in ("torn", "lost", "mid-step")]
+        yield (
+            f"  disks      {', '.join(kinds)}, {self.struck['kill for good']} killed for good; "
+            f"{self._incarnations} new incarnations"
+        )
+        yield f"  rejoined   {_told(self._rejoined_s, REJOIN_S)}"
+        yield f"  resumed    world-sim {_told(self._resumed_s)}"
+        yield f"  liveness   {', '.join(f'{rule} judged {n}' for rule, n in sorted(self._judged.items()))}"
+        yield from self._memory()
+        yield "  left over  no process, no file" if not broken else "  left over  see the violation"
+
+    def _memory(self) -> Iterator[str]:
+        for kind, grown in sorted(self._grown.items()):
+            yield (
+                f"  memory     {kind}: {grown.mb_per_1000:+.2f} MB in 1000 periods "
+                f"({grown.lives} lives, {grown.periods:.0f} periods; at most {grown.most_mb:+.1f} MB in "
+                f"a life, peak {grown.peak_mb:.0f} MB)"
+            )
+        if (lasting := self._lasting.grown_mb) is not None:
+            yield f"  memory     from the third mission on: campaign {lasting[0]:+.1f} MB, fork server {lasting[1]:+.1f} MB"
+        yield (
+            f"  memory     {'flat' if self._is_flat else 'NOT FLAT'}: bounds {FLAT_MB:g} MB in 1000 "
+            f"periods, {FLAT_LASTING_MB:g} MB of what outlives missions"
+        )
+
+
+def _quantile(values: list[float], share: float) -> float:
+    """One of the values; 0 if there is none."""
+    ordered = sorted(values)
+    return ordered[-(-round(1000 * share) * len(ordered) // 1000) - 1] if ordered else 0.0
+
+
+def _told(times_s: list[float], bound_s: float | None = None) -> str:
+    if not times_s:
+        return "nobody"
+    p50, p99 = (_quantile(times_s, share) for share in (0.5, 0.99))
+    told = f"{len(times_s)} times: p50 {p50:.2f} s, p99 {p99:.2f} s, at most {max(times_s):.2f} s"
+    if bound_s is None:
+        return told
+    return f"{told}; {'below' if p99 < bound_s else 'NOT BELOW'} {bound_s:g} s"
+
+
+def _line(flight: Flight, totals: Totals, spent_s: float) -> str:
+    """A mission in one line, and how far the campaign is."""
+    minutes, seconds = divmod(round(spent_s), 60)
+    verdict = "all rules held" if not flight.complaints else "VIOLATION"
+    slowest_s = max(flight.rejoined_s, default=0.0)
+    return (
+        f"{minutes:2d}:{seconds:02d}  seed {flight.seed} ({flight.exchange}): {flight.ended} in "
+        f"{flight.wall_s:.0f} s, {verdict}; back in at most {slowest_s:.2f} s; so far {totals.signals()}"
+    )
+
+
+def _report(flight: Flight, order: Soak) -> None:
+    """Everything that is needed to see it again."""
+    terms = order.terms
+    place = order.folder / FOLDER / f"seed-{flight.seed}"
+    (place / SCENARIO).write_text(to_toml(storm(flight.seed, *terms)), encoding="utf-8")
+    print(f"VIOLATION  seed {flight.seed} ({flight.exchange})")
+    for complaint in flight.complaints:
+        print(f"  {printable(complaint)}")
+    print(f"  commit     {commit()}, sources {code()[:16]}")
+    print(
+        f"  replay     kantor campaign --processes --replay {flight.seed} "
+        f"--speed {terms.speed:g} --storm {terms.storm_s:g}"
+    )
+    print(f"  kept       {place}/")
+
+
+@contextmanager
+def _own_temporary_folder() -> Iterator[Path]:
+    """Everything temporary of this process and its children is below it, and nobody else's."""
+    get_temp_dir()  # what multiprocessing has of its own goes when this process does
+    before = tempfile.tempdir, os.environ.get("TMPDIR")
+    with tempfile.TemporaryDirectory(prefix="kantor-") as folder:
+        tempfile.tempdir = os.environ["TMPDIR"] = folder
+        try:
+            yield Path(folder)
+        finally:
+            tempfile.tempdir = before[0]
+            os.environ.pop("TMPDIR")
+            if before[1] is not None:
+                os.environ["TMPDIR"] = before[1]
+
+
+def _entries(folder: Path) -> set[str]:
+    """What is in a folder."""
+    return {path.name for path in folder.iterdir()}
