@@ -785,7 +785,7 @@ def main() -> int:
         if not wanted or one.name in wanted:
             catch = hunt(one)
             hunted.append((one, catch))
-            print(f"{one.name:38} {catch or 'SURVIVES'}", flush=True)  # noqa: T201
+            print(f"{one.name:38} {catch or 'SURVIVES'}", flush=True)
     if not wanted:
         write(hunted)
     return int(any(catch is None for _, catch in hunted))
