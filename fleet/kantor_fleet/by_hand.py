@@ -13,7 +13,7 @@ from kantor_protocol.process import NotWantedError, StateError
 from kantor_protocol.scenario import Scenario
 
 if TYPE_CHECKING:
-    from kantor_worldsim.process import Plan
+    from kantor_worldsim.plan import Plan
     from kantor_worldsim.recording import Past, Recording
 
 RunParticipant = Callable[[str, Identity, float, Callable[[str], None], Path], str]
@@ -32,7 +32,7 @@ def host_by_hand(
     exact_every: int | None,
 ) -> Exit:
     """World-sim in this terminal, for a new run. Raises ScenarioError, BusError, OSError."""
-    from kantor_worldsim.process import Plan  # noqa: PLC0415  robots by hand do not need these
+    from kantor_worldsim.plan import Plan  # noqa: PLC0415  robots by hand do not need these
     from kantor_worldsim.recording import Recording, folder_for  # noqa: PLC0415
     from kantor_worldsim.world import Site  # noqa: PLC0415
 
@@ -50,7 +50,7 @@ def host_by_hand(
 
 def resume_by_hand(folder: Path, listen: str, secrets: Path, fleet: str) -> Exit:
     """World-sim in this terminal, for a run that was cut short. Raises BusError, OSError."""
-    from kantor_worldsim.process import Plan  # noqa: PLC0415
+    from kantor_worldsim.plan import Plan  # noqa: PLC0415
     from kantor_worldsim.recording import Past, Recording, ResumeError  # noqa: PLC0415
 
     try:
@@ -70,7 +70,7 @@ def resume_by_hand(folder: Path, listen: str, secrets: Path, fleet: str) -> Exit
 
 
 def _check_faults(scenario: Scenario, exchange: str) -> None:
-    from kantor_worldsim.process import needs_hands  # noqa: PLC0415
+    from kantor_worldsim.plan import needs_hands  # noqa: PLC0415
 
     if (fault := needs_hands(scenario, exchange)) is not None:
         fail(Exit.USAGE, f"{fault}: nobody here can do that to processes; use `kantor run`")

@@ -326,7 +326,8 @@ def _be_world_sim(
     resume: bool,  # noqa: FBT001  a target of a process
     stopping: bool,  # noqa: FBT001
 ) -> None:
-    from kantor_worldsim.process import Plan, run  # noqa: PLC0415  the fork server has it
+    from kantor_worldsim.plan import Plan  # noqa: PLC0415  the fork server has it
+    from kantor_worldsim.process import run  # noqa: PLC0415  the fork server has it
     from kantor_worldsim.recording import Past, Recording, ResumeError  # noqa: PLC0415
     from kantor_worldsim.world import Site  # noqa: PLC0415
 

@@ -17,7 +17,7 @@ from kantor_protocol.bus import BusError
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.journal import read
 from kantor_worldsim.metrics import MapResult, Result
-from kantor_worldsim.process import progress
+from kantor_worldsim.progress import progress
 from kantor_worldsim.recording import (
     JOURNAL,
     METRICS,

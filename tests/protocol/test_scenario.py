@@ -96,7 +96,12 @@ OVERRIDES = (
     ("clock.drift_ppm=250.0", "clock.jitter_s=1e-3", "publish.keyframe_every=3"),
     ('summary="a \\"quoted\\" line\\nand \\u007f another\\\\"', "claims=false"),
     ("starts.random=true", "starts.poses_m=[]", "targets.file='t.csv'", "planner.horizon=12"),
-    ("supervisor.pose_m=[-1.5e-7, 2e22]", "coordination=centralized", "limit_s=1e4", "energy.steps=7"),
+    (
+        "supervisor.pose_m=[-1.5e-7, 2e22]",
+        "coordination=centralized",
+        "limit_s=1e4",
+        "energy.steps=7",
+    ),
 )
 
 

@@ -6,8 +6,10 @@ from hypothesis import strategies as st
 from kantor_protocol.machine import Envelope
 from kantor_protocol.process import INBOX_MAX
 from kantor_protocol.scenario import Scenario
+from kantor_worldsim.deeds import world_starts_ns
 from kantor_worldsim.outages import deeds_of
-from kantor_worldsim.process import _Mail, _world_starts_ns, needs_hands
+from kantor_worldsim.plan import needs_hands
+from kantor_worldsim.relay import Mail
 from strategies import examples, mission
 
 
@@ -24,7 +26,7 @@ def test_whatever_part_of_what_was_handed_out_arrived_is_believed(
     handed: list[int], kept: list[bool]
 ) -> None:
     """A full queue drops some; the rest is in order. Numbers come twice, as duplicates do."""
-    mail = _Mail()
+    mail = Mail()
     mail.waiting += [envelope(number) for number in handed]
     assert [e.sequence for e in mail.hand()] == handed
     arrived = [number for number, stays in zip(handed, kept, strict=False) if stays]
@@ -39,7 +41,7 @@ def test_whatever_part_of_what_was_handed_out_arrived_is_believed(
 @examples(300)
 def test_nothing_else_is_believed(handed: list[int], told: list[int]) -> None:
     """Against the rule in words: an inbox is a subsequence of what was handed out."""
-    mail = _Mail()
+    mail = Mail()
     mail.waiting += [envelope(number) for number in handed]
     mail.hand()
     rest = iter(handed)
@@ -51,7 +53,7 @@ def test_nothing_else_is_believed(handed: list[int], told: list[int]) -> None:
 
 
 def test_what_waits_for_who_does_not_listen_is_bounded() -> None:
-    mail = _Mail()
+    mail = Mail()
     mail.waiting += [envelope(i) for i in range(3 * INBOX_MAX)]
     first = mail.hand()
     mail.waiting += [envelope(i) for i in range(3 * INBOX_MAX, 5 * INBOX_MAX)]
@@ -88,7 +90,7 @@ def test_a_killed_world_sim_knows_when_it_was_to_come_back() -> None:
             '{kind="pause", who=["r2"], from_s=2, until_s=4}',
         )
     )
-    starts = [_world_starts_ns(deeds, done) for done in range(len(deeds) + 1)]
+    starts = [world_starts_ns(deeds, done) for done in range(len(deeds) + 1)]
 
     assert [deed.what for deed in deeds] == ["pause", "kill", "resume", "start"]
     assert starts == [None, None, 5 * 10**9, 5 * 10**9, None]
