@@ -5,12 +5,14 @@ as a seed says, world-sim too, and every mission has to come to its end with eve
 and read again from its file alone.
 """
 
+import multiprocessing
 import os
 import shutil
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from multiprocessing.util import get_temp_dir
 from pathlib import Path
@@ -151,8 +153,7 @@ def fly(seed: int, terms: Terms, folder: Path, stopped: Interrupts, temporary: P
     failures += [f"leftover: {name} in {temporary}" for name in _entries(temporary) - before]
     if stopped():
         return Flight(seed, exchange, "interrupted", 0.0, (), Counter())
-    judged = _judged(order, failures)
-    return judged._replace(wall_s=time.monotonic() - started_s, grown=grown)
+    return _judged_apart(order, failures)._replace(wall_s=time.monotonic() - started_s, grown=grown)
 
 
 def _run(order: Order, stopped: Interrupts) -> tuple[list[str], dict[str, Grown]]:
@@ -195,6 +196,13 @@ def _orphans() -> list[int]:
     while (left := grandchildren()) and time.monotonic() < give_up_s:
         time.sleep(0.05)
     return left
+
+
+def _judged_apart(order: Order, failures: list[str]) -> Flight:
+    """Judged in a process of its own: a whole record in memory would leave this one as large for ever."""
+    context = multiprocessing.get_context("forkserver")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(_judged, order, failures).result()
 
 
 def _judged(order: Order, failures: list[str]) -> Flight:
