@@ -77,10 +77,14 @@ class _InProcess:
     ) -> Mapping[ParticipantId, Outputs]:
         """Step all of a batch."""
         machines = self._machines
-        return {
-            name: _decode_outputs(encode(machines[name].step(decode_inputs(encode(given)))))
-            for name, given in inputs.items()
-        }
+        made = {}
+        for name, given in inputs.items():
+            machine, page = machines[name], encode(given)
+            outputs = (
+                machine.take(page) if type(machine) is Mortal else machine.step(decode_inputs(page))
+            )
+            made[name] = _decode_outputs(encode(outputs))
+        return made
 
     def kill(self, name: ParticipantId) -> None:
         """End a participant; nothing has to be done to world-sim, which is rebuilt."""
