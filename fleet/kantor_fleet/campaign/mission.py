@@ -19,8 +19,8 @@ from kantor_protocol.scenario import Scenario
 from kantor_worldsim.checkers import Checker
 from kantor_worldsim.journal import Digest, Journal, read
 from kantor_worldsim.liveness import Liveness
-from kantor_worldsim.recording import JOURNAL, Recording
 from kantor_worldsim.reading import Reader
+from kantor_worldsim.recording import JOURNAL, Recording
 from kantor_worldsim.records import Record, decode_record, encode_record
 from kantor_worldsim.world import Site
 
