@@ -118,6 +118,8 @@ class Outages:
             name: [w for w in windows if name in w.fault.who and _is_mid_step(w.fault)]
             for name in self._faults
         }
+        self.some_die_mid_step = any(self._deaths.values())
+        """Whether anybody ever dies in a step."""
         self._clocks = {
             name: [fault for fault in self._faults[name] if isinstance(fault, Clock)]
             for name in self._faults

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import ClassVar
 
-from kantor_protocol.faults import Kill, Late, OneWay, Partition
+from kantor_protocol.faults import Clock, Kill, Late, OneWay, Partition
 from kantor_protocol.machine import EVERYBODY, SUPERVISOR, WORLD_SIM, Outputs, ParticipantId, State
 from kantor_protocol.messages import RefusedError, decode_news
 from kantor_protocol.packing import Pairs
@@ -300,16 +300,15 @@ class _Ends(_Sight):
         self._read_ns: dict[ParticipantId, int] = {}
         self._alone: set[ParticipantId] = set()
         self._centralized = self.scenario.centralized
+        self._misled = any(isinstance(fault, Clock) for fault in self.scenario.faults)
 
     def act(self, act: Act, outputs: Outputs) -> None:
         name = act.name
         if outputs.state is State.EXHAUSTED and name not in self._exhausted:
             self._exhausted.add(name)
             self.seen["energy ended in contact"] += bool(act.heard)
-        read_ns = act.now_ns + act.skew_ns
-        if read_ns < self._read_ns.get(name, 0):
-            self.seen["clock jumped back"] += 1
-        self._read_ns[name] = read_ns
+        if self._misled:
+            self._read_clock(act)
         if self._centralized and name != SUPERVISOR and outputs.outbox:
             alone = outputs.outbox[-1].target == EVERYBODY
             if alone and name not in self._alone:
@@ -318,6 +317,12 @@ class _Ends(_Sight):
             elif not alone and name in self._alone:
                 self._alone.discard(name)
                 self.seen["supervisor heard again after it was given up"] += 1
+
+    def _read_clock(self, act: Act) -> None:
+        read_ns = act.now_ns + act.skew_ns
+        if read_ns < self._read_ns.get(act.name, 0):
+            self.seen["clock jumped back"] += 1
+        self._read_ns[act.name] = read_ns
 
 
 _SIGHTS = (_Goals, _Sides, _Lives, _Ears, _Memory, _Ends)
