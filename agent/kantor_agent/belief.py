@@ -201,7 +201,8 @@ class Belief:
         if self._walk.advance(now_ns):
             build(self.grid, self.weights)
             return
-        _drop_empty(*self._to_drop)
+        if self.replica.fell:
+            _drop_empty(*self._to_drop)
 
     def spend(self, x_m: float, y_m: float) -> bytes:
         """Ship one robot point from here (Prop. 1); packed pairs (sample, units), nearest first."""

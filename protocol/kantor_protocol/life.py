@@ -53,7 +53,7 @@ class Diary(Protocol):
 
 
 class Life:
-    """A machine with its diary. `step` is its only entrance."""
+    """A machine with its diary. `step` is its only entrance, also for what is encoded already."""
 
     def __init__(self, build: Build, diary: Diary, body: Body) -> None:
         """body: what the world knows of what it takes over. Raises OSError if nothing can be noted."""
@@ -79,11 +79,15 @@ class Life:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """The next step, noted ahead; or the last one again. Raises OSError if it cannot be noted."""
+        return self.take(encode(inputs))
+
+    def take(self, page: bytes, /) -> Outputs:
+        """`step`, of encoded Inputs."""
+        inputs = decode_inputs(page)
         if self._told is not None and inputs.observation.step < self.step_count:
             return self._told
-        page = encode(inputs)
         self._diary.note(page)
-        return self._live(decode_inputs(page))
+        return self._live(inputs)
 
     def _live(self, inputs: Inputs) -> Outputs:
         self._given, self._told = inputs, self._machine.step(inputs)
@@ -130,8 +134,12 @@ class Mortal:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """See `Life`. Nobody may ask the dead."""
+        return self.take(encode(inputs))
+
+    def take(self, page: bytes, /) -> Outputs:
+        """`step`, of encoded Inputs."""
         assert self._life is not None
-        return self._life.step(inputs)
+        return self._life.take(page)
 
     def kill(self) -> None:
         """All is gone but the diary."""

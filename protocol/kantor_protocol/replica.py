@@ -687,12 +687,19 @@ class Replica:
         told = self._out[:end].tobytes()
         return told[:end_of_have], told[end_of_have:end_of_logs], told[end_of_logs:]
 
+    @property
+    def fell(self) -> bool:
+        """Whether any weight fell in this step."""
+        return self.store.counters.item(LOWERED) > 0
+
     def lowered(self) -> npt.NDArray[np.int32]:
         """Samples whose weight fell in this step, each once; a view valid until `end_step`."""
         return self.store.lowered[: self.store.counters.item(LOWERED)]
 
     def packed_lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""
+        if not self.fell:
+            return b""
         store = self.store
         used = _pack_lowered(store.weights, store.lowered, store.counters, self._out)
         if used == _NO_ROOM_TO_PACK:

@@ -28,6 +28,7 @@ from kantor_protocol import life, replica
 from kantor_protocol.faults import FullDisk, Hostile, Impostor, Kill, Late, Partition, Pause
 from kantor_protocol.life import Life, Memory, Mortal, Pages
 from kantor_protocol.machine import EVERYBODY, WORLD_SIM, Body
+from kantor_protocol.messages import decode_inputs
 from kantor_protocol.radio import Radio
 from kantor_protocol.registers import Registers
 from kantor_protocol.replica import Replica, read_logs
@@ -673,11 +674,11 @@ def needless_incarnation(patch: Patch) -> None:
 
 @mutant("asked again, a robot does its step once more", _has(Kill, mid_step=(True,)))
 def answering_a_turn_twice(patch: Patch) -> None:
-    def step(self: Life, inputs: Any) -> Any:
-        self._diary.note(msgspec.msgpack.encode(inputs))
-        return self._live(inputs)
+    def take(self: Life, page: bytes) -> Any:
+        self._diary.note(page)
+        return self._live(decode_inputs(page))
 
-    patch.setattr(Life, "step", step)
+    patch.setattr(Life, "take", take)
 
 
 @mutant("a step is not counted now and then", _density)
@@ -699,8 +700,8 @@ def _ignoring(patch: Patch, kind: type) -> None:
         def made(self: Outages, *arguments: Any, **named: Any) -> None:
             init(self, *arguments, **named)
             self._stops = {
-                name: [fault for fault in faults if not isinstance(fault, kind)]
-                for name, faults in self._stops.items()
+                name: [window for window in windows if not isinstance(window.fault, kind)]
+                for name, windows in self._stops.items()
             }
 
         return made

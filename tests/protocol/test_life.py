@@ -10,6 +10,7 @@ from msgspec.structs import replace
 from kantor_protocol.faults import Disk
 from kantor_protocol.life import Life, Memory, Mortal
 from kantor_protocol.machine import Body, Inputs, Observation, Outputs, Pose
+from kantor_protocol.messages import encode
 from strategies import examples
 
 HOME = Body(Pose(1.0, 2.0))
@@ -74,6 +75,21 @@ def test_step_is_done_once(times_ns: list[int], again: int) -> None:
     assert reborn.unheard == (last, reborn.step(last))
     assert len(diary.read() or ()) == 2
     assert told(life, [7], len(times_ns)) == told(Rememberer(HOME), [*times_ns, 7])[-1:]
+
+
+@examples(50)
+@given(times_ns=TIMES)
+def test_encoded_turns_are_turns(times_ns: list[int]) -> None:
+    """What comes encoded is noted as it came, and answered like any turn; also when it comes again."""
+    diary = Memory()
+    life = Life(Rememberer, diary, HOME)
+    pages = [encode(turn(i, now_ns)) for i, now_ns in enumerate(times_ns)]
+    answers = [life.take(page).refused for page in (*pages, pages[-1])]
+    read = diary.read()
+
+    assert answers == [*(first := told(Rememberer(HOME), times_ns)), first[-1]]
+    assert read is not None
+    assert list(read.inputs) == pages
 
 
 class FullDisk(Memory):

@@ -16,7 +16,7 @@ from kantor_protocol.packing import Pairs
 from kantor_worldsim import reading as of
 from kantor_worldsim.channel import DROPPED, Verdict
 from kantor_worldsim.reading import Reader, Reading, head_of, parts_of_news, skip
-from kantor_worldsim.records import Act, Batch, Opening, Record, encode_record
+from kantor_worldsim.records import Act, Batch, Opening, Record, decode_record, encode_record
 from kantor_worldsim.world import Ruling
 from strategies import NEWS, examples
 
@@ -109,15 +109,18 @@ def tabled(reading: Reading) -> list[Any]:
 
 @pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
 def test_tables_hold_what_the_record_holds(played: Play, coordination: str) -> None:
-    """Over a whole mission with loss and copies: every number of every batch."""
+    """Over a whole mission with loss and copies: every number of every batch, also from given bytes."""
     records = played(*LOSSY, f"coordination={coordination}")
-    opening, reader = records[0], Reader()
+    opening, reader, given = records[0], Reader(), Reader()
     assert isinstance(opening, Opening)
     reader.read(opening)
+    given.read(opening)
     for record in records:
         if isinstance(record, Batch):
             told = plain(record, opening.scenario.roster, 60)
             assert tabled(Reading(*reader.read(record))) == told
+            payload = encode_record(record)
+            assert tabled(Reading(*given.read(decode_record(payload), payload))) == told
 
 
 ODD = Batch(

@@ -106,6 +106,8 @@ class LinkFaults:
         faults = {fault: scenario.faults[fault] for fault in self._order}
         self._histories = {i: _History(f) for i, f in faults.items() if isinstance(f, Replay)}
         self._queues = [_Queue(fault) for fault in faults.values() if isinstance(fault, Bandwidth)]
+        self._over_ns = max(map(until_ns, faults.values()), default=0)
+        """Nothing that is sent from then on is touched."""
         self._has_beside = any(isinstance(f, Replay | Hostile) for f in faults.values())
         self._roster = scenario.roster
         self._strangers = strangers(scenario.roster)
@@ -142,6 +144,8 @@ class LinkFaults:
         self, sent: Sequence[Sent], rows: np.ndarray, ruled: Ruled, field: Field
     ) -> tuple[Sequence[Sent], Ruled, int]:
         """Rule on what the radio has ruled; see `Interference`."""
+        if sent[0].now_ns >= self._over_ns:
+            return sent, ruled, 0
         self._enqueue(sent)
         law = (*self.table, *field, *self._ranges_m, rows, *ruled)
         on_air, besides = self._bring(sent, law) if self._has_beside else (sent, 0)
@@ -153,6 +157,9 @@ class LinkFaults:
 
     def take_tolls(self) -> tuple[Toll, ...]:
         """What each fault has done since the last call; those that did nothing are left out."""
+        told = self._tolls.tobytes()
+        if told.count(0) == len(told):
+            return ()
         tolls = [
             Toll(fault, *deeds)
             for fault, deeds in zip(self._order, self._tolls.tolist(), strict=True)

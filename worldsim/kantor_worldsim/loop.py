@@ -77,10 +77,14 @@ class _InProcess:
     ) -> Mapping[ParticipantId, Outputs]:
         """Step all of a batch."""
         machines = self._machines
-        return {
-            name: _decode_outputs(encode(machines[name].step(decode_inputs(encode(given)))))
-            for name, given in inputs.items()
-        }
+        made = {}
+        for name, given in inputs.items():
+            machine, page = machines[name], encode(given)
+            outputs = (
+                machine.take(page) if type(machine) is Mortal else machine.step(decode_inputs(page))
+            )
+            made[name] = _decode_outputs(encode(outputs))
+        return made
 
     def kill(self, name: ParticipantId) -> None:
         """End a participant; nothing has to be done to world-sim, which is rebuilt."""
@@ -207,7 +211,7 @@ class _Mission:
             name: stage.turn(name, due_ns, outages.skew_ns(name, due_ns)) for due_ns, name in due
         }
         outputs = self._exchange({name: turn.inputs for name, turn in turns.items()})
-        if outages.some:
+        if outages.some_die_mid_step:
             outputs = self._cut_short(due, outputs)
         for moment_ns, acting in groupby(due, key=itemgetter(0)):
             if moment_ns > batch[0][0] and self._reason(moment_ns):
@@ -229,6 +233,8 @@ class _Mission:
     ) -> Mapping[ParticipantId, Outputs]:
         """Kill whoever dies in its step, before anybody hears of that."""
         dying = {name for due_ns, name in due if self._dies(due_ns, name)}
+        if not dying:
+            return outputs
         for name in self._clocks:
             if name in dying:
                 self._crew.kill(name)

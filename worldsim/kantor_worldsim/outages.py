@@ -10,6 +10,8 @@ from kantor_protocol.faults.processes import Disk
 from kantor_protocol.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.scenario import Scenario
 
+_NEVER_NS = 2**63 - 1
+
 What = Literal[
     "kill",
     "start",
@@ -78,6 +80,21 @@ def _turn(deed: Deed) -> tuple[int, bool]:
     return deed.at_ns, deed.what in _FIRST.values()
 
 
+class _Window(NamedTuple):
+    """When a fault holds; a fault itself works that out anew each time."""
+
+    from_ns: int
+    until_ns: int
+    every: int
+    """It gets to one of so many steps; 0: to none."""
+    fault: OnProcesses
+
+    @classmethod
+    def of(cls, fault: OnProcesses) -> "_Window":
+        until_ns = _NEVER_NS if fault.until_ns is None else fault.until_ns
+        return cls(fault.from_ns, until_ns, fault.every if isinstance(fault, Slow) else 0, fault)
+
+
 class Outages:
     """The process faults of a scenario as time goes by."""
 
@@ -92,10 +109,17 @@ class Outages:
             name: [fault for fault in faults if name in fault.who]
             for name in (*scenario.roster, WORLD_SIM)
         }
+        windows = [_Window.of(fault) for fault in faults]
         self._stops = {
-            name: [fault for fault in faults if fault.stops and {name, WORLD_SIM} & set(fault.who)]
-            for name in (*scenario.roster, WORLD_SIM)
+            name: [w for w in windows if w.fault.stops and {name, WORLD_SIM} & set(w.fault.who)]
+            for name in self._faults
         }
+        self._deaths = {
+            name: [w for w in windows if name in w.fault.who and _is_mid_step(w.fault)]
+            for name in self._faults
+        }
+        self.some_die_mid_step = any(self._deaths.values())
+        """Whether anybody ever dies in a step."""
         self._clocks = {
             name: [fault for fault in self._faults[name] if isinstance(fault, Clock)]
             for name in self._faults
@@ -118,14 +142,15 @@ class Outages:
 
     def idle(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether a participant takes no step now, because of its own or of world-sim's state."""
-        return any(self._stands(fault, now_ns) for fault in self._stops[name])
+        for from_ns, until_ns, every, _ in self._stops[name]:
+            if from_ns <= now_ns < until_ns and not (every and self._gets_to_it(now_ns, every)):
+                return True
+        return False
 
     def dies(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether the next step of a participant is the one in which it dies, or was."""
-        return any(
-            isinstance(fault, Kill) and fault.mid_step and fault.holds(now_ns)
-            for fault in self._faults[name]
-        )
+        deaths = self._deaths[name]
+        return bool(deaths) and any(death.from_ns <= now_ns < death.until_ns for death in deaths)
 
     def lost(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether a participant is dead and will not come back."""
@@ -142,7 +167,9 @@ class Outages:
         skew_ns = sum(clock.skew_ns(now_ns) for clock in clocks if clock.holds(now_ns))
         return max(skew_ns, -now_ns)
 
-    def _stands(self, fault: OnProcesses, now_ns: int) -> bool:
-        if not fault.holds(now_ns):
-            return False
-        return not isinstance(fault, Slow) or now_ns // self._period_ns % fault.every != 0
+    def _gets_to_it(self, now_ns: int, every: int) -> bool:
+        return now_ns // self._period_ns % every == 0
+
+
+def _is_mid_step(fault: OnProcesses) -> bool:
+    return isinstance(fault, Kill) and fault.mid_step

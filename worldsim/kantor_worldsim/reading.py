@@ -514,14 +514,14 @@ class Reader:
         """Robots, place of the supervisor, samples."""
         self._make_room(1 << 10)
 
-    def read(self, record: Record) -> tuple[Any, ...]:
+    def read(self, record: Record, payload: bytes = b"") -> tuple[Any, ...]:
         """The record's bytes and, of a batch, its tables: a Reading as arguments of a kernel.
 
-        The first record must be an opening.
+        The first record must be an opening. payload: the record encoded, if it came so.
         """
         if record is self._record:
             return self._reading
-        payload = encode_record(record)
+        payload = payload or encode_record(record)
         if isinstance(record, Batch):
             while _read_batch(payload, *self._tables, self._pose_bits, *self._bounds) < 0:
                 assert self._rows <= len(payload), "what msgspec has encoded can be read"

@@ -126,6 +126,8 @@ class Recording:
         survey = Survey(self._reader) if scenario.mapping else None
         self.metrics = metrics_of(scenario, exact_every, self._reader, survey)
         self.checker = Checker(self._reader, survey, virtual=exchange != "wall")
+        self.payload = b""
+        """The last record, encoded."""
         self.refused_at_door = 0
         """Messages to world-sim that it could not take in; whoever runs the bus counts them."""
         self._scenario = scenario
@@ -160,7 +162,8 @@ class Recording:
 
     def take(self, record: Record) -> None:
         """Follow one record."""
-        self.journal.take(record, self._reader.read(record)[0])
+        self.payload = self._reader.read(record)[0]
+        self.journal.take(record, self.payload)
         self.metrics.take(record)
         self.checker.take(record)
         if len(self.metrics.rows) > self._rows:

@@ -19,8 +19,9 @@ from kantor_protocol.scenario import Scenario
 from kantor_worldsim.checkers import Checker
 from kantor_worldsim.journal import Digest, Journal, read
 from kantor_worldsim.liveness import Liveness
+from kantor_worldsim.reading import Reader
 from kantor_worldsim.recording import JOURNAL, Recording
-from kantor_worldsim.records import Batch, Record, decode_record, encode_record
+from kantor_worldsim.records import Record, decode_record, encode_record
 from kantor_worldsim.world import Site
 
 TWICE_EVERY = 20
@@ -103,31 +104,21 @@ class Follower:
         """folder: for the run's files, as `kantor run` leaves them; None keeps nothing."""
         self.recording = Recording(scenario, seed, "in-process", folder)
         self.payloads: list[bytes] = []
-        self._keep()
         self.struck, self.sightings = Struck(), Sightings()
-        self.steps = 0
         self.judged: frozenset[str] = frozenset()
         """Rules of liveness that the record could have broken."""
-        self._robots = frozenset(scenario.robot_ids)
 
     def take(self, record: Record) -> None:
         """Follow one record."""
         self.recording.take(record)
+        self.payloads.append(self.recording.payload)
         self.struck.take(record)
         self.sightings.take(record)
-        if isinstance(record, Batch):
-            for act in record.acts:
-                self.steps += act.outputs is not None and act.name in self._robots
 
-    def _keep(self) -> None:
-        """Note the bytes of every record as the journal takes them."""
-        take = self.recording.journal.take
-
-        def taken(record: Record, payload: bytes = b"") -> None:
-            self.payloads.append(payload or encode_record(record))
-            take(record, payload)
-
-        self.recording.journal.take = taken  # type: ignore[method-assign]
+    @property
+    def steps(self) -> int:
+        """Of all robots so far."""
+        return self.recording.metrics.steps
 
     @property
     def broken(self) -> bool:
@@ -141,8 +132,11 @@ class Follower:
 
     def _judged(self) -> list[str]:
         """What referees find who have nothing but the bytes of the record."""
-        checker, liveness = Checker(), Liveness()
-        for record in map(decode_record, self.payloads):
+        reader, liveness = Reader(), Liveness()
+        checker = Checker(reader)
+        for payload in self.payloads:
+            record = decode_record(payload)
+            reader.read(record, payload)
             checker.take(record)
             liveness.take(record)
         self.judged = frozenset(liveness.judged)
@@ -202,7 +196,9 @@ def _cut_open(seed: int, payloads: list[bytes]) -> Iterable[str]:
             found = list(read(path))
             if [payload for payload, _ in found] != payloads[: len(found)]:
                 yield "prefix: what is left of a journal that was cut is not what was written"
-            checker = Checker()
-            for _, record in found:
+            reader = Reader()
+            checker = Checker(reader)
+            for payload, record in found:
+                reader.read(record, payload)
                 checker.take(record)
             yield from checker.complaints

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import ClassVar
 
-from kantor_protocol.faults import Kill, Late, OneWay, Partition
+from kantor_protocol.faults import Clock, Kill, Late, OneWay, Partition
 from kantor_protocol.machine import EVERYBODY, SUPERVISOR, WORLD_SIM, Outputs, ParticipantId, State
 from kantor_protocol.messages import RefusedError, decode_news
 from kantor_protocol.packing import Pairs
@@ -59,34 +59,41 @@ class _Ears(_Sight):
 
     def __init__(self, opening: Opening) -> None:
         super().__init__(opening)
-        self._heard: dict[tuple[ParticipantId, ParticipantId], set[int]] = {}
         self._newest: dict[tuple[ParticipantId, ParticipantId], int] = {}
+        self._missing: dict[tuple[ParticipantId, ParticipantId], set[int]] = {}
+        """Numbers below the newest of a link that were not heard."""
         self._restarted: set[ParticipantId] = set()
         self._born: dict[ParticipantId, int] = {}
         self._refused: dict[ParticipantId, int] = {}
 
     def act(self, act: Act, outputs: Outputs) -> None:
-        name = act.name
+        name, newest, born = act.name, self._newest, self._born
         for source, sequence in act.heard:
             if sequence >= FIRST_SEQUENCE:
                 continue
             link = (name, source)
-            newest = self._newest.get(link, -1)
-            if sequence > newest:
-                self._newest[link] = sequence
-            elif sequence in self._heard[link]:
-                self.seen["heard twice"] += 1
+            last = newest.get(link, -1)
+            if sequence > last:
+                newest[link] = sequence
+                if sequence > last + 1:
+                    self._missing.setdefault(link, set()).update(range(last + 1, sequence))
             else:
-                self.seen["heard out of order"] += 1
-            if sequence < newest and name in self._restarted:
-                self.seen["stale word after a restart"] += 1
-            if self._born and sequence <= self._born.get(source, -1):
+                self._note_old(link, sequence, last)
+            if born and sequence <= born.get(source, -1):
                 self.seen["word of a former incarnation"] += 1
-            self._heard.setdefault(link, set()).add(sequence)
         if outputs.refused > self._refused.get(name, 0) and act.heard:
             forged = any(sequence >= FIRST_SEQUENCE for _, sequence in act.heard)
             self.seen["hostile message refused"] += forged
         self._refused[name] = outputs.refused
+
+    def _note_old(
+        self, link: tuple[ParticipantId, ParticipantId], sequence: int, newest: int
+    ) -> None:
+        missing = self._missing.get(link, set())
+        self.seen["heard out of order" if sequence in missing else "heard twice"] += 1
+        missing.discard(sequence)
+        if sequence < newest and link[0] in self._restarted:
+            self.seen["stale word after a restart"] += 1
 
     def incident(self, incident: Incident) -> None:
         if incident.what == "start" and incident.step > 0:
@@ -293,16 +300,15 @@ class _Ends(_Sight):
         self._read_ns: dict[ParticipantId, int] = {}
         self._alone: set[ParticipantId] = set()
         self._centralized = self.scenario.centralized
+        self._misled = any(isinstance(fault, Clock) for fault in self.scenario.faults)
 
     def act(self, act: Act, outputs: Outputs) -> None:
         name = act.name
         if outputs.state is State.EXHAUSTED and name not in self._exhausted:
             self._exhausted.add(name)
             self.seen["energy ended in contact"] += bool(act.heard)
-        read_ns = act.now_ns + act.skew_ns
-        if read_ns < self._read_ns.get(name, 0):
-            self.seen["clock jumped back"] += 1
-        self._read_ns[name] = read_ns
+        if self._misled:
+            self._read_clock(act)
         if self._centralized and name != SUPERVISOR and outputs.outbox:
             alone = outputs.outbox[-1].target == EVERYBODY
             if alone and name not in self._alone:
@@ -311,6 +317,12 @@ class _Ends(_Sight):
             elif not alone and name in self._alone:
                 self._alone.discard(name)
                 self.seen["supervisor heard again after it was given up"] += 1
+
+    def _read_clock(self, act: Act) -> None:
+        read_ns = act.now_ns + act.skew_ns
+        if read_ns < self._read_ns.get(act.name, 0):
+            self.seen["clock jumped back"] += 1
+        self._read_ns[act.name] = read_ns
 
 
 _SIGHTS = (_Goals, _Sides, _Lives, _Ears, _Memory, _Ends)
