@@ -47,6 +47,20 @@ def test_what_ends_comes_before_what_begins() -> None:
     ]
 
 
+def test_world_sim_comes_first_and_goes_last() -> None:
+    """Whoever starts, or stops, at the same moment is seen by it."""
+    outage = 'kind = "kill"; who = ["worldsim"]; from_s = 1.0; until_s = 2.0'
+    pause = 'kind = "pause"; who = ["r3"]; from_s = 1.0; until_s = 2.0'
+    deeds = deeds_of(troubled(outage, pause))
+
+    assert [(deed.who, deed.what) for deed in deeds] == [
+        ("r3", "pause"),
+        ("worldsim", "kill"),
+        ("worldsim", "start"),
+        ("r3", "resume"),
+    ]
+
+
 @pytest.mark.parametrize(
     ("who", "at_ms", "idle"),
     [

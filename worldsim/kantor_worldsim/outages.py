@@ -60,7 +60,8 @@ class Deed(NamedTuple):
 def deeds_of(scenario: Scenario) -> list[Deed]:
     """Everything that is done to processes in a mission, in order of time and of the list.
 
-    At one moment what ends comes before what begins, so that a process can come and go.
+    At one moment what ends comes before what begins, so that a process can come and go; world-sim comes
+    first and goes last, so that it sees what befalls the others.
     """
     deeds: list[Deed] = []
     for index, fault in enumerate(scenario.faults):
@@ -76,8 +77,9 @@ def deeds_of(scenario: Scenario) -> list[Deed]:
     return sorted(deeds, key=_turn)
 
 
-def _turn(deed: Deed) -> tuple[int, bool]:
-    return deed.at_ns, deed.what in _FIRST.values()
+def _turn(deed: Deed) -> tuple[int, bool, bool]:
+    begins = deed.what in _FIRST.values()
+    return deed.at_ns, begins, (deed.who == WORLD_SIM) == begins
 
 
 class _Window(NamedTuple):
