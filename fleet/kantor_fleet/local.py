@@ -170,6 +170,12 @@ class Fleet:
         with self._lock:
             return self._down or self.world_sim.exitcode is None
 
+    @property
+    def deserted(self) -> bool:
+        """Whether nobody is left who could take part, before anything has happened."""
+        with self._lock:
+            return all(process.exitcode is not None for process in self.participants.values())
+
     def stop(self) -> None:
         """Ask world-sim to end the mission and close the record."""
         self._stopping.set()
@@ -328,7 +334,12 @@ def _be_world_sim(
 ) -> None:
     from kantor_worldsim.plan import Plan  # noqa: PLC0415  the fork server has it
     from kantor_worldsim.process import run  # noqa: PLC0415  the fork server has it
-    from kantor_worldsim.recording import Past, Recording, ResumeError  # noqa: PLC0415
+    from kantor_worldsim.recording import (  # noqa: PLC0415
+        OverError,
+        Past,
+        Recording,
+        ResumeError,
+    )
     from kantor_worldsim.world import Site  # noqa: PLC0415
 
     say = log_to(log, "worldsim")
@@ -336,8 +347,13 @@ def _be_world_sim(
     scenario, seed = order.scenario, order.seed
     past = None
     if resume:
-        with contextlib.suppress(ResumeError):  # then nothing has happened yet
+        try:
             past = Past.of(order.folder)
+        except OverError as error:  # it was killed on its way out
+            say(str(error))
+            return
+        except ResumeError:  # nothing has happened yet
+            past = None
     site = Site.of(scenario, seed) if past is None else past.opening.site
     plan = Plan(scenario, seed, site, order.exchange, order.speed)
     identity = credentials.find(secrets, credentials.HOST)

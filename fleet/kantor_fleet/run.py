@@ -213,7 +213,8 @@ def _run_processes(order: Order, interrupts: Interrupts) -> Exit:
                         view.note(f"{name} ended with {_told(failure)}; the others go on")
                     if (ended := fleet.revive()) is not None:
                         view.note(f"world-sim ended with {ended}; it goes on from its record")
-                    if interrupts() and not asked:
+                    waiting = message is not None and message.phase == "waiting"
+                    if not asked and (interrupts() or (waiting and fleet.deserted)):
                         asked = True
                         view.note("ending the mission")
                         fleet.stop()

@@ -269,3 +269,19 @@ def test_scenarios_are_listed_and_shown(kantor: "Kantor") -> None:
     assert listed.splitlines()[0].startswith("fleet ")
     assert len(listed.splitlines()) == 12
     assert in_process(kantor, "mine.toml", *SHORT).code == 1
+
+
+def test_world_sim_that_is_killed_on_its_way_out_leaves_its_run_alone(kantor: "Kantor") -> None:
+    """Started again, it finds the mission over: it does nothing, and nothing is lost."""
+    from multiprocessing import Pipe
+
+    from kantor_fleet.catalog import find
+    from kantor_fleet.local import Order, _be_world_sim
+
+    assert in_process(kantor, "fleet", *SHORT).code == 1
+    (folder,) = kantor.runs()
+    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    order = Order(find("fleet"), 0, "lockstep", 1.0, folder)
+    _be_world_sim(order, "tcp/127.0.0.1:1", folder, kantor.folder / "log", Pipe()[1], True, False)
+
+    assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before

@@ -15,6 +15,7 @@ from kantor_worldsim.recording import (
     MANIFEST,
     METRICS,
     RESULT,
+    OverError,
     Past,
     Recording,
     ResumeError,
@@ -148,7 +149,7 @@ def test_an_interrupted_mission_can_be_resumed_and_one_that_is_over_cannot(
         cut_short(folder, (*records[:5], Ending(10**10, reason))).finish()
 
     assert Past.of(tmp_path / "interrupted").records == records[:5]
-    with pytest.raises(ResumeError, match=r"its mission is over \(done\)"):
+    with pytest.raises(OverError, match=r"its mission is over \(done\)"):
         Past.of(tmp_path / "done")
 
 

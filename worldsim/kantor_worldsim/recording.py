@@ -63,6 +63,10 @@ class ResumeError(ValueError):
     """A run folder from which no mission can go on; the message is one line with the remedy."""
 
 
+class OverError(ResumeError):
+    """The mission has come to its end, and its files are whole."""
+
+
 class Terms(msgspec.Struct, frozen=True):
     """How a run is run, in its manifest."""
 
@@ -84,7 +88,7 @@ class Past(NamedTuple):
 
     @classmethod
     def of(cls, folder: Path) -> "Past":
-        """Raises ResumeError."""
+        """Raises ResumeError; OverError if nothing is left to be done."""
         try:
             manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
             records = [record for _, record in read(folder / JOURNAL)]
@@ -99,7 +103,7 @@ class Past(NamedTuple):
         last = records[-1]
         if isinstance(last, Ending):
             if "digest" in manifest and last.reason != "interrupted":
-                raise ResumeError(f"{folder}: its mission is over ({last.reason})")
+                raise OverError(f"{folder}: its mission is over ({last.reason})")
             records.pop()
         return cls(terms, records[0], tuple(records), manifest)
 
