@@ -145,6 +145,7 @@ def rehearse(
 SEEDS = st.integers(0, 2**63 - 1)
 WORDS = st.integers(0, 2**32 - 1)
 COUNTS = st.integers(0, 2**63 - 1)
+MOMENTS = st.integers(-(2**62), 2**62)
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 UNUSABLE = st.sampled_from([math.nan, math.inf, -math.inf])
 METRES = st.floats(-1e6, 1e6)
@@ -190,7 +191,7 @@ ENVELOPES = st.builds(
 )
 INPUTS = st.builds(
     Inputs,
-    now_ns=COUNTS,
+    now_ns=MOMENTS,
     observation=st.builds(
         Observation, step=COUNTS, pose=POSES, detected=st.lists(COUNTS, max_size=4).map(tuple)
     ),
