@@ -187,3 +187,19 @@ def test_lost_entries_are_named() -> None:
         told = returning(told, name, outbox=said([have[0], have[1] - 1, have[2]], last))
 
     assert rules(told) == {"I8"}
+
+
+def test_what_a_fault_has_held_up_is_news_when_it_arrives() -> None:
+    """Nobody is judged by what was still under way; once it has arrived long ago, everybody is."""
+    records = rested(CUT)
+    sent = next(i for i, r in enumerate(records) if isinstance(r, Batch) and r.verdicts)
+    batch = records[sent]
+    assert isinstance(batch, Batch)
+    assert "L1" in judged(records).judged
+    for before_the_end_ns, rules_judged in ((1, False), (-1, True)):
+        due_ns = records[-1].now_ns - before_the_end_ns  # type: ignore[union-attr]
+        late = msgspec.structs.replace(batch.verdicts[0], due_ns=due_ns)
+        held_up = msgspec.structs.replace(batch, verdicts=(late, *batch.verdicts[1:]))
+        referee = judged([*records[:sent], held_up, *records[sent + 1 :]])
+
+        assert ("L1" in referee.judged) == rules_judged

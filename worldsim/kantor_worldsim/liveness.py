@@ -2,7 +2,7 @@
 
 Rules
 -----
-L1  when nothing has changed for long enough (no fault, nobody moves), all who can hear one another, over
+L1  when nothing has changed for long enough (no fault, nobody moves, nothing held up arrives), all who can hear one another, over
     others if need be, hold the same entries of all logs, and have the same view
 L2  a mission comes to its end before the limit of time
 L3  a robot that has not heard its supervisor for more than 9 of its own steps talks to everybody, and as
@@ -90,6 +90,8 @@ class Liveness:
         elif isinstance(record, Batch):
             for act in record.acts:
                 self._follow(act, record.now_ns)
+            if self._scenario.faults:
+                self._note_late(record)
         elif isinstance(record, Incident):
             self._befall(record)
         else:
@@ -107,6 +109,10 @@ class Liveness:
             for name, (x, y) in zip(scenario.robot_ids, opening.site.starts_m.tolist(), strict=True)
         }
         self._changed_ns = 0
+        self._late_ns: list[int] = []
+        """When messages arrive that a fault has held up: they are news from before."""
+        radio = scenario.radio
+        self._way_ns = round((radio.delay_s + radio.jitter_s + radio.reorder_s) * 1e9)
         self._spent: dict[int, list[bytes]] = {}
         """What each slot has shipped."""
         self._said: set[str] = set()
@@ -130,6 +136,10 @@ class Liveness:
             self._poses[act.name], self._changed_ns = pose, now_ns
         if act.name != SUPERVISOR and self._scenario.centralized:
             self._check_contact(state, act, outputs)
+
+    def _note_late(self, batch: Batch) -> None:
+        on_time_ns = batch.now_ns + self._way_ns
+        self._late_ns += [each.due_ns for each in batch.verdicts if each.due_ns > on_time_ns]
 
     def _check_contact(self, state: _Participant, act: Act, outputs: Outputs) -> None:
         """L3, for each step of a robot."""
@@ -168,6 +178,8 @@ class Liveness:
             self.judged.add("L2")
             if ending.reason == "limit":
                 self._complain("L2", ending.now_ns, "record", "the mission came to no end")
+        arrived_ns = (due_ns for due_ns in self._late_ns if due_ns <= ending.now_ns)
+        self._changed_ns = max(self._changed_ns, *arrived_ns, 0)
         if not self._has_calmed_down(ending.now_ns):
             return
         known = {name: self._known(name) for name in self._names if self._states[name].alive}
