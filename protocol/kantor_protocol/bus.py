@@ -1,7 +1,7 @@
 """The bus: the only file that knows Zenoh.
 
-World-sim is the router; every other process is a client of it, with an identity of its own. Access
-control makes world-sim the only way from one participant to another: a participant may put on its own
+World-sim is the router; every other process is a client of it, with an identity of its own: a password on
+`tcp/HOST:PORT`, a certificate on `tls/HOST:PORT`, where both sides prove who they are. Access control makes world-sim the only way from one participant to another: a participant may put on its own
 keys and read its own `rx`, nothing else. The traps that the settings below avoid are in
 protocol/README.md.
 
@@ -12,20 +12,29 @@ A client connects again by itself when world-sim comes back: its token and its s
 anew, so that world-sim sees it join with the nonce that it had.
 """
 
+import base64
 import contextlib
 import json
+import os
 import queue
 import socket
+import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from kantor_protocol import keys
-from kantor_protocol.credentials import OBSERVER, Identity
+from kantor_protocol import keys, tls
+from kantor_protocol.credentials import (
+    OBSERVER,
+    Certificate,
+    CredentialsError,
+    Identity,
+    Password,
+)
 from kantor_protocol.machine import ParticipantId
 from kantor_protocol.messages import MESSAGE_BYTES_MAX
 
@@ -74,20 +83,23 @@ class Host:
         listen: str,
         users_file: Path,
         roster: tuple[ParticipantId, ...],
+        say: Callable[[str], None] = lambda _line: None,
     ) -> None:
-        """listen: an endpoint such as `tcp/127.0.0.1:7447`. Raises BusError if it cannot be had."""
+        """listen: an endpoint such as `tcp/127.0.0.1:7447`. users_file: of passwords, for an identity that is one.
+
+        say: takes a line on whoever shows a certificate of the fleet's authority and is not let in; called
+        from a thread. Raises BusError if the endpoint cannot be had, CredentialsError if it is not of the
+        identity's kind.
+        """
+        check_endpoint(listen, identity)
         fleet = identity.fleet
         settings = {
             "scouting/delay": 0,
             "open/return_conditions": {"connect_scouted": False, "declares": False},
             # A frozen client must not hold the router for long (the unit is microseconds).
             "transport/link/tx/queue/congestion_control/block/wait_before_close": 200_000,
-            "transport/auth/usrpwd": {
-                "user": identity.user,
-                "password": identity.password,
-                "dictionary_file": str(users_file),
-            },
-            "access_control": _access(fleet, roster),
+            **_proof(identity, "listen", users_file),
+            "access_control": _access(fleet, _subjects(identity, (*roster, OBSERVER))),
             "low_pass_filter": [
                 {
                     "id": "tx",
@@ -108,12 +120,20 @@ class Host:
         self._drop = zenoh.CongestionControl.DROP
         self._rx = {name: keys.rx(fleet, name) for name in roster}
         self._progress = keys.progress(fleet)
+        self._wanted = frozenset((*roster, OBSERVER))
+        self._identity = identity
+        self._refusals = tls.Refusals(say)
         self._held: list[Any] = [
             self._session.declare_subscriber(keys.tx(fleet), self._on_message),
             self._session.liveliness().declare_subscriber(
                 keys.alive(fleet), self._on_token, history=True
             ),
         ]
+        if isinstance(identity, Certificate):
+            self._held += [
+                self._session.declare_queryable(keys.door(fleet), self._on_question),
+                self._session.info.declare_link_events_listener(self._on_link),
+            ]
 
     def __enter__(self) -> Self:
         return self
@@ -140,6 +160,21 @@ class Host:
     def close(self) -> None:
         """Leave the bus."""
         _close(self._session, self._held)
+        self._refusals.close()
+
+    def _objection(self, name: str) -> str:
+        """Why the holder of a certificate is not let in."""
+        assert isinstance(self._identity, Certificate)
+        return self._identity.objection(name, self._wanted)
+
+    def _on_question(self, query: zenoh.Query) -> None:
+        name = str(query.key_expr).rpartition("/")[2]
+        query.reply(keys.door(self._fleet, name), self._objection(name).encode())
+
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        name = event.link.auth_identifier
+        if event.kind == zenoh.SampleKind.PUT and name and (objection := self._objection(name)):
+            self._refusals.tell(f"refused {name.partition('.')[0]}: {objection}")
 
     def _on_message(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
@@ -245,24 +280,30 @@ def watch(connect: str, identity: Identity, key: str, patience_s: float) -> Iter
         opened.close()
 
 
-def free_endpoint() -> str:
+def free_endpoint(protocol: str = "tcp") -> str:
     """A loopback endpoint that nobody uses now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def await_endpoint(
-    connect: str, patience_s: float, monotonic: Callable[[], float] = time.monotonic
+    connect: str,
+    patience_s: float,
+    identity: Identity | None = None,
+    monotonic: Callable[[], float] = time.monotonic,
 ) -> None:
-    """Return once something accepts connections there; raises BusError after `patience_s`."""
-    host, port = _address(connect)
+    """Return once something accepts connections there.
+
+    identity: if it is a certificate, also shake hands with it, which is worth an objection in words. Raises
+    BusError after `patience_s`, and at once if either side objects.
+    """
+    _, host, port = _address(connect)
     give_up = monotonic() + patience_s
     pause_s = 0.02
     while True:
         try:
-            with socket.create_connection((host, port), timeout=1.0):
-                return
+            objection = _look_in(host, port, identity)
         except socket.gaierror:
             raise BusError(f"{connect}: no such host; check --connect") from None
         except OSError:
@@ -271,25 +312,56 @@ def await_endpoint(
                     f"{connect}: nothing listens there after {patience_s:g} s; "
                     f"start `kantor worldsim` or check --connect"
                 ) from None
+        else:
+            if objection:
+                raise BusError(f"{connect}: {objection}")
+            return
         time.sleep(pause_s)
         pause_s = min(0.2, 1.5 * pause_s)
 
 
-def _address(endpoint: str) -> tuple[str, int]:
+def _look_in(host: str, port: int, identity: Identity | None) -> str:
+    """What world-sim or we have against each other. Raises OSError if nothing listens there."""
+    if isinstance(identity, Certificate):
+        return tls.objection(host, port, identity)
+    socket.create_connection((host, port), timeout=1.0).close()
+    return ""
+
+
+def _address(endpoint: str) -> tuple[str, str, int]:
     protocol, _, place = endpoint.partition("/")
     host, _, port = place.rpartition(":")
-    if protocol != "tcp" or not host or not port.isdigit() or int(port) > 65535:
-        raise BusError(f"{endpoint}: not an endpoint; write it as tcp/HOST:PORT")
-    return host.strip("[]"), int(port)
+    sound = protocol in {"tcp", "tls"} and host and port.isdecimal() and port.isascii()
+    if not sound or int(port) > 65535:
+        raise BusError(f"{endpoint}: not an endpoint; write it as tcp/HOST:PORT or tls/HOST:PORT")
+    return protocol, host.strip("[]"), int(port)
 
 
-def check_endpoint(endpoint: str) -> None:
-    """Raise BusError unless it reads tcp/HOST:PORT."""
-    _address(endpoint)
+def is_tls(endpoint: str) -> bool:
+    """Whether an endpoint is for certificates. Raises BusError if it is none."""
+    return _address(endpoint)[0] == "tls"
+
+
+def check_endpoint(endpoint: str, identity: Identity | None = None) -> None:
+    """Raise BusError unless it reads tcp/HOST:PORT or tls/HOST:PORT.
+
+    identity: raise CredentialsError unless it is of the kind that the endpoint is for.
+    """
+    protocol, _, place = endpoint.partition("/")
+    if is_tls(endpoint) and isinstance(identity, Password):
+        raise CredentialsError(
+            f"{endpoint}: {identity.user} has a password, and tls takes certificates; "
+            f"make them with `kantor keys`, or use tcp/{place}"
+        )
+    if protocol == "tcp" and isinstance(identity, Certificate):
+        raise CredentialsError(
+            f"{endpoint}: {identity.user} has a certificate, and tcp takes passwords; use tls/{place}"
+        )
 
 
 def _client(connect: str, identity: Identity, patience_s: float) -> zenoh.Session:
-    await_endpoint(connect, patience_s)
+    check_endpoint(connect, identity)
+    await_endpoint(connect, patience_s, identity)
     settings = {
         "connect/timeout_ms": round(_HANDSHAKE_S * 1000),
         "connect/retry": {
@@ -298,14 +370,53 @@ def _client(connect: str, identity: Identity, patience_s: float) -> zenoh.Sessio
             "period_increase_factor": 1.5,
         },
         "transport/link/tx/lease": LEASE_MS,
-        "transport/auth/usrpwd": {"user": identity.user, "password": identity.password},
+        **_proof(identity, "connect"),
     }
     try:
-        return zenoh.open(_config("client", connect=connect, settings=settings))
+        session = zenoh.open(_config("client", connect=connect, settings=settings))
     except zenoh.ZError:
         raise BusError(
             f"{connect}: refuses {identity.user}; its credentials are not this world-sim's"
         ) from None
+    if isinstance(identity, Certificate):
+        try:
+            _knock(connect, session, identity)
+        except BusError:
+            _close(session, [])
+            raise
+    return session
+
+
+def _knock(connect: str, session: zenoh.Session, identity: Certificate) -> None:
+    """Ask whether we are let in: a certificate may be sound and yet not the register's. Raises BusError."""
+    for reply in session.get(keys.door(identity.fleet, identity.name), timeout=_HANDSHAKE_S):
+        if reply.ok is not None:
+            if objection := reply.ok.payload.to_bytes().decode(errors="replace"):
+                raise BusError(f"{connect}: refuses {identity.user}: {objection}")
+            return
+    raise BusError(f"{connect}: no world-sim of fleet {identity.fleet} answers; check --connect")
+
+
+def _proof(identity: Identity, side: str, users_file: Path | None = None) -> dict[str, Any]:
+    """The settings that prove who we are. side: connect or listen."""
+    if isinstance(identity, Password):
+        known = {"dictionary_file": str(users_file)} if users_file is not None else {}
+        proof = {"user": identity.user, "password": identity.password, **known}
+        return {"transport/auth/usrpwd": proof}
+
+    def encoded(pem: str) -> str:
+        return base64.b64encode(pem.encode()).decode()
+
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate_base64": encoded(identity.authority),
+            f"{side}_certificate_base64": encoded(identity.certificate),
+            f"{side}_private_key_base64": encoded(identity.key),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "close_link_on_expiration": True,
+        }
+    }
 
 
 def _config(
@@ -326,47 +437,87 @@ def _config(
     return config
 
 
-def _access(fleet: str, roster: tuple[ParticipantId, ...]) -> dict[str, Any]:
-    """Who may do what on the router. Whatever is not allowed here is denied."""
-    rules: list[dict[str, Any]] = []
-    subjects: list[dict[str, Any]] = []
-    policies: list[dict[str, Any]] = []
+class Grant(NamedTuple):
+    """What somebody may do on the router."""
 
-    def allow(user: str, *grants: tuple[str, str, list[str], list[str]]) -> None:
-        for label, flow, messages, expressions in grants:
-            rules.append(
-                {
-                    "id": f"{user}-{label}",
-                    "permission": "allow",
-                    "flows": [flow],
-                    "messages": messages,
-                    "key_exprs": expressions,
-                }
-            )
-        subjects.append({"id": user, "usernames": [user]})
-        policies.append({"rules": [f"{user}-{label}" for label, *_ in grants], "subjects": [user]})
+    label: str
+    flow: str
+    messages: list[str]
+    expressions: list[str]
 
-    for name in roster:
-        own = [keys.tx(fleet, name), keys.pose(fleet, name), keys.weights(fleet, name)]
-        allow(
-            name,
-            ("says", "ingress", ["put"], own),
-            ("listens", "ingress", ["declare_subscriber"], [keys.rx(fleet, name)]),
-            ("hears", "egress", ["put"], [keys.rx(fleet, name)]),
-            ("lives", "ingress", ["liveliness_token"], [keys.alive(fleet, name)]),
-        )
+
+Subject = Mapping[str, list[str]]
+"""How the router knows somebody: by `usernames`, `cert_common_names` or `link_protocols`."""
+
+
+def _subjects(identity: Identity, users: tuple[ParticipantId, ...]) -> dict[ParticipantId, Subject]:
+    """How the router knows those users. Who has no certificate, or whose was revoked, is unknown to it."""
+    if isinstance(identity, Password):
+        return {user: {"usernames": [user]} for user in users}
+    named = identity.names(users)
+    return {user: {"cert_common_names": [name]} for user, name in named.items()}
+
+
+def _participant(fleet: str, name: ParticipantId) -> list[Grant]:
+    """A participant's grants."""
+    own = [keys.tx(fleet, name), keys.pose(fleet, name), keys.weights(fleet, name)]
+    return [
+        Grant("says", "ingress", ["put"], own),
+        Grant("listens", "ingress", ["declare_subscriber"], [keys.rx(fleet, name)]),
+        Grant("hears", "egress", ["put"], [keys.rx(fleet, name)]),
+        Grant("lives", "ingress", ["liveliness_token"], [keys.alive(fleet, name)]),
+    ]
+
+
+def _observer(fleet: str) -> list[Grant]:
+    """An observer's grants."""
     everything = [keys.everything(fleet)]
-    allow(
-        OBSERVER,
-        ("listens", "ingress", ["declare_subscriber"], everything),
-        ("hears", "egress", ["put"], everything),
-    )
+    return [
+        Grant("listens", "ingress", ["declare_subscriber"], everything),
+        Grant("hears", "egress", ["put"], everything),
+    ]
+
+
+def _anybody(fleet: str) -> list[Grant]:
+    """What a client may do whose certificate is the fleet's, even if it is not let in: ask why."""
+    return [
+        Grant("asks", "ingress", ["query"], [keys.door(fleet)]),
+        Grant("learns", "egress", ["reply", "declare_queryable"], [keys.door(fleet)]),
+    ]
+
+
+def _access(fleet: str, subjects: Mapping[ParticipantId, Subject]) -> dict[str, Any]:
+    """Who may do what on the router. Whatever is not allowed here is denied."""
+    grants = [
+        (user, subject, _observer(fleet) if user == OBSERVER else _participant(fleet, user))
+        for user, subject in subjects.items()
+    ]
+    if any("cert_common_names" in subject for subject in subjects.values()):
+        grants.append(("anybody", {"link_protocols": ["tls"]}, _anybody(fleet)))
+    return rules_of(grants)
+
+
+def rules_of(grants: list[tuple[str, Subject, list[Grant]]]) -> dict[str, Any]:
+    """Zenoh's access control: everybody's name, how the router knows them, and what they may do."""
     return {
         "enabled": True,
         "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
+        "rules": [
+            {
+                "id": f"{user}-{grant.label}",
+                "permission": "allow",
+                "flows": [grant.flow],
+                "messages": grant.messages,
+                "key_exprs": grant.expressions,
+            }
+            for user, _, granted in grants
+            for grant in granted
+        ],
+        "subjects": [{"id": user, **subject} for user, subject, _ in grants],
+        "policies": [
+            {"rules": [f"{user}-{grant.label}" for grant in granted], "subjects": [user]}
+            for user, _, granted in grants
+        ],
     }
 
 
@@ -390,3 +541,45 @@ def _short(error: Exception) -> str:
 def init_log() -> None:
     """Zenoh's own log: silent, since kantor tells what a user can mend, unless RUST_LOG says more."""
     zenoh.init_log_from_env_or("off")
+
+
+@contextlib.contextmanager
+def host_log(identity: Identity, say: Callable[[str], None]) -> Iterator[None]:
+    """`init_log` for a host; with certificates, also a line on whoever comes without a sound one.
+
+    Zenoh tells of them in its log alone (zenoh#2712), without an address and with a misleading hint, and its log
+    goes to standard output. In here its lines are read instead, while our own output goes on where it went.
+    say: called from a thread.
+    """
+    if isinstance(identity, Password) or "RUST_LOG" in os.environ:
+        init_log()
+        yield
+        return
+    refusals = tls.Refusals(say)
+    sys.stdout.flush()
+    usual = sys.stdout
+    reading, writing = os.pipe()
+    kept = os.dup(1)
+    os.dup2(writing, 1)
+    os.close(writing)
+    sys.stdout = os.fdopen(os.dup(kept), "w", encoding="utf-8", errors="replace", buffering=1)
+    zenoh.init_log_from_env_or("zenoh_link_tls=warn")
+
+    def read() -> None:
+        with os.fdopen(reading, encoding="utf-8", errors="replace") as lines:
+            for line in lines:
+                if reason := tls.logged_reason(line):
+                    refusals.tell(reason)
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)  # closes the pipe, unless somebody else holds it
+        os.close(kept)
+        reader.join(_CLOSE_S)
+        refusals.close()
+        sys.stdout.flush()
+        sys.stdout.close()
+        sys.stdout = usual
