@@ -95,11 +95,11 @@ class Mission(_Message, frozen=True, array_like=True, tag=2):
     """(N, 2) float64 at time 0."""
     exchange: str
     """`lockstep` or `wall`."""
-    frame: Frame | None = None
+    frame: Frame | None
     """How the cells of the map lie, if there is one; what is in them is for the robots to find out."""
-    run: str = ""
+    run: str
     """Names this run of the mission, so that no snapshot of another is taken for its own."""
-    body: Body | None = None
+    body: Body
     """What the participant takes over."""
 
 

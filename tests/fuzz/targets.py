@@ -29,7 +29,7 @@ from kantor_protocol.diary import DiaryFile
 from kantor_protocol.evidence import Evidence, entries
 from kantor_protocol.grid import FREE, OCCUPIED, UNKNOWN
 from kantor_protocol.life import Life, Pages
-from kantor_protocol.machine import Body, Envelope, Inputs, Observation, Pose
+from kantor_protocol.machine import Body, Envelope, Inputs, Observation, Pose, StateMachine
 from kantor_protocol.messages import (
     Array,
     Mission,
@@ -355,12 +355,17 @@ def _parts_of_weights(content: bytes) -> bool:
 # Machines.
 
 
+def _newborn(me: str, played: corpora.Played) -> StateMachine:
+    scenario, site = played.scenario, played.site
+    return participant(me, scenario, 1, site, Body(site.poses(scenario)[me]))
+
+
 def _machine(name: str, me: str) -> Callable[[Path], Decode]:
     """A whole participant hears an envelope in each step."""
 
     def start(_folder: Path) -> Decode:
         played = corpora.played(name)
-        machine = participant(me, played.scenario, 1, played.site)
+        machine = _newborn(me, played)
         pose, step, refused = Pose(1.5, 1.5), 0, 0
         inputs = [i for i, who in zip(played.inputs, played.acted, strict=True) if who == me]
         scan = inputs[0].observation.scan
@@ -405,7 +410,7 @@ def _life(name: str, me: str) -> Callable[[Path], Decode]:
 
     def start(_folder: Path) -> Decode:
         played = corpora.played(name)
-        machine = participant(me, played.scenario, 1, played.site)
+        machine = _newborn(me, played)
 
         def live(content: bytes) -> None:
             Life(lambda _body: machine, _Leaf(content), Body(Pose(10.0, 10.0)))

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.machine import Envelope, Inputs, Observation, Outputs, Pose, State
+from kantor_protocol.grid import Frame
+from kantor_protocol.machine import Body, Envelope, Inputs, Observation, Outputs, Pose, State
 from kantor_protocol.messages import (
     BODY_BYTES_MAX,
     MESSAGE_BYTES_MAX,
@@ -75,6 +76,9 @@ TO_PARTICIPANT = st.one_of(
         starts=st.integers(0, 3).map(lambda n: Array.of(scattered(n))),
         samples=st.integers(0, 3).map(lambda n: Array.of(scattered(n))),
         exchange=st.sampled_from(["lockstep", "wall"]),
+        frame=st.none() | st.just(Frame(0.5, (-1.0, 2.0), 8, 6)),
+        run=NAMES,
+        body=st.builds(Body, pose=POSES, step=COUNTS, energy_spent=COUNTS, epoch=COUNTS),
     ),
     st.builds(Refusal, version=V, nonce=NAMES, reason=NAMES),
     st.builds(Go, version=V, nonce=NAMES, now_ns=COUNTS, speed=FINITE),
@@ -272,6 +276,17 @@ def test_older_report_gets_the_defaults() -> None:
     plain = msgpack.packb([6, 1, "n", [3, [1.0, 2.0]]])
 
     assert decode_from_participant(plain) == Report(1, "n", Outputs(3, Pose(1.0, 2.0)))
+
+
+def test_a_mission_without_a_body_is_refused() -> None:
+    """Whoever takes part has to know from where it goes on, and in which run."""
+    nothing, body = Array.of(scattered(0)), Body(Pose(1.0, 2.0))
+    told = Mission(VERSION, "n", mission(), 1, nothing, nothing, "wall", None, "run", body)
+    plain = msgpack.unpackb(encode(told))
+
+    assert decode_to_participant(msgpack.packb(plain)) == told
+    with pytest.raises(RefusedError):
+        decode_to_participant(msgpack.packb(plain[:-1]))
 
 
 @examples(60)
