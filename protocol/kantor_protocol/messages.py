@@ -202,7 +202,6 @@ _NEWS = msgspec.msgpack.Decoder(News)
 _FROM_PARTICIPANT = msgspec.msgpack.Decoder(FromParticipant)
 _TO_PARTICIPANT = msgspec.msgpack.Decoder(ToParticipant)
 _INPUTS = msgspec.msgpack.Decoder(Inputs)
-_OUTPUTS = msgspec.msgpack.Decoder(Outputs)
 _PROGRESS = msgspec.msgpack.Decoder(Progress)
 
 encode = _ENCODER.encode
@@ -261,13 +260,6 @@ def decode_progress(payload: bytes) -> Progress:
 def decode_inputs(payload: bytes) -> Inputs:
     """Inputs as they passed the codec. Raises RefusedError."""
     return _decoded(_INPUTS, payload)  # type: ignore[no-any-return]
-
-
-def decode_outputs(payload: bytes) -> Outputs:
-    """Outputs as they passed the codec. Raises RefusedError."""
-    outputs: Outputs = _decoded(_OUTPUTS, payload)
-    check_outputs(outputs)
-    return outputs
 
 
 def check_outputs(outputs: Outputs) -> None:

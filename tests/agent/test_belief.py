@@ -15,6 +15,7 @@ from kantor_protocol.packing import Pairs
 from kantor_protocol.replica import Replica
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units
+from replicas import entries
 from strategies import Points, crowds, examples, scattered
 
 Plan = list[tuple[int, int]]
@@ -196,7 +197,7 @@ def test_belief_holds_when_logs_outgrow_their_room(*, ledger: bool) -> None:
 
     assert one.weights.tolist() == [max(0, weight) for weight in left]
     plan = spend(one, 50.0, 50.0)
-    assert one.replica.entries(0)[-1][0] == plan[-1][0]
+    assert entries(one.replica, 0)[-1][0] == plan[-1][0]
     assert sum(one.weights.tolist()) == sum(max(0, weight) for weight in left) - 1
 
 

@@ -31,7 +31,7 @@ from kantor_protocol.machine import EVERYBODY, WORLD_SIM, Body
 from kantor_protocol.messages import decode_inputs
 from kantor_protocol.radio import Radio
 from kantor_protocol.registers import Registers
-from kantor_protocol.replica import Replica, read_logs
+from kantor_protocol.replica import Replica
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.weights import WeightsPublisher
 from kantor_worldsim import loop, outages
@@ -39,6 +39,7 @@ from kantor_worldsim.channel import Channel
 from kantor_worldsim.outages import Outages
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import World
+from replicas import read_logs
 
 LIMIT = 200
 """Missions within which every mutant must be caught."""
