@@ -18,6 +18,9 @@ import msgspec
 import numpy as np
 import pytest
 
+if __name__ == "__main__":
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
+
 from kantor_agent import core as agent_core
 from kantor_agent.belief import Belief
 from kantor_agent.core import Agent
