@@ -68,7 +68,7 @@ class Agent:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the class."""
-        self._radio.hear(inputs.inbox, self._belief.learn)
+        self._radio.hear(inputs.inbox, self._belief.replica.learn)
         self._locate(inputs.observation)
         self._belief.advance(inputs.now_ns)
         elapsed_ns = max(0, min(inputs.now_ns - self._now_ns, self._period_ns))
