@@ -66,7 +66,7 @@ def _learned(scenario: Scenario, epoch: int, said: Sequence[_Said]) -> Replica:
     for _ in range(_PASSES):
         for slot, news in said:
             replica.learn(slot, news.have, news.logs, news.claims, news.registers)
-            replica.end_step()
+        replica.end_step()
         held = int(replica.store.length.sum())
         if held == before:
             break
