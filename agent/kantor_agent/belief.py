@@ -206,7 +206,3 @@ class Belief:
             self._follow_store()
             used = _ship_packed(*self._to_ship, x_m, y_m)
         return self._packed[:used].tobytes()
-
-    def lowered(self) -> bytes:
-        """Packed pairs (sample, units left) of what fell in this step."""
-        return self.replica.packed_lowered()

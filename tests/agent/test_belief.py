@@ -268,7 +268,7 @@ def test_lowered_entries_are_the_difference_of_the_vectors(
     for x_m, y_m in places_m:
         before = belief.weights.tolist()
         belief.spend(x_m, y_m)
-        arrays = Pairs().decode(belief.lowered(), 6)
+        arrays = Pairs().decode(belief.replica.packed_lowered(), 6)
         assert arrays is not None
         for sample, left in zip(arrays[0].tolist(), arrays[1].tolist(), strict=True):
             assert left < before[sample]
