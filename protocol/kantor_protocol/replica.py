@@ -604,25 +604,19 @@ class Replica:
         self, source: int, have: bytes, logs: bytes, claims: bytes, registers: bytes = b""
     ) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
+        told = 0
         if registers:
-            return self._learn_with_registers(source, have, logs, claims, registers)
+            told = count_slots(have, self.manner.roster, 2 if self.manner.claims else 1)
+            if not self.registers.sound(registers, told):
+                return False
         outcome = _learn(*self._fields, have, logs, claims, source)
         while outcome != _LEARNT:
             if outcome == _MALFORMED:
                 return False
             self._make_room(outcome)
             outcome = _learn(*self._fields, have, logs, claims, source)
-        return True
-
-    def _learn_with_registers(
-        self, source: int, have: bytes, logs: bytes, claims: bytes, registers: bytes
-    ) -> bool:
-        told = count_slots(have, self.manner.roster, 2 if self.manner.claims else 1)
-        if not self.registers.sound(registers, told):
-            return False
-        if not self.learn(source, have, logs, claims):
-            return False
-        self.registers.learn(source, registers, told)
+        if registers:
+            self.registers.learn(source, registers, told)
         return True
 
     def _make_room(self, outcome: int) -> None:
