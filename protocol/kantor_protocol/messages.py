@@ -198,13 +198,13 @@ FromParticipant = Report | Ready
 ToParticipant = Mission | Refusal | Go | Turn | Stop
 
 _ENCODER = msgspec.msgpack.Encoder()
-_NEWS = msgspec.msgpack.Decoder(News)
 _FROM_PARTICIPANT = msgspec.msgpack.Decoder(FromParticipant)
 _TO_PARTICIPANT = msgspec.msgpack.Decoder(ToParticipant)
-_INPUTS = msgspec.msgpack.Decoder(Inputs)
 _PROGRESS = msgspec.msgpack.Decoder(Progress)
 
 encode = _ENCODER.encode
+_decode_news = msgspec.msgpack.Decoder(News).decode
+_decode_inputs = msgspec.msgpack.Decoder(Inputs).decode
 _NO_EPOCH, _NO_REGISTERS = encode(0), encode(b"") + encode(0)
 
 
@@ -223,7 +223,7 @@ def decode_news(body: bytes) -> News:
     if len(body) > BODY_BYTES_MAX:
         raise RefusedError(f"body of {len(body)} bytes")
     try:
-        news: News = _NEWS.decode(body)
+        news = _decode_news(body)
     except _UNDECODABLE as error:
         raise RefusedError(str(error)) from None
     if news.version != VERSION:
@@ -259,7 +259,10 @@ def decode_progress(payload: bytes) -> Progress:
 
 def decode_inputs(payload: bytes) -> Inputs:
     """Inputs as they passed the codec. Raises RefusedError."""
-    return _decoded(_INPUTS, payload)  # type: ignore[no-any-return]
+    try:
+        return _decode_inputs(payload)
+    except _UNDECODABLE as error:
+        raise RefusedError(str(error)) from None
 
 
 def check_outputs(outputs: Outputs) -> None:

@@ -598,20 +598,20 @@ class Replica:
         self, source: int, have: bytes, logs: bytes, claims: bytes, registers: bytes = b""
     ) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
-        told = self._told(have) if registers else 0
-        if registers and not self.registers.sound(registers, told):
-            return False
+        told = 0
+        if registers:
+            told = count_slots(have, self.manner.roster, 2 if self.manner.claims else 1)
+            if not self.registers.sound(registers, told):
+                return False
         outcome = _learn(*self._fields, have, logs, claims, source)
-        while outcome not in (_LEARNT, _MALFORMED):
+        while outcome != _LEARNT:
+            if outcome == _MALFORMED:
+                return False
             self._make_room(outcome)
             outcome = _learn(*self._fields, have, logs, claims, source)
-        if outcome == _LEARNT and registers:
+        if registers:
             self.registers.learn(source, registers, told)
-        return bool(outcome == _LEARNT)
-
-    def _told(self, have: bytes) -> int:
-        told: int = count_slots(have, self.manner.roster, 2 if self.manner.claims else 1)
-        return told
+        return True
 
     def _make_room(self, outcome: int) -> None:
         """What `_learn` asks for."""
@@ -685,8 +685,6 @@ class Replica:
 
     def packed_lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""
-        if not self.fell:
-            return b""
         store = self.store
         used = _pack_lowered(store.weights, store.lowered, store.counters, self._out)
         if used == _NO_ROOM_TO_PACK:

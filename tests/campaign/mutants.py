@@ -447,10 +447,13 @@ def hostile_message_taken_in(patch: Patch) -> None:
 def sound_message_refused(patch: Patch) -> None:
     due = _now_and_then(100)
 
-    def make(take: Any) -> Any:
-        return lambda self, *arguments: not due() and take(self, *arguments)
+    def make(hear: Any) -> Any:
+        def heard(self: Radio, inbox: Any, learn: Any) -> None:
+            hear(self, inbox, lambda *parts: not due() and learn(*parts))
 
-    _wrap(patch, Radio, "_take", make)
+        return heard
+
+    _wrap(patch, Radio, "hear", make)
 
 
 @mutant("a new incarnation counts its messages from 1 again", _has(Kill, disk=("torn", "lost")))

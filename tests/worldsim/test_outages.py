@@ -1,5 +1,7 @@
 """Process faults as time goes by: what is done when, and who is idle meanwhile."""
 
+import itertools
+
 import pytest
 
 from kantor_protocol.scenario import Scenario, parse
@@ -84,6 +86,21 @@ def test_who_is_idle_when(who: str, at_ms: int, idle: bool) -> None:  # noqa: FB
     outages = Outages(troubled(KILL, FOR_GOOD, PAUSE, DARK, SLOW))
 
     assert outages.idle(who, at_ms * MS) == idle
+
+
+def test_nobody_is_idle_or_dies_while_it_is_quiet() -> None:
+    """Before the first window and after the last; windows of clocks and of links do not count."""
+    outages = Outages(troubled(KILL, PAUSE, AHEAD))
+    quiet = [outages.quiet(at_ms * MS, (at_ms + 99) * MS) for at_ms in range(0, 9000, 100)]
+
+    for i, is_quiet in enumerate(quiet):
+        for name, at_ms in itertools.product(("r1", "r2", "r3"), (100 * i, 100 * i + 99)):
+            struck = outages.idle(name, at_ms * MS) or outages.dies(name, at_ms * MS)
+            assert not (is_quiet and struck)
+    assert quiet[0]
+    assert quiet[-1]
+    assert not all(quiet)
+    assert Outages(troubled(AHEAD)).quiet(0, 2**62)
 
 
 @pytest.mark.parametrize(

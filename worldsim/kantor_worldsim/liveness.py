@@ -136,7 +136,7 @@ class Liveness:
         if outputs.spent:
             self._spent.setdefault(state.slot, []).append(outputs.spent)
         before = self._poses.get(act.name)
-        if before is None or (pose.x_m, pose.y_m) != (before.x_m, before.y_m):
+        if before is None or pose.x_m != before.x_m or pose.y_m != before.y_m:
             self._poses[act.name], self._changed_ns = pose, now_ns
         if act.name != SUPERVISOR and self._scenario.centralized:
             self._check_contact(state, act, outputs)

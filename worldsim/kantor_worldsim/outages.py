@@ -105,8 +105,6 @@ class Outages:
         self._deeds = deeds_of(scenario)[done:]
         self._period_ns = scenario.period_ns
         faults = [fault for fault in scenario.faults if isinstance(fault, OnProcesses)]
-        self.some = bool(faults)
-        """Whether anybody ever fails."""
         names = (*scenario.roster, WORLD_SIM)
         windows = [_Window.of(fault) for fault in faults]
         self._stops = {
@@ -119,6 +117,9 @@ class Outages:
         }
         self.some_die_mid_step = any(self._deaths.values())
         """Whether anybody ever dies in a step."""
+        struck = [w for w in windows if w.fault.stops or _is_mid_step(w.fault)]
+        self._first_ns = min((w.from_ns for w in struck), default=_NEVER_NS)
+        self._last_ns = max((w.until_ns for w in struck), default=0)
         self._clocks = {
             name: [fault for fault in faults if isinstance(fault, Clock) and name in fault.who]
             for name in names
@@ -132,6 +133,10 @@ class Outages:
     def pop(self) -> Deed:
         """The next deed, handed out once."""
         return self._deeds.pop(0)
+
+    def quiet(self, from_ns: int, to_ns: int) -> bool:
+        """Whether nobody is idle and nobody dies in a step from one time to another, both included."""
+        return to_ns < self._first_ns or from_ns >= self._last_ns
 
     def idle(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether a participant takes no step now, because of its own or of world-sim's state."""
