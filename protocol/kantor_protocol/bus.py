@@ -18,7 +18,7 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -28,6 +28,7 @@ from kantor_protocol import keys
 from kantor_protocol.credentials import OBSERVER, Identity
 from kantor_protocol.machine import ParticipantId
 from kantor_protocol.messages import MESSAGE_BYTES_MAX
+from kantor_protocol.quota import Bucket, Excess, Quota, excesses
 
 LEASE_MS = 1000
 """A frozen or cut-off process is noticed after this."""
@@ -62,7 +63,13 @@ class Heard(NamedTuple):
     payload: bytes
 
 
-Event = Joined | Left | Heard
+class Flooded(NamedTuple):
+    """A participant has gone beyond its quota for the first time."""
+
+    name: ParticipantId
+
+
+Event = Joined | Left | Heard | Flooded
 
 
 class Host:
@@ -100,6 +107,7 @@ class Host:
         }
         self._fleet = fleet
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._buckets = {name: Bucket(Quota.of(0.0)) for name in roster}
         try:
             self._session = zenoh.open(_config("router", listen=listen, settings=settings))
         except zenoh.ZError as error:
@@ -131,7 +139,19 @@ class Host:
     def send(self, name: ParticipantId, payload: bytes, *, patiently: bool) -> None:
         """Put on a participant's `rx`. patiently: wait for a full queue, up to 0.2 s, rather than drop."""
         congestion = self._block if patiently else self._drop
+        if patiently:  # what may be lost is news, and news asks for nothing
+            self._buckets[name].ask()
         self._session.put(self._rx[name], payload, congestion_control=congestion, express=True)
+
+    def limit(self, quotas: Mapping[ParticipantId, Quota]) -> None:
+        """How much to take in of what each says; before that, little more than answers."""
+        for name, quota in quotas.items():
+            self._buckets[name].quota = quota
+
+    @property
+    def excess(self) -> dict[ParticipantId, Excess]:
+        """What was beyond the quotas."""
+        return excesses(self._buckets.items())
 
     def publish_progress(self, payload: bytes) -> None:
         """Tell observers how the mission goes."""
@@ -143,8 +163,15 @@ class Host:
 
     def _on_message(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
-        if key is not None and self._events.qsize() < QUEUE_MAX:
-            self._events.put(Heard(key.name, sample.payload.to_bytes()))
+        bucket = None if key is None else self._buckets.get(key.name)
+        if key is None or bucket is None:
+            return
+        payload = sample.payload
+        if not bucket.take(len(payload), time.monotonic()):
+            if bucket.excess.messages == 1:
+                self._events.put(Flooded(key.name))
+        elif self._events.qsize() < QUEUE_MAX:
+            self._events.put(Heard(key.name, payload.to_bytes()))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
