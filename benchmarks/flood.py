@@ -24,7 +24,7 @@ from functools import partial
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -79,6 +79,8 @@ FLOODS = (
     Flood("1 MiB on tx", ("tx",), LARGE, float("inf")),
     Flood("pose and weights, 10,000/s", ("pose", "weights"), SMALL, SMALL_PER_S),
     Flood("1 MiB on pose and weights", ("pose", "weights"), LARGE, float("inf")),
+    Flood("1 MiB on tx, gigabit", ("tx",), LARGE, 119),
+    Flood("tokens, 10,000/s", ("alive",), None, SMALL_PER_S),
 )
 
 
@@ -300,8 +302,10 @@ def _be_flooder(
         assert isinstance(mission, Mission)
         old = encode(Report(VERSION, "flood", Outputs(0, Pose(0.0, 0.0))))
         payload = old if flood.payload is None else flood.payload
-        put = [
-            partial(
+        put: list[Callable[[], object]] = [
+            Tokens(line, keys.alive(FLEET, FLOODER, "more"))
+            if kind == "alive"
+            else partial(
                 line._session.put,
                 f"kantor/v1/{identity.fleet}/{FLOODER}/{kind}",
                 payload,
@@ -318,6 +322,22 @@ def _be_flooder(
         out.send(windows)
         while not isinstance(_next(line), Stop):
             pass
+
+
+class Tokens:
+    """Comes and goes."""
+
+    def __init__(self, line: bus.Line, key: str) -> None:
+        self._liveliness = line._session.liveliness()
+        self._key = key
+        self._held: list[Any] = []
+
+    def __call__(self) -> None:
+        """Comes, or goes."""
+        if self._held:
+            self._held.pop().undeclare()
+        else:
+            self._held.append(self._liveliness.declare_token(self._key))
 
 
 def _await_message(line: bus.Line, kind: type, _said: object = None) -> object:
@@ -341,7 +361,7 @@ def _rest() -> int:
     return 0
 
 
-def _flood(put: list[Callable[[], None]], per_s: float) -> int:
+def _flood(put: list[Callable[[], object]], per_s: float) -> int:
     start_s, sent = time.monotonic(), 0
     while (elapsed_s := time.monotonic() - start_s) < WINDOW_S:
         if sent >= per_s * elapsed_s:

@@ -71,6 +71,11 @@ class Bucket:
         """What was beyond the quota so far."""
         return Excess(self._excess_messages, self._excess_bytes)
 
+    @property
+    def floods(self) -> bool:
+        """Whether there was anything beyond it."""
+        return self._excess_messages > 0
+
     def ask(self) -> None:
         """It has been asked something, which it may answer."""
         self._asked += 1
@@ -98,4 +103,4 @@ class Bucket:
 
 def excesses(buckets: Iterable[tuple[ParticipantId, Bucket]]) -> dict[ParticipantId, Excess]:
     """Of those that have gone beyond their quota."""
-    return {name: bucket.excess for name, bucket in buckets if bucket.excess.messages}
+    return {name: bucket.excess for name, bucket in buckets if bucket.floods}
