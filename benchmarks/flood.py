@@ -220,7 +220,7 @@ def _mission(
             target=_be_flooder, args=(theirs, endpoint, secrets, flood, rounds, end)
         )
         with _running([world]):
-            _await(lambda: (secrets / f"{FLOODER}.toml").exists())
+            _await((secrets / f"{FLOODER}.toml").exists)
             bus.await_endpoint(endpoint, START_S)
             with _running([*robots, flooder]):
                 uses: list[Use] = []
@@ -260,14 +260,12 @@ def _use(pid: int) -> Use:
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     ticks, pages = int(fields[11]) + int(fields[12]), int(fields[21])
     page_bytes = os.sysconf("SC_PAGE_SIZE")
-    return Use(
-        time.monotonic(), ticks / os.sysconf("SC_CLK_TCK"), pages * page_bytes / MIB
-    )
+    return Use(time.monotonic(), ticks / os.sysconf("SC_CLK_TCK"), pages * page_bytes / MIB)
 
 
 def _be_world(cores: list[int], listen: str, secrets: Path, out: Path) -> None:
-    from kantor_fleet.by_hand import host_by_hand
-    from kantor_fleet.catalog import find
+    from kantor_fleet.by_hand import host_by_hand  # noqa: PLC0415  the others need none of it
+    from kantor_fleet.catalog import find  # noqa: PLC0415
 
     os.sched_setaffinity(0, cores)
     scenario = find("fleet", ("limit_s=100000", "energy.points=50000", "energy.steps=50000"))
@@ -279,7 +277,7 @@ def _be_world(cores: list[int], listen: str, secrets: Path, out: Path) -> None:
 def _be_robot(
     cores: list[int], connect: str, secrets: Path, who: str, folder: Path, out: Connection
 ) -> None:
-    from kantor_agent.process import run
+    from kantor_agent.process import run  # noqa: PLC0415
 
     os.sched_setaffinity(0, cores)
     bus.Line = Timed  # type: ignore[misc]

@@ -43,9 +43,7 @@ def quotas(
 ) -> dict[ParticipantId, Quota]:
     """The quota of everybody. speed: wall, simulated seconds in a real one."""
     of_its_own = speed if exchange == "wall" else 0.0
-    return {
-        name: Quota.of(of_its_own * 1e9 / clock.period_ns) for name, clock in clocks.items()
-    }
+    return {name: Quota.of(of_its_own * 1e9 / clock.period_ns) for name, clock in clocks.items()}
 
 
 class Excess(msgspec.Struct, frozen=True):

@@ -2,12 +2,12 @@
 
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import examples
 
 from kantor_protocol.clock import clocks
 from kantor_protocol.messages import MESSAGE_BYTES_MAX
 from kantor_protocol.quota import BURST_BYTES, BURST_MESSAGES, Bucket, Excess, Quota, quotas
 from kantor_protocol.scenario import parse
+from strategies import examples
 
 SIZES = st.integers(0, 2 * MESSAGE_BYTES_MAX)
 PAUSES_S = st.floats(0.0, 2.0)
@@ -24,9 +24,7 @@ density = [{ mean_m = [50, 50], variance_m2 = [100, 100] }]
 
 
 @examples(200)
-@given(
-    st.floats(0.0, 500.0), st.lists(st.tuples(PAUSES_S, SIZES, st.booleans()), max_size=400)
-)
+@given(st.floats(0.0, 500.0), st.lists(st.tuples(PAUSES_S, SIZES, st.booleans()), max_size=400))
 def test_whatever_is_said_no_more_is_taken_than_was_asked_for_and_earned(
     steps_per_s: float, said: list[tuple[float, int, bool]]
 ) -> None:
