@@ -16,6 +16,7 @@ name = "turns"
 coordination = "centralized"
 domain = { min_m = [0, 0], max_m = [100, 100] }
 robots = { count = 4 }
+starts = { random = true }
 clock = { period_s = 0.5, order = "turn" }
 energy = { points = 40, steps = 100 }
 samples = { count = 10 }
