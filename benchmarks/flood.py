@@ -6,9 +6,9 @@ A mission on the wall with five robots over the real bus. Four are honest; the f
 credentials and is hostile. Windows with and without its flood follow each other, so that both see the same
 machine. A *tick* is from a robot's first word of a step to the world's acceptance of it in its hands.
 
-Robots would be other machines: what they use of a core is not what is measured. World-sim therefore has all cores
-but one to itself; the robots share that one, and the flooder gets what the honest leave of it. `--beside` lets everybody
-compete for all cores. Exits with 1 if a flood at least doubles the p99 of ticks, or memory grows.
+A robot would be another machine: its own use of a core is not what is measured. The flooder therefore has a core
+to itself and everybody else shares the others; `--beside` lets it compete for all of them. Exits with 1 if a
+flood at least doubles the p99 of ticks, or memory grows.
 """
 
 import argparse
@@ -162,7 +162,7 @@ def measure(*, quick: bool, beside: bool, floods: tuple[Flood, ...] = FLOODS) ->
         )
         show(Table(flood.name, tuple("" for _ in rows[-1]), [rows[-1]]))
     return Table(
-        f"flood: ticks of four honest robots, {'all on all cores' if beside else 'world-sim on cores of its own'}",
+        f"flood: ticks of four honest robots, the flooder {'beside them' if beside else 'on its own core'}",
         (
             "flood", "sent/s", "ticks", "p50 ms", "flooded", "p99 ms", "flooded", "ratio",
             "cpu %", "flooded", "MiB", "flooded", "",
@@ -216,12 +216,12 @@ def _mission(
         world = context.Process(target=_be_world, args=(ours, endpoint, secrets, folder / "runs"))
         pipes = {who: context.Pipe(duplex=False) for who in HONEST}
         robots = [
-            context.Process(target=_be_robot, args=(theirs, endpoint, secrets, who, folder, pipes[who][1]))
+            context.Process(target=_be_robot, args=(ours, endpoint, secrets, who, folder, pipes[who][1]))
             for who in HONEST
         ]  # fmt: skip
         tap, end = context.Pipe()
         flooder = context.Process(
-            target=_be_flooder, args=(theirs, beside, endpoint, secrets, flood, rounds, end)
+            target=_be_flooder, args=(theirs, endpoint, secrets, flood, rounds, end)
         )
         with _running([world]):
             _await((secrets / f"{FLOODER}.toml").exists)
@@ -291,17 +291,9 @@ def _be_robot(
 
 
 def _be_flooder(
-    cores: list[int],
-    beside: bool,  # noqa: FBT001  a target of a process
-    connect: str,
-    secrets: Path,
-    flood: Flood,
-    rounds: int,
-    out: Connection,
+    cores: list[int], connect: str, secrets: Path, flood: Flood, rounds: int, out: Connection
 ) -> None:
     os.sched_setaffinity(0, cores)
-    if not beside:
-        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     bus.init_log()
     identity = credentials.find(secrets, FLOODER)
     with bus.line(connect, identity, "flood", START_S) as line:
