@@ -371,7 +371,9 @@ def _be_world_sim(
                     past=past,
                 )
                 say(f"run {recording.run}" + (", resumed" if past is not None else ""))
-                result = run(host, plan, recording, interrupts, past=past, hands=_hands(pipe))
+                result = run(
+                    host, plan, recording, interrupts, past=past, hands=_hands(pipe), say=say
+                )
         except bus.BusError as error:
             say(str(error))
             sys.exit(Exit.UNREACHABLE)
