@@ -107,7 +107,7 @@ def _host(
             for name in scenario.roster:
                 verb = name if name == "supervisor" else f"agent {name}"
                 view.note(f"  kantor {verb} --connect {listen} --credentials {secrets}")
-            run(host, plan, recording, interrupts, view.show, past)
+            run(host, plan, recording, interrupts, view.show, past, say=view.note)
     conclude(folder)
     result = read_result(folder)
     return interrupts.code or (verdict(result) if result is not None else Exit.PROCESS_FAILED)
