@@ -146,6 +146,30 @@ def supervisor(
     return participate_by_hand(run_supervisor, "supervisor", connect, credentials, patience, state)
 
 
+def site(
+    name: Annotated[str, tyro.conf.Positional],
+    /,
+    connect: str = "tls/127.0.0.1:7447",
+    listen: str = "tls/0.0.0.0:7447",
+    credentials: Path = Path("keys"),
+    patience: float = 60.0,
+) -> int:
+    """The router of a place: its robots connect to it, and it connects to world-sim.
+
+    It speaks for its own robots only, those that `kantor keys --site` has put behind it, and keeps nothing.
+
+    Args:
+        name: Which site, such as north.
+        connect: World-sim's endpoint, tls/HOST:PORT.
+        listen: Endpoint for the site's robots.
+        credentials: The folder of identities, or this site's file.
+        patience: Seconds to wait for world-sim to come up.
+    """
+    from kantor_fleet.site import serve  # noqa: PLC0415
+
+    return serve(name, connect, listen, credentials, patience)
+
+
 def sweep(
     scenario: Annotated[str, tyro.conf.Positional] = "fleet",
     /,
@@ -370,6 +394,7 @@ VERBS: dict[str, Callable[..., int]] = {
     "worldsim": worldsim,
     "agent": agent,
     "supervisor": supervisor,
+    "site": site,
     "sweep": sweep,
     "campaign": campaign,
     "scenarios": scenarios,

@@ -94,7 +94,10 @@ def _host(
     if not FLEET_PATTERN.fullmatch(fleet):
         fail(Exit.USAGE, f"--fleet {fleet}: use lower-case letters, digits and dashes")
     bus.check_endpoint(listen)
-    identities = credentials.issue(secrets, fleet, scenario.roster)
+    if secrets.is_file() or 'certificate = ' in (secrets / "worldsim.toml").read_text() if (secrets / "worldsim.toml").exists() or secrets.is_file() else False:
+        identities = {credentials.HOST: credentials.find(secrets, credentials.HOST)}
+    else:
+        identities = credentials.issue(secrets, fleet, scenario.roster)
     bus.init_log()
     with Interrupts() as interrupts, ProgressView(scenario.name) as view:
         warm_up()

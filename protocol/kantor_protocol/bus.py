@@ -12,21 +12,22 @@ A client connects again by itself when world-sim comes back: its token and its s
 anew, so that world-sim sees it join with the nonce that it had.
 """
 
+import base64
 import contextlib
 import json
 import queue
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from kantor_protocol import keys
+from kantor_protocol import access, keys
 from kantor_protocol.credentials import OBSERVER, Identity
-from kantor_protocol.machine import ParticipantId
+from kantor_protocol.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.messages import MESSAGE_BYTES_MAX
 
 LEASE_MS = 1000
@@ -35,6 +36,11 @@ QUEUE_MAX = 16_384
 """Messages that wait for a reader."""
 _HANDSHAKE_S = 3.0
 _CLOSE_S = 5.0
+_RECONNECT = {
+    "connect/timeout_ms": round(_HANDSHAKE_S * 1000),
+    "connect/retry": {"period_init_ms": 50, "period_max_ms": 200, "period_increase_factor": 1.5},
+    "transport/link/tx/lease": LEASE_MS,
+}
 
 
 class BusError(ConnectionError):
@@ -63,6 +69,7 @@ class Heard(NamedTuple):
 
 
 Event = Joined | Left | Heard
+Subject = tuple[str, dict[str, list[str]], access.Grants]
 
 
 class Host:
@@ -77,27 +84,9 @@ class Host:
     ) -> None:
         """listen: an endpoint such as `tcp/127.0.0.1:7447`. Raises BusError if it cannot be had."""
         fleet = identity.fleet
-        settings = {
-            "scouting/delay": 0,
-            "open/return_conditions": {"connect_scouted": False, "declares": False},
-            # A frozen client must not hold the router for long (the unit is microseconds).
-            "transport/link/tx/queue/congestion_control/block/wait_before_close": 200_000,
-            "transport/auth/usrpwd": {
-                "user": identity.user,
-                "password": identity.password,
-                "dictionary_file": str(users_file),
-            },
-            "access_control": _access(fleet, roster),
-            "low_pass_filter": [
-                {
-                    "id": "tx",
-                    "flows": ["ingress"],
-                    "messages": ["put"],
-                    "key_exprs": [keys.everything(fleet)],
-                    "size_limit": MESSAGE_BYTES_MAX,
-                }
-            ],
-        }
+        settings = _router(identity, _subjects(identity, roster))
+        if not identity.certificate:
+            settings["transport/auth/usrpwd"]["dictionary_file"] = str(users_file)
         self._fleet = fleet
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         try:
@@ -145,6 +134,67 @@ class Host:
         key = keys.parse(str(sample.key_expr))
         if key is not None and self._events.qsize() < QUEUE_MAX:
             self._events.put(Heard(key.name, sample.payload.to_bytes()))
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        key = keys.parse(str(sample.key_expr))
+        if key is not None:
+            kind = Joined if sample.kind == zenoh.SampleKind.PUT else Left
+            self._events.put(kind(key.name, key.nonce))
+
+
+class Site:
+    """A router of a place: its robots connect to it, and it connects to world-sim's.
+
+    What each robot may do is enforced here, what all of them may do at world-sim. It connects again by itself;
+    without it its robots have left.
+    """
+
+    def __init__(self, identity: Identity, connect: str, listen: str, patience_s: float) -> None:
+        """Wait for world-sim up to `patience_s`, then listen. Raises BusError."""
+        fleet = identity.fleet
+        self.members = tuple(name for name in identity.members if name != WORLD_SIM)
+        """Its robots."""
+        robots = [(name, access.robot(fleet, name)) for name in self.members]
+        hub = (WORLD_SIM, access.hub(fleet, self.members))
+        settings = _router(identity, _marked(identity, [*robots, hub])) | _RECONNECT
+        _check_free(listen)
+        await_endpoint(connect, patience_s)
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        try:
+            self._session = zenoh.open(
+                _config("router", connect=connect, listen=listen, settings=settings)
+            )
+        except zenoh.ZError:
+            raise BusError(
+                f"{connect}: refuses {identity.user}; its credentials are not this world-sim's"
+            ) from None
+        self._held: list[Any] = [
+            self._session.liveliness().declare_subscriber(
+                keys.alive(fleet), self._on_token, history=True
+            )
+        ]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def next(self, timeout_s: float) -> Event | None:
+        """Who has come or gone, or None after the timeout."""
+        try:
+            return self._events.get(timeout=max(0.0, timeout_s))
+        except queue.Empty:
+            return None
+
+    @property
+    def connected(self) -> bool:
+        """Whether world-sim is there."""
+        return bool(self._session.info.routers_zid())
+
+    def close(self) -> None:
+        """Leave the bus."""
+        _close(self._session, self._held)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
@@ -278,9 +328,21 @@ def await_endpoint(
 def _address(endpoint: str) -> tuple[str, int]:
     protocol, _, place = endpoint.partition("/")
     host, _, port = place.rpartition(":")
-    if protocol != "tcp" or not host or not port.isdigit() or int(port) > 65535:
+    if protocol not in {"tcp", "tls"} or not host or not port.isdigit() or int(port) > 65535:
         raise BusError(f"{endpoint}: not an endpoint; write it as tcp/HOST:PORT")
     return host.strip("[]"), int(port)
+
+
+def _check_free(listen: str) -> None:
+    """Raise BusError if somebody else listens there."""
+    family = socket.AF_INET6 if ":" in _address(listen)[0] else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(_address(listen))
+        except OSError as error:
+            reason = error.strerror or error
+            raise BusError(f"cannot listen on {listen}: {reason}; choose another") from None
 
 
 def check_endpoint(endpoint: str) -> None:
@@ -290,16 +352,7 @@ def check_endpoint(endpoint: str) -> None:
 
 def _client(connect: str, identity: Identity, patience_s: float) -> zenoh.Session:
     await_endpoint(connect, patience_s)
-    settings = {
-        "connect/timeout_ms": round(_HANDSHAKE_S * 1000),
-        "connect/retry": {
-            "period_init_ms": 50,
-            "period_max_ms": 200,
-            "period_increase_factor": 1.5,
-        },
-        "transport/link/tx/lease": LEASE_MS,
-        "transport/auth/usrpwd": {"user": identity.user, "password": identity.password},
-    }
+    settings = _proof(identity) | _RECONNECT
     try:
         return zenoh.open(_config("client", connect=connect, settings=settings))
     except zenoh.ZError:
@@ -326,48 +379,66 @@ def _config(
     return config
 
 
-def _access(fleet: str, roster: tuple[ParticipantId, ...]) -> dict[str, Any]:
-    """Who may do what on the router. Whatever is not allowed here is denied."""
-    rules: list[dict[str, Any]] = []
-    subjects: list[dict[str, Any]] = []
-    policies: list[dict[str, Any]] = []
-
-    def allow(user: str, *grants: tuple[str, str, list[str], list[str]]) -> None:
-        for label, flow, messages, expressions in grants:
-            rules.append(
-                {
-                    "id": f"{user}-{label}",
-                    "permission": "allow",
-                    "flows": [flow],
-                    "messages": messages,
-                    "key_exprs": expressions,
-                }
-            )
-        subjects.append({"id": user, "usernames": [user]})
-        policies.append({"rules": [f"{user}-{label}" for label, *_ in grants], "subjects": [user]})
-
-    for name in roster:
-        own = [keys.tx(fleet, name), keys.pose(fleet, name), keys.weights(fleet, name)]
-        allow(
-            name,
-            ("says", "ingress", ["put"], own),
-            ("listens", "ingress", ["declare_subscriber"], [keys.rx(fleet, name)]),
-            ("hears", "egress", ["put"], [keys.rx(fleet, name)]),
-            ("lives", "ingress", ["liveliness_token"], [keys.alive(fleet, name)]),
-        )
-    everything = [keys.everything(fleet)]
-    allow(
-        OBSERVER,
-        ("listens", "ingress", ["declare_subscriber"], everything),
-        ("hears", "egress", ["put"], everything),
-    )
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
+def _router(identity: Identity, subjects: Iterable[Subject]) -> dict[str, Any]:
+    """The settings of world-sim's router and of a site's."""
+    return _proof(identity) | {
+        "scouting/delay": 0,
+        "open/return_conditions": {"connect_scouted": False, "declares": False},
+        # A frozen client must not hold the router for long (the unit is microseconds).
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 200_000,
+        "access_control": access.control(subjects),
+        "low_pass_filter": [
+            {
+                "id": "tx",
+                "flows": ["ingress"],
+                "messages": ["put"],
+                "key_exprs": [keys.everything(identity.fleet)],
+                "size_limit": MESSAGE_BYTES_MAX,
+            }
+        ],
     }
+
+
+def _subjects(identity: Identity, roster: Iterable[ParticipantId]) -> list[Subject]:
+    """Whom the hub lets in, and as what."""
+    fleet = identity.fleet
+    sites = [(name, access.site(fleet, members)) for name, members in identity.sites.items()]
+    robots = [(name, access.robot(fleet, name)) for name in roster]
+    return _marked(identity, [*robots, *sites, (OBSERVER, access.observer(fleet))])
+
+
+def _marked(identity: Identity, grants: Iterable[tuple[str, access.Grants]]) -> list[Subject]:
+    """With how the router knows each."""
+    if not identity.certificate:
+        return [(name, {"usernames": [name]}, granted) for name, granted in grants]
+    known = identity.members
+    return [
+        (name, {"cert_common_names": [known[name]]}, granted)
+        for name, granted in grants
+        if name in known
+    ]
+
+
+def _proof(identity: Identity) -> dict[str, Any]:
+    """How a process shows who it is, and sees who others are."""
+    if not identity.certificate:
+        return {"transport/auth/usrpwd": {"user": identity.user, "password": identity.password}}
+    key, certificate = _base64(identity.key), _base64(identity.certificate)
+    return {
+        "transport/link/tls": {
+            "root_ca_certificate_base64": _base64(identity.authority),
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "listen_private_key_base64": key,
+            "listen_certificate_base64": certificate,
+            "connect_private_key_base64": key,
+            "connect_certificate_base64": certificate,
+        }
+    }
+
+
+def _base64(text: str) -> str:
+    return base64.b64encode(text.encode()).decode()
 
 
 def _close(session: zenoh.Session, held: list[Any]) -> None:

@@ -25,12 +25,17 @@ class CredentialsError(ValueError):
     """Credentials that are missing or no use; the message is one line with the remedy."""
 
 
-class Identity(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Identity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Who a process is on which fleet's bus."""
 
     fleet: str
     user: ParticipantId
-    password: str
+    password: str = ""
+    authority: str = ""
+    certificate: str = ""
+    key: str = ""
+    members: dict[ParticipantId, str] = {}
+    sites: dict[str, list[ParticipantId]] = {}
 
 
 def issue(folder: Path, fleet: str, users: Iterable[ParticipantId]) -> dict[str, Identity]:
