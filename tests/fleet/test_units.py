@@ -16,7 +16,7 @@ SETTINGS = {
     "HUB": "tls/127.0.0.1:7447",
     "LISTEN": "tls/127.0.0.1:7448",
     "SCENARIO": "fleet",
-    "OPTIONS": "--seed 3 --set robots.count=10",
+    "OPTIONS": "--seed 3 --set robots.count=10 starts.random=true",
 }
 
 

@@ -274,3 +274,28 @@ def test_robots_hold_while_their_site_is_gone(place: Place) -> None:
         assert sum(leaving.now_ns < act.now_ns < joining.now_ns for act in acts) <= 1
         assert acts[-1].now_ns > joining.now_ns
     assert kantor("verify", folder).code == 0
+
+
+def test_a_site_finds_world_sim_again(place: Place) -> None:
+    """World-sim is killed and goes on with its run: the site connects again, and nothing is lost or done twice."""
+    kantor = place.kantor
+    mission = (*MISSION, "energy.points=6000", "energy.steps=6000", "samples.count=1000")
+    assert kantor("run", *mission, "--exchange", "in-process").code == 0
+    world = place.world_sim(*mission, "--exchange", "lockstep")
+    site = place.site()
+    robots = place.robots()
+    while len(kantor.runs()) < 2:
+        await_line(world, "t=")
+    folder = kantor.runs()[1]
+    await_act(folder, "r1", after=20)
+    os.killpg(world.pid, signal.SIGKILL)
+    await_line(site, place.hub, "not there")
+    again = place.world_sim("--resume", folder)
+    out, err = again.communicate(timeout=PATIENCE_S)
+
+    assert again.returncode == 0, out + err
+    for robot in robots.values():
+        assert robot.wait(timeout=PATIENCE_S) == 0
+    first, second = map(result_of, kantor.runs())
+    assert first["digest"] == second["digest"]
+    assert second["violations"] == 0
