@@ -147,6 +147,30 @@ def supervisor(
     return participate_by_hand(run_supervisor, "supervisor", connect, credentials, patience, state)
 
 
+def site(
+    name: Annotated[str, tyro.conf.Positional],
+    /,
+    connect: str = "tls/127.0.0.1:7447",
+    listen: str = "tls/0.0.0.0:7447",
+    credentials: Path = Path("keys"),
+    patience: float = 60.0,
+) -> int:
+    """The router of a place: its robots connect to it, and it connects to world-sim.
+
+    It speaks for its own robots only, those that `kantor keys --site` has put behind it, and keeps nothing.
+
+    Args:
+        name: Which site, such as north.
+        connect: World-sim's endpoint, tls/HOST:PORT.
+        listen: Endpoint for the site's robots.
+        credentials: The folder of identities, or this site's file.
+        patience: Seconds to wait for world-sim to come up.
+    """
+    from kantor_fleet.site import serve  # noqa: PLC0415
+
+    return serve(name, connect, listen, credentials, patience)
+
+
 def sweep(
     scenario: Annotated[str, tyro.conf.Positional] = "fleet",
     /,
@@ -373,6 +397,7 @@ def keys(
     robots: int = 0,
     supervisor: bool = False,
     host: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    site: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     days: int = 365,
     renew: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     revoke: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
@@ -388,8 +413,9 @@ def keys(
         fleet: Name of the fleet in every key.
         robots: Robots r1 to r<robots>; those that there are stay.
         supervisor: Also the supervisor.
-        host: A name or an address by which others reach world-sim; any number of times. It always has localhost,
-            127.0.0.1, ::1 and worldsim.
+        host: A name or an address by which others reach world-sim, or a site's router: north=10.0.0.5. Any number
+            of times. Each has localhost, 127.0.0.1, ::1 and its id anyway.
+        site: A site and the robots that stand behind it, such as north=r1,r2,r3; any number of times.
         days: How long the new certificates count.
         renew: Make a new certificate for this member; the old one ceases to count. Any number of times.
         revoke: This member's certificate ceases to count. Any number of times.
@@ -401,7 +427,7 @@ def keys(
     if list:
         lines = listing(out, fleet, today())
     else:
-        wanted = Wanted(fleet, robots, supervisor, host, days, renew, revoke)
+        wanted = Wanted(fleet, robots, supervisor, host, site, days, renew, revoke)
         lines = issue(out, wanted, today())
     print("\n".join(lines))
     return Exit.DONE
@@ -412,6 +438,7 @@ VERBS: dict[str, Callable[..., int]] = {
     "worldsim": worldsim,
     "agent": agent,
     "supervisor": supervisor,
+    "site": site,
     "sweep": sweep,
     "campaign": campaign,
     "scenarios": scenarios,

@@ -1,9 +1,10 @@
 """A fleet's private authority: it issues the certificates of its members and keeps the register of them.
 
 Everything is in one folder on the operator's machine: `authority.toml`, which never leaves it, and an identity
-file for each member, to be handed to whoever runs it. World-sim's identity carries a copy of the register.
+file for each member, to be handed to whoever runs it. The identities of routers, world-sim's and those of sites,
+carry a copy of the register.
 
-A file is written whole or not at all, the identities first, then the authority's register, then world-sim's copy.
+A file is written whole or not at all, the identities first, then the authority's register, then the routers' copies.
 So whatever interrupts this, running it again makes good what is missing.
 """
 
@@ -16,6 +17,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import msgspec
 from cryptography import x509
@@ -44,9 +46,15 @@ _AUTHORITY_DAYS = 7300
 """How long an authority issues: longer than any certificate of it lasts."""
 _EARLIER = timedelta(days=1)
 """Certificates are valid from a day before they are made, for clocks that are behind."""
-_HOSTS = ("localhost", "127.0.0.1", "::1", HOST)
-"""Names that every world-sim's certificate has."""
+_HOSTS = ("localhost", "127.0.0.1", "::1")
+"""Names that every router's certificate has, beside its id."""
+_SITE = "site-"
+"""What the id of a site's router begins with."""
+_ROBOT_PATTERN = re.compile(r"r[1-9][0-9]{0,3}")
 _HOST_PATTERN = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(\.(?!-)[A-Za-z0-9-]{1,63})*")
+
+
+Sites = dict[ParticipantId, tuple[ParticipantId, ...]]
 
 
 class Authority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,9 +63,19 @@ class Authority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fleet: str
     certificate: str
     key: str
-    hosts: tuple[str, ...] = _HOSTS
     revoked: tuple[str, ...] = ()
     members: dict[ParticipantId, Member] = {}
+    sites: Sites = {}
+    hosts: dict[ParticipantId, tuple[str, ...]] = {}
+    """Names by which others reach a router, beside those that it has anyway."""
+
+    def register(self, router: ParticipantId) -> dict[str, Any]:
+        """The fields of a router's identity that say whom it lets in."""
+        if router == HOST:
+            return {"revoked": self.revoked, "members": self.members, "sites": self.sites}
+        names = (HOST, *self.sites[router])
+        members = {user: self.members[user] for user in names if user in self.members}
+        return {"revoked": self.revoked, "members": members}
 
 
 class Wanted(msgspec.Struct, frozen=True):
@@ -67,6 +85,9 @@ class Wanted(msgspec.Struct, frozen=True):
     robots: int = 0
     supervisor: bool = False
     hosts: tuple[str, ...] = ()
+    """World-sim's names, or a site's as SITE=NAME."""
+    sites: tuple[str, ...] = ()
+    """SITE=ROBOT,ROBOT,..."""
     days: int = 365
     renew: tuple[ParticipantId, ...] = ()
     revoke: tuple[ParticipantId, ...] = ()
@@ -81,53 +102,134 @@ def issue(folder: Path, wanted: Wanted, now: datetime) -> list[str]:
     _check(wanted)
     with _locked(folder):
         before = _open(folder, wanted.fleet)
-        authority = before or _found(wanted.fleet, now)
-        hosts = tuple(dict.fromkeys((*authority.hosts, *wanted.hosts)))
-        users = _users(authority, wanted)
-        _check_known(authority, wanted, users)
-        withdrawn = [authority.members[user].name for user in wanted.revoke]
-        revoked = (*authority.revoked, *withdrawn)
-        kept = {
-            user: member for user, member in authority.members.items() if user not in wanted.revoke
-        }
-        fresh = [user for user in users if user not in kept or user in wanted.renew]
-        if hosts != authority.hosts and HOST not in fresh:
-            fresh.append(HOST)
-        host = None if HOST in fresh else _host(folder, wanted.fleet)
-
-        authority = msgspec.structs.replace(authority, hosts=hosts, revoked=revoked)
-        if before is None:
-            _save(folder / f"{AUTHORITY}.toml", authority)
+        authority = _asked(before or _found(wanted.fleet, now), wanted)
+        fresh = _fresh(before, authority, wanted)
         made = {user: _certify(authority, user, wanted.days, now) for user in fresh}
+        issued = {user: Member(identity.name, identity.until) for user, identity in made.items()}
+        members = dict(sorted((authority.members | issued).items(), key=lambda row: _order(row[0])))
+        authority = msgspec.structs.replace(authority, members=members)
+        routers = _routers(folder, before, authority, made)
+
+        if before is None:  # first of all: whatever it has signed is worth nothing without it
+            _save(folder / f"{AUTHORITY}.toml", msgspec.structs.replace(authority, members={}))
         for user, identity in made.items():
-            if user != HOST:
+            if user not in routers:
                 _save(folder / f"{user}.toml", identity)
-        members = kept | {user: Member(made[user].name, made[user].until) for user in fresh}
-        authority = msgspec.structs.replace(
-            authority, members=dict(sorted(members.items(), key=lambda row: _order(row[0])))
-        )
         _save(folder / f"{AUTHORITY}.toml", authority)
-        host = host or made[HOST]
-        copy = msgspec.structs.replace(host, revoked=revoked, members=authority.members)
-        if HOST in made or copy != host:
-            _save(folder / f"{HOST}.toml", copy)
-    return _news(folder, wanted, fresh, changed=HOST in made or copy != host, first=before is None)
+        for user, identity in routers.items():
+            _save(folder / f"{user}.toml", identity)
+    return _news(
+        folder, wanted, fresh, [] if before is None else list(routers), first=before is None
+    )
+
+
+def _asked(authority: Authority, wanted: Wanted) -> Authority:
+    """The authority without who is revoked, and with the sites and the names that are wanted.
+
+    Raises CredentialsError.
+    """
+    _check_known(authority, wanted)
+    withdrawn = tuple(authority.members[user].name for user in wanted.revoke)
+    placed = _placed(wanted)
+    everywhere = {name for there in placed.values() for name in there}
+    sites = {
+        site: tuple(name for name in there if name not in everywhere)
+        for site, there in authority.sites.items()
+        if site not in wanted.revoke
+    } | placed
+    hosts = dict(authority.hosts)
+    for user, host in map(_host_of, wanted.hosts):
+        if user != HOST and user not in sites:
+            site = user.removeprefix(_SITE)
+            raise CredentialsError(f"--host {site}={host}: no such site; add --site {site}=r1,r2")
+        hosts[user] = tuple(dict.fromkeys((*hosts.get(user, ()), host)))
+    return msgspec.structs.replace(
+        authority,
+        revoked=(*authority.revoked, *withdrawn),
+        members={
+            user: member for user, member in authority.members.items() if user not in wanted.revoke
+        },
+        sites=sites,
+        hosts={user: names for user, names in hosts.items() if user not in wanted.revoke},
+    )
+
+
+def _fresh(before: Authority | None, authority: Authority, wanted: Wanted) -> list[ParticipantId]:
+    """Who gets a new certificate. Whoever was revoked gets one only by its name. Raises CredentialsError."""
+    robots = [f"r{number}" for number in range(1, wanted.robots + 1)]
+    supervisor = [SUPERVISOR] if wanted.supervisor else []
+    users = (HOST, OBSERVER, *authority.sites, *supervisor, *robots)
+    without = _withdrawn(authority) | set(authority.members)
+    renamed = [
+        user
+        for user in authority.hosts
+        if before and authority.hosts[user] != before.hosts.get(user)
+    ]
+    missing = [user for user in users if user not in without]
+    fresh = sorted({*missing, *renamed, *wanted.renew}, key=_order)
+    for site, there in authority.sites.items():
+        for name in there:
+            if (
+                name not in authority.members
+                and name not in fresh
+                and name not in _withdrawn(authority)
+            ):
+                label = f"--site {site.removeprefix(_SITE)}"
+                raise CredentialsError(
+                    f"{label}: the register has no {name}; add --robots {name[1:]}"
+                )
+    return fresh
+
+
+def _routers(
+    folder: Path,
+    before: Authority | None,
+    authority: Authority,
+    made: dict[ParticipantId, Certificate],
+) -> dict[ParticipantId, Certificate]:
+    """The identities of routers that are to be written, each with its copy of the register.
+
+    Raises CredentialsError if one is needed that is not here.
+    """
+    changed = {}
+    for router in (HOST, *authority.sites):
+        path = folder / f"{router}.toml"
+        old = made.get(router) or read(path, Certificate)
+        same = (
+            before is not None
+            and router in before.members
+            and (router == HOST or router in before.sites)
+            and before.register(router) == authority.register(router)
+        )
+        if old is None or old.name != authority.members[router].name:
+            if same and not path.exists():
+                continue  # it has been handed out
+            raise CredentialsError(
+                f"{path}: not here or no use, and it carries the register; bring it back, "
+                f"or `kantor keys {authority.fleet} --renew {router}`"
+            )
+        new = msgspec.structs.replace(old, **authority.register(router))
+        if router in made or new != old:
+            changed[router] = new
+    return changed
 
 
 def _news(
-    folder: Path, wanted: Wanted, fresh: list[ParticipantId], *, changed: bool, first: bool
+    folder: Path,
+    wanted: Wanted,
+    fresh: list[ParticipantId],
+    routers: list[ParticipantId],
+    *,
+    first: bool,
 ) -> list[str]:
     lines = (
         [f"{folder}/{AUTHORITY}.toml: the authority of fleet {wanted.fleet}; keep it here"]
         if first
         else []
     )
-    lines += [
-        f"{folder}/{user}.toml: made, for {wanted.days} days" for user in sorted(fresh, key=_order)
-    ]
-    lines += [f"{user}: revoked" for user in wanted.revoke if user not in fresh]
-    if changed and not first:
-        lines.append(f"bring {folder}/{HOST}.toml to world-sim and start it again")
+    lines += [f"{folder}/{user}.toml: made, for {wanted.days} days" for user in fresh]
+    lines += [f"{user}: revoked" for user in wanted.revoke]
+    lines += [f"{folder}/{user}.toml: changed; start {user} again with it" for user in routers]
     return lines or ["nothing to do"]
 
 
@@ -154,9 +256,10 @@ def _check(wanted: Wanted) -> None:
         raise CredentialsError(f"--robots {wanted.robots}: give a number from 0 to {ROBOTS_MAX}")
     if not 1 <= wanted.days <= DAYS_MAX:
         raise CredentialsError(f"--days {wanted.days}: give a number from 1 to {DAYS_MAX}")
-    for host in wanted.hosts:
+    for _, host in map(_host_of, wanted.hosts):
         if not _is_address(host) and not _HOST_PATTERN.fullmatch(host):
             raise CredentialsError(f"--host {host}: give a name or an IP address, without a port")
+    _placed(wanted)
     both = sorted(set(wanted.renew) & set(wanted.revoke))
     if both:
         raise CredentialsError(
@@ -164,37 +267,47 @@ def _check(wanted: Wanted) -> None:
         )
 
 
-def _check_known(authority: Authority, wanted: Wanted, users: list[ParticipantId]) -> None:
+def _host_of(text: str) -> tuple[ParticipantId, str]:
+    """NAME, of world-sim, or SITE=NAME."""
+    site, equals, host = text.rpartition("=")
+    return (f"{_SITE}{site}" if equals else HOST), host
+
+
+def _placed(wanted: Wanted) -> Sites:
+    """Which robots stand behind which site. Raises CredentialsError."""
+    placed: Sites = {}
+    for text in wanted.sites:
+        site, _, names = text.partition("=")
+        there = tuple(names.split(","))
+        if not FLEET_PATTERN.fullmatch(site) or not all(map(_ROBOT_PATTERN.fullmatch, there)):
+            raise CredentialsError(f"--site {text}: write it as --site north=r1,r2")
+        placed[f"{_SITE}{site}"] = there
+    everybody = [name for there in placed.values() for name in there]
+    for name in everybody:
+        if everybody.count(name) > 1:
+            raise CredentialsError(f"--site: {name} stands behind one site only")
+    return placed
+
+
+def _check_known(authority: Authority, wanted: Wanted) -> None:
     """Raises CredentialsError."""
-    withdrawn = _withdrawn(authority)
+    withdrawn, see = _withdrawn(authority), f"see `kantor keys {wanted.fleet} --list`"
     for user in wanted.revoke:
         if user == HOST:
-            raise CredentialsError(
-                f"--revoke {HOST}: robots have no register; use --renew and a new folder"
-            )
+            raise CredentialsError(f"--revoke {HOST}: robots know no register; make a new fleet")
         if user not in authority.members:
             state = "is revoked already" if user in withdrawn else "is not in the register"
-            raise CredentialsError(
-                f"--revoke {user}: {state}; see `kantor keys {wanted.fleet} --list`"
-            )
+            raise CredentialsError(f"--revoke {user}: {state}; {see}")
     for user in wanted.renew:
-        if user not in users and user not in authority.members and user not in withdrawn:
-            raise CredentialsError(
-                f"--renew {user}: is not in the register; see `kantor keys {wanted.fleet} --list`"
-            )
+        if user.startswith(_SITE) and user not in authority.sites | _placed(wanted):
+            raise CredentialsError(f"--renew {user}: no such site; {see}")
+        if user not in authority.members and user not in withdrawn:
+            raise CredentialsError(f"--renew {user}: is not in the register; {see}")
 
 
 def _withdrawn(authority: Authority) -> set[ParticipantId]:
-    return {name.partition(".")[0] for name in authority.revoked}
-
-
-def _users(authority: Authority, wanted: Wanted) -> list[ParticipantId]:
-    """Everybody who should have a certificate. Whoever was revoked gets a new one only by its name."""
-    robots = [f"r{number}" for number in range(1, wanted.robots + 1)]
-    supervisor = [SUPERVISOR] if wanted.supervisor else []
-    without = (_withdrawn(authority) - set(authority.members)) | set(wanted.revoke)
-    asked = [user for user in (HOST, OBSERVER, *supervisor, *robots) if user not in without]
-    return list(dict.fromkeys((*asked, *wanted.renew)))
+    """Who has been revoked and has no other certificate since."""
+    return {name.partition(".")[0] for name in authority.revoked} - set(authority.members)
 
 
 def _order(user: ParticipantId) -> tuple[bool, int, str]:
@@ -233,18 +346,6 @@ def _open(folder: Path, fleet: str) -> Authority | None:
             f"{path}: the authority of fleet {authority.fleet}; choose another --out"
         )
     return authority
-
-
-def _host(folder: Path, fleet: str) -> Certificate:
-    """World-sim's identity, which the register goes with."""
-    path = folder / f"{HOST}.toml"
-    host = read(path, Certificate)
-    if host is None or host.user != HOST or host.fleet != fleet:
-        raise CredentialsError(
-            f"{path}: not there or no use, and the register goes with it; bring it back, "
-            f"or `kantor keys {fleet} --renew {HOST}`"
-        )
-    return host
 
 
 def _save(path: Path, content: Authority | Certificate) -> None:
@@ -293,8 +394,8 @@ def _certify(authority: Authority, user: ParticipantId, days: int, now: datetime
         )
     serial = secrets.randbits(64) | 1
     common_name = f"{user}.{serial:016x}"
-    purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
-    if user == HOST:
+    purposes, is_router = [ExtendedKeyUsageOID.CLIENT_AUTH], user == HOST or user in authority.sites
+    if is_router:
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
     usage = dict.fromkeys(_USAGES, False) | {"digital_signature": True}
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
@@ -310,8 +411,9 @@ def _certify(authority: Authority, user: ParticipantId, days: int, now: datetime
             critical=False,
         )
     )
-    if user == HOST:
-        names = x509.SubjectAlternativeName(_general_names(authority.hosts))
+    if is_router:
+        hosts = dict.fromkeys((*_HOSTS, user, *authority.hosts.get(user, ())))
+        names = x509.SubjectAlternativeName(_general_names(hosts))
         unsigned = unsigned.add_extension(names, critical=False)
     certificate = unsigned.sign(issuer_key, hashes.SHA256())
     return Certificate(

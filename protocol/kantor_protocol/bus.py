@@ -12,7 +12,6 @@ A client connects again by itself when world-sim comes back: its token and its s
 anew, so that world-sim sees it join with the nonce that it had.
 """
 
-import base64
 import contextlib
 import json
 import os
@@ -21,13 +20,13 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from kantor_protocol import keys, tls
+from kantor_protocol import keys, settings, tls
 from kantor_protocol.credentials import (
     OBSERVER,
     Certificate,
@@ -35,21 +34,12 @@ from kantor_protocol.credentials import (
     Identity,
     Password,
 )
-from kantor_protocol.machine import ParticipantId
-from kantor_protocol.messages import MESSAGE_BYTES_MAX
+from kantor_protocol.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.quota import Bucket, Excess, Quota, excesses
 
-LEASE_MS = 1000
-"""A frozen or cut-off process is noticed after this."""
+LEASE_MS = settings.LEASE_MS
 QUEUE_MAX = 16_384
 """Messages that wait for a reader."""
-POSE_BYTES_MAX = 256
-SHOWN_PER_S = 1000
-"""Messages on a pose key, and on a weights key, that reach observers. A pose is outdated by the next, and
-weights have keyframes."""
-_RECEIVE_BYTES = 32 * 1024
-_FRAME_BYTES = 64 * 1024
-_HANDSHAKE_S = 3.0
 _CLOSE_S = 5.0
 
 
@@ -106,50 +96,29 @@ class Host:
         """
         check_endpoint(listen, identity)
         fleet = identity.fleet
-        settings = {
-            "scouting/delay": 0,
-            "open/return_conditions": {"connect_scouted": False, "declares": False},
-            # A frozen client must not hold the router for long (the unit is microseconds).
-            "transport/link/tx/queue/congestion_control/block/wait_before_close": 200_000,
-            **_proof(identity, "listen", users_file),
-            # A flood reaches the router in small portions, so that the others' turn comes between them.
-            "transport/link/tcp/so_rcvbuf": _RECEIVE_BYTES,
-            "transport/link/tls/so_rcvbuf": _RECEIVE_BYTES,
-            # Longer ones are not put together. Without this a robot could have a gigabyte waiting.
-            "transport/link/rx/max_message_size": MESSAGE_BYTES_MAX + _FRAME_BYTES,
-            "access_control": _access(fleet, _subjects(identity, (*roster, OBSERVER))),
-            "low_pass_filter": [
-                _low_pass("all", keys.everything(fleet), MESSAGE_BYTES_MAX),
-                _low_pass("pose", keys.pose(fleet, "*"), POSE_BYTES_MAX),
-            ],
-            "downsampling": _downsampling(fleet, roster),
-        }
+        known = settings.hub(identity, roster, users_file)
         self._fleet = fleet
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._listening = threading.Lock()
         self._buckets = {name: Bucket(Quota.of(0.0)) for name in roster}
         try:
-            self._session = zenoh.open(_config("router", listen=listen, settings=settings))
+            self._session = _open("router", known, listen=listen)
         except zenoh.ZError as error:
             raise BusError(f"cannot listen on {listen}: {_short(error)}; choose another") from None
         self._block = zenoh.CongestionControl.BLOCK
         self._drop = zenoh.CongestionControl.DROP
         self._rx = {name: keys.rx(fleet, name) for name in roster}
         self._progress = keys.progress(fleet)
-        self._wanted = frozenset((*roster, OBSERVER))
-        self._identity = identity
-        self._refusals = tls.Refusals(say)
+        self._door = None
+        if isinstance(identity, Certificate):
+            wanted = (*roster, *identity.sites, OBSERVER)
+            self._door = _Door(self._session, identity, wanted, say)
         self._held: list[Any] = [
             self._session.declare_subscriber(keys.tx(fleet), self._on_message),
             self._session.liveliness().declare_subscriber(
                 keys.alive(fleet), self._on_token, history=True
             ),
         ]
-        if isinstance(identity, Certificate):
-            self._held += [
-                self._session.declare_queryable(keys.door(fleet), self._on_question),
-                self._session.info.declare_link_events_listener(self._on_link),
-            ]
 
     def __enter__(self) -> Self:
         return self
@@ -187,22 +156,9 @@ class Host:
 
     def close(self) -> None:
         """Leave the bus."""
+        if self._door is not None:
+            self._door.close()
         _close(self._session, self._held)
-        self._refusals.close()
-
-    def _objection(self, name: str) -> str:
-        """Why the holder of a certificate is not let in."""
-        assert isinstance(self._identity, Certificate)
-        return self._identity.objection(name, self._wanted)
-
-    def _on_question(self, query: zenoh.Query) -> None:
-        name = str(query.key_expr).rpartition("/")[2]
-        query.reply(keys.door(self._fleet, name), self._objection(name).encode())
-
-    def _on_link(self, event: zenoh.LinkEvent) -> None:
-        name = event.link.auth_identifier
-        if event.kind == zenoh.SampleKind.PUT and name and (objection := self._objection(name)):
-            self._refusals.tell(f"refused {name.partition('.')[0]}: {objection}")
 
     def _on_message(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
@@ -231,6 +187,110 @@ class Host:
             if bucket.floods and not flooded:
                 self._events.put(Flooded(name))
             return taken
+
+
+class _Door:
+    """Tells whoever shows a certificate of the fleet's authority, and is not let in, why; and the host's log too.
+
+    For TLS such a certificate is sound, and Zenoh silently passes nothing of its holder's on.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        identity: Certificate,
+        wanted: Iterable[ParticipantId],
+        say: Callable[[str], None],
+    ) -> None:
+        self._identity = identity
+        self._wanted = frozenset(wanted)
+        self._refusals = tls.Refusals(say)
+        self._held: list[Any] = [
+            session.declare_queryable(keys.door(identity.fleet), self._on_question),
+            session.info.declare_link_events_listener(self._on_link),
+        ]
+
+    def close(self) -> None:
+        """Tell what has not been told."""
+        self._held.clear()
+        self._refusals.close()
+
+    def _objection(self, name: str) -> str:
+        return self._identity.objection(name, self._wanted)
+
+    def _on_question(self, query: zenoh.Query) -> None:
+        name = str(query.key_expr).rpartition("/")[2]
+        query.reply(keys.door(self._identity.fleet, name), self._objection(name).encode())
+
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        name = event.link.auth_identifier
+        if event.kind == zenoh.SampleKind.PUT and name and (objection := self._objection(name)):
+            self._refusals.tell(f"refused {name.partition('.')[0]}: {objection}")
+
+
+class Site:
+    """A router of a place: its robots connect to it, and it connects to world-sim's.
+
+    What each robot may do is enforced here, what all of them may do at world-sim. It connects again by itself;
+    without it its robots have left.
+    """
+
+    def __init__(
+        self,
+        identity: Certificate,
+        connect: str,
+        listen: str,
+        patience_s: float,
+        say: Callable[[str], None] = lambda _line: None,
+    ) -> None:
+        """Wait for world-sim up to `patience_s`, then listen. say: see Host. Raises BusError, CredentialsError."""
+        check_endpoint(listen, identity)
+        fleet = identity.fleet
+        self.members = tuple(name for name in identity.members if name != WORLD_SIM)
+        """Its robots."""
+        _check_free(listen)
+        _close(_client(connect, identity, patience_s), [])  # which is told why, if it is not let in
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        own = settings.site(identity, self.members)
+        try:
+            self._session = _open("router", own, connect=connect, listen=listen)
+        except zenoh.ZError as error:
+            raise BusError(f"cannot connect {listen} to {connect}: {_short(error)}") from None
+        self._door = _Door(self._session, identity, (*self.members, WORLD_SIM), say)
+        self._held: list[Any] = [
+            self._session.liveliness().declare_subscriber(
+                keys.alive(fleet), self._on_token, history=True
+            ),
+        ]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def next(self, timeout_s: float) -> Event | None:
+        """Who has come or gone, or None after the timeout."""
+        try:
+            return self._events.get(timeout=max(0.0, timeout_s))
+        except queue.Empty:
+            return None
+
+    @property
+    def connected(self) -> bool:
+        """Whether world-sim is there."""
+        return bool(self._session.info.routers_zid())
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._door.close()
+        _close(self._session, self._held)
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        key = keys.parse(str(sample.key_expr))
+        if key is not None:
+            kind = Joined if sample.kind == zenoh.SampleKind.PUT else Left
+            self._events.put(kind(key.name, key.nonce))
 
 
 class Line:
@@ -404,21 +464,24 @@ def check_endpoint(endpoint: str, identity: Identity | None = None) -> None:
         )
 
 
+def _check_free(listen: str) -> None:
+    """Raise BusError if somebody else listens there."""
+    _, host, port = _address(listen)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            reason = error.strerror or error
+            raise BusError(f"cannot listen on {listen}: {reason}; choose another") from None
+
+
 def _client(connect: str, identity: Identity, patience_s: float) -> zenoh.Session:
     check_endpoint(connect, identity)
     await_endpoint(connect, patience_s, identity)
-    settings = {
-        "connect/timeout_ms": round(_HANDSHAKE_S * 1000),
-        "connect/retry": {
-            "period_init_ms": 50,
-            "period_max_ms": 200,
-            "period_increase_factor": 1.5,
-        },
-        "transport/link/tx/lease": LEASE_MS,
-        **_proof(identity, "connect"),
-    }
     try:
-        session = zenoh.open(_config("client", connect=connect, settings=settings))
+        session = _open("client", settings.client(identity), connect=connect)
     except zenoh.ZError:
         raise BusError(
             f"{connect}: refuses {identity.user}; its credentials are not this world-sim's"
@@ -434,7 +497,9 @@ def _client(connect: str, identity: Identity, patience_s: float) -> zenoh.Sessio
 
 def _knock(connect: str, session: zenoh.Session, identity: Certificate) -> None:
     """Ask whether we are let in: a certificate may be sound and yet not the register's. Raises BusError."""
-    for reply in session.get(keys.door(identity.fleet, identity.name), timeout=_HANDSHAKE_S):
+    for reply in session.get(
+        keys.door(identity.fleet, identity.name), timeout=settings.HANDSHAKE_S
+    ):
         if reply.ok is not None:
             if objection := reply.ok.payload.to_bytes().decode(errors="replace"):
                 raise BusError(f"{connect}: refuses {identity.user}: {objection}")
@@ -442,155 +507,18 @@ def _knock(connect: str, session: zenoh.Session, identity: Certificate) -> None:
     raise BusError(f"{connect}: no world-sim of fleet {identity.fleet} answers; check --connect")
 
 
-def _proof(identity: Identity, side: str, users_file: Path | None = None) -> dict[str, Any]:
-    """The settings that prove who we are. side: connect or listen."""
-    if isinstance(identity, Password):
-        known = {"dictionary_file": str(users_file)} if users_file is not None else {}
-        proof = {"user": identity.user, "password": identity.password, **known}
-        return {"transport/auth/usrpwd": proof}
-
-    def encoded(pem: str) -> str:
-        return base64.b64encode(pem.encode()).decode()
-
-    return {
-        "transport/link/tls": {
-            "root_ca_certificate_base64": encoded(identity.authority),
-            f"{side}_certificate_base64": encoded(identity.certificate),
-            f"{side}_private_key_base64": encoded(identity.key),
-            "enable_mtls": True,
-            "verify_name_on_connect": True,
-            "close_link_on_expiration": True,
-        }
-    }
-
-
-def _config(
-    mode: str, *, connect: str | None = None, listen: str | None = None, settings: dict[str, Any]
-) -> zenoh.Config:
+def _open(
+    mode: str,
+    own: settings.Settings,
+    *,
+    connect: str | None = None,
+    listen: str | None = None,
+) -> zenoh.Session:
+    """Raises zenoh.ZError."""
     config = zenoh.Config()
-    every = {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "connect/endpoints": [connect] if connect else [],
-        "listen/endpoints": [listen] if listen else [],
-        # Chunks of shared memory are lost when a receiver is not scheduled for 100 ms.
-        "transport/shared_memory/enabled": False,
-    }
-    for key, value in (every | settings).items():
+    for key, value in (settings.everywhere(mode, connect, listen) | own).items():
         config.insert_json5(key, json.dumps(value))
-    return config
-
-
-class Grant(NamedTuple):
-    """What somebody may do on the router."""
-
-    label: str
-    flow: str
-    messages: list[str]
-    expressions: list[str]
-
-
-Subject = Mapping[str, list[str]]
-"""How the router knows somebody: by `usernames`, `cert_common_names` or `link_protocols`."""
-
-
-def _subjects(identity: Identity, users: tuple[ParticipantId, ...]) -> dict[ParticipantId, Subject]:
-    """How the router knows those users. Who has no certificate, or whose was revoked, is unknown to it."""
-    if isinstance(identity, Password):
-        return {user: {"usernames": [user]} for user in users}
-    named = identity.names(users)
-    return {user: {"cert_common_names": [name]} for user, name in named.items()}
-
-
-def _participant(fleet: str, name: ParticipantId) -> list[Grant]:
-    """A participant's grants."""
-    own = [keys.tx(fleet, name), keys.pose(fleet, name), keys.weights(fleet, name)]
-    return [
-        Grant("says", "ingress", ["put"], own),
-        Grant("listens", "ingress", ["declare_subscriber"], [keys.rx(fleet, name)]),
-        Grant("hears", "egress", ["put"], [keys.rx(fleet, name)]),
-        Grant("lives", "ingress", ["liveliness_token"], [keys.alive(fleet, name)]),
-    ]
-
-
-def _observer(fleet: str) -> list[Grant]:
-    """An observer's grants."""
-    everything = [keys.everything(fleet)]
-    return [
-        Grant("listens", "ingress", ["declare_subscriber"], everything),
-        Grant("hears", "egress", ["put"], everything),
-    ]
-
-
-def _anybody(fleet: str) -> list[Grant]:
-    """What a client may do whose certificate is the fleet's, even if it is not let in: ask why."""
-    return [
-        Grant("asks", "ingress", ["query"], [keys.door(fleet)]),
-        Grant("learns", "egress", ["reply", "declare_queryable"], [keys.door(fleet)]),
-    ]
-
-
-def _access(fleet: str, subjects: Mapping[ParticipantId, Subject]) -> dict[str, Any]:
-    """Who may do what on the router. Whatever is not allowed here is denied."""
-    grants = [
-        (user, subject, _observer(fleet) if user == OBSERVER else _participant(fleet, user))
-        for user, subject in subjects.items()
-    ]
-    if any("cert_common_names" in subject for subject in subjects.values()):
-        grants.append(("anybody", {"link_protocols": ["tls"]}, _anybody(fleet)))
-    return rules_of(grants)
-
-
-def rules_of(grants: list[tuple[str, Subject, list[Grant]]]) -> dict[str, Any]:
-    """Zenoh's access control: everybody's name, how the router knows them, and what they may do."""
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": [
-            {
-                "id": f"{user}-{grant.label}",
-                "permission": "allow",
-                "flows": [grant.flow],
-                "messages": grant.messages,
-                "key_exprs": grant.expressions,
-            }
-            for user, _, granted in grants
-            for grant in granted
-        ],
-        "subjects": [{"id": user, **subject} for user, subject, _ in grants],
-        "policies": [
-            {"rules": [f"{user}-{grant.label}" for grant in granted], "subjects": [user]}
-            for user, _, granted in grants
-        ],
-    }
-
-
-def _low_pass(label: str, key: str, bytes_max: int) -> dict[str, Any]:
-    """Nothing longer passes the router."""
-    return {
-        "id": label,
-        "flows": ["ingress"],
-        "messages": ["put"],
-        "key_exprs": [key],
-        "size_limit": bytes_max,
-    }
-
-
-def _downsampling(fleet: str, roster: tuple[ParticipantId, ...]) -> list[dict[str, Any]]:
-    """What observers can do without. A rule for each, since many may stand behind one router."""
-    return [
-        {
-            "id": f"{name}-shows",
-            "flows": ["ingress"],
-            "messages": ["put"],
-            "rules": [
-                {"key_expr": key(fleet, name), "freq": SHOWN_PER_S}
-                for key in (keys.pose, keys.weights)
-            ],
-        }
-        for name in roster
-    ]
+    return zenoh.open(config)
 
 
 def _close(session: zenoh.Session, held: list[Any]) -> None:

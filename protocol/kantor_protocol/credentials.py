@@ -64,9 +64,12 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     certificate: str
     key: str
     revoked: tuple[str, ...] = ()
-    """World-sim's: names of certificates that were withdrawn before their time."""
+    """A router's: names of certificates that were withdrawn before their time."""
     members: dict[ParticipantId, Member] = {}
-    """World-sim's: the certificate of everybody; whoever shows another is not let in."""
+    """A router's: the certificate of everybody; whoever shows another is not let in. A site's has its robots
+    and world-sim."""
+    sites: dict[ParticipantId, tuple[ParticipantId, ...]] = {}
+    """World-sim's: for each site the robots that stand behind it."""
 
     def __post_init__(self) -> None:
         """Refuse parts that cannot be what they should be."""
@@ -77,9 +80,12 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if any(len(part) > _PEM_MAX for part in (self.authority, self.certificate, self.key)):
             raise ValueError("no PEM")
 
-    def names(self, users: Iterable[ParticipantId]) -> dict[ParticipantId, str]:
-        """The names of those users' certificates, of those who have one."""
-        return {user: self.members[user].name for user in users if user in self.members}
+    def behind(self) -> dict[ParticipantId, tuple[ParticipantId, ...]]:
+        """For each site the robots that it speaks for: those that have not been revoked."""
+        return {
+            site: tuple(name for name in there if name in self.members)
+            for site, there in self.sites.items()
+        }
 
     def objection(self, name: str, wanted: Iterable[ParticipantId]) -> str:
         """Why the holder of a certificate is not let in, with the remedy; empty if it is.
@@ -92,7 +98,9 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if name in self.revoked:
             return f"its certificate has been revoked; {renew}"
         if member is None:
-            return "is not in the register; start world-sim again with the newest worldsim.toml"
+            return (
+                f"is not in the register; start {self.user} again with the newest {self.user}.toml"
+            )
         if member.name != name:
             return f"the register names another certificate; use the newest {user}.toml, or {renew}"
         if user not in wanted:
