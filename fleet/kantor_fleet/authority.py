@@ -161,7 +161,8 @@ def _fresh(before: Authority | None, authority: Authority, wanted: Wanted) -> li
     robots = [f"r{number}" for number in range(1, wanted.robots + 1)]
     supervisor = [SUPERVISOR] if wanted.supervisor else []
     users = (HOST, OBSERVER, *authority.sites, *supervisor, *robots)
-    without = _withdrawn(authority) | set(authority.members)
+    named = {*_placed(wanted), *wanted.renew}
+    without = (_withdrawn(authority) - named) | set(authority.members)
     renamed = [
         user
         for user in authority.hosts
@@ -171,11 +172,7 @@ def _fresh(before: Authority | None, authority: Authority, wanted: Wanted) -> li
     fresh = sorted({*missing, *renamed, *wanted.renew}, key=_order)
     for site, there in authority.sites.items():
         for name in there:
-            if (
-                name not in authority.members
-                and name not in fresh
-                and name not in _withdrawn(authority)
-            ):
+            if name not in {*authority.members, *fresh, *_withdrawn(authority)}:
                 label = f"--site {site.removeprefix(_SITE)}"
                 raise CredentialsError(
                     f"{label}: the register has no {name}; add --robots {name[1:]}"

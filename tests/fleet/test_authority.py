@@ -291,7 +291,7 @@ def test_what_was_interrupted_is_made_good_by_running_it_again(
             ),
             st.builds(
                 lambda user: Wanted("demo", revoke=(user,)),
-                st.sampled_from(("r1", "r2", "observer")),
+                st.sampled_from(("r1", "r2", "observer", "site-a")),
             ),
             st.builds(
                 lambda text: Wanted("demo", sites=(text,)),
