@@ -10,17 +10,13 @@ case $1 in
 dependencies)
     /pip/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["dependencies"], sep="\n")' >/requirements.txt
     pip install --quiet --no-compile --requirement /requirements.txt --constraint constraints.txt
-    cd /opt/kantor/lib/python3*/site-packages
-    # What no kantor command opens: tests, sources and headers of compiled parts, stubs.
-    find . -type d \( -name tests -o -name test -o -name testing -prune -o -name sample_data \) -prune -print >/tests.txt
-    grep -vE '/(numpy|matplotlib|numba)/testing' /tests.txt | xargs rm -rf
-    find . \( -name '*.pyi' -o -name '*.pxd' -o -name '*.pyx' -o -name '*.c' -o -name '*.cpp' -o -name '*.h' -o -name '*.hpp' -o -name '*.a' \) -delete
-    if command -v strip >/dev/null; then strip --strip-unneeded llvmlite/binding/*.so; fi
+    /pip/bin/python /wheels/lighten.py /opt/kantor/lib/python3*/site-packages
     ;;
 kantor)
     PIP_CONSTRAINT=constraints.txt pip install --quiet --no-compile --no-deps .
     cd /opt/kantor/lib/python3*/site-packages
-    /opt/kantor/bin/python -m compileall -q -j 0 --invalidation-mode unchecked-hash .
+    # Without those that only PDF output and tracebacks in colour want.
+    /opt/kantor/bin/python -m compileall -q -j 0 --invalidation-mode unchecked-hash -x '/(fontTools|pygments)/' .
     /opt/kantor/bin/python -c 'from kantor_fleet.preload import warm_up; warm_up()'
     ;;
 esac
