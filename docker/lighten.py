@@ -1,3 +1,4 @@
+# ruff: noqa: INP001
 """Inside the first stage of the image: leaves out of installed packages what no kantor command opens.
 
     lighten.py SITE-PACKAGES

@@ -99,7 +99,10 @@ def _check(order: Order) -> None:
     if not 1 <= order.robots <= ROBOTS_MAX:
         fail(Exit.USAGE, f"--robots {order.robots}: give 1 to {ROBOTS_MAX}")
     if order.isolated and order.robots > NETWORKS_MAX:
-        fail(Exit.USAGE, f"--isolated: a network for each robot, and Docker has room for {NETWORKS_MAX}")
+        fail(
+            Exit.USAGE,
+            f"--isolated: a network for each robot, and Docker has room for {NETWORKS_MAX}",
+        )
     if order.hub is not None:
         bus.check_endpoint(order.hub)
         return
@@ -143,7 +146,9 @@ def text(order: Order) -> str:
     owners = people if order.hub else ["worldsim", *people]
     # Nobody in a fleet has any business beyond it, unless its hub is there.
     inside = "internal: false" if order.hub else "internal: true"
-    secrets = "".join(f'  {who}: {{file: "${{KANTOR_KEYS:-./keys}}/{who}.toml"}}\n' for who in owners)
+    secrets = "".join(
+        f'  {who}: {{file: "${{KANTOR_KEYS:-./keys}}/{who}.toml"}}\n' for who in owners
+    )
     parts += ["\nnetworks:\n", *(f"  {name}: {{{inside}}}\n" for name in networks)]
     parts += ["\nsecrets:\n", secrets, "\nvolumes:\n", *(f"  {who}: {{}}\n" for who in owners)]
     return "".join(parts)

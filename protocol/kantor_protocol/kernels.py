@@ -1,7 +1,6 @@
 """How kernels are compiled: for speed, to be called often, and kept on disk."""
 
 import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,18 +9,23 @@ from numba import njit
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
 
 
-class _Sealed(InTreeCacheLocator):  # type: ignore[misc]
-    """Kernels that somebody else has compiled, in a folder that cannot be written, as in an image."""
+class _InTree(InTreeCacheLocator):  # type: ignore[misc]
+    """Beside the source, even where nothing can be written but kernels are, as in an image."""
 
     def ensure_cache_path(self) -> None:
-        """Numba's own goes on to other folders, and compiles anew, unless it can write."""
-        folder = Path(self.get_cache_path())
-        if os.access(folder, os.W_OK) or not any(folder.glob("*.nbi")):
-            raise OSError(f"{folder}: no sealed kernels")
+        """Numba's own looks elsewhere then, and compiles anew."""
+        try:
+            super().ensure_cache_path()
+        except OSError:
+            if not any(Path(self.get_cache_path()).glob("*.nbi")):
+                raise
 
 
 class _Finding(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = (_Sealed, *CompileResultCacheImpl._locator_classes)  # noqa: SLF001
+    _locator_classes = tuple(
+        _InTree if locator is InTreeCacheLocator else locator
+        for locator in CompileResultCacheImpl._locator_classes  # noqa: SLF001
+    )
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]

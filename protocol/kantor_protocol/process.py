@@ -18,7 +18,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from kantor_protocol import bus
+from kantor_protocol import bus, memory
 from kantor_protocol.clock import clocks
 from kantor_protocol.credentials import Identity
 from kantor_protocol.diary import DiaryFile
@@ -47,6 +47,8 @@ AGAIN_S = 0.2
 """After so long, what has not been heard is said again, and what could not be noted is tried again."""
 INBOX_MAX = 4096
 """Envelopes that wait for a step of a participant that holds; the oldest make room."""
+_LOADED = frozenset({2, 20, 200})
+"""After so many steps kernels have been loaded that were not before."""
 
 
 class NotWantedError(RuntimeError):
@@ -110,6 +112,8 @@ class _Participant:
         self._wall: _Wall | None = None
         self._cannot = False
         """The diary could not be written when that was last tried."""
+        self._shown = 0
+        """Steps of this process."""
         self.refused = 0
         """Messages from world-sim that could not be read."""
 
@@ -266,6 +270,9 @@ class _Participant:
         self._line.publish_pose(encode(PoseMessage(VERSION, outputs.step, now_ns, outputs.pose)))
         if outputs.weights:
             self._line.publish_weights(outputs.weights)
+        self._shown += 1
+        if self._shown in _LOADED:
+            memory.leave_compiler()
 
 
 def _start(mission: Mission, name: str) -> Pose:
