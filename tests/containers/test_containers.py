@@ -114,13 +114,12 @@ def test_a_storm_over_containers(fleet_of: MakeFleet, kantor: "Kantor") -> None:
     assert done.code == 0, done.out + done.err
     assert len(re.findall(r"^ok .*on record, (?:leave|join)", done.out, re.MULTILINE)) == 6
     assert "FAIL" not in done.out
-    result = check_record(fleet)
-    seen = [(i.who, i.what) for i in incidents_of(fleet.run_folder())]
-    assert sorted(seen) == sorted(
-        (who, what) for who in ("r2", "r3", "r4") for what in ("leave", "join")
-    )
-    assert fleet.inspect("worldsim")["State"]["ExitCode"] == 0
+    result = result_of(fleet.run_folder())  # chaos has verified the rest
+    assert (result["ended"], result["violations"]) == ("done", 0)
     assert float(str(result["detection_rate"])) >= 0.8
+    seen = {(incident.who, incident.what) for incident in incidents_of(fleet.run_folder())}
+    assert seen >= {(who, what) for who in ("r2", "r3", "r4") for what in ("leave", "join")}
+    assert fleet.inspect("worldsim")["State"]["ExitCode"] == 0
 
 
 def test_world_sim_killed_goes_on_by_itself(fleet_of: MakeFleet) -> None:
