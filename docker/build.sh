@@ -3,7 +3,8 @@
 #
 #   docker/build.sh [--tag kantor] [further arguments of docker build, such as --build-arg BASE=...]
 #
-# PYTHON names a Python of the version that the base image has, 3.11.
+# PYTHON names a Python of the version that the base image has, 3.11. Beside compose.yaml it leaves runs/ and .env, which
+# says who runs the containers: the user, whose are the identities and the runs, and never root.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}
@@ -19,4 +20,9 @@ rm -rf docker/wheels
 mv docker/wheels.new docker/wheels
 
 DOCKER_BUILDKIT=${DOCKER_BUILDKIT:-0} docker build --quiet --file docker/Dockerfile --tag "$tag" "$@" . >/dev/null
+
+if [ "$(id -u)" = 0 ]; then owner=10001:10001; else owner=$(id -u):$(id -g); fi
+mkdir -p docker/runs docker/keys
+if [ "$(id -u)" = 0 ]; then chown "$owner" docker/runs docker/keys; fi
+[ -e docker/.env ] || printf 'COMPOSE_PROJECT_NAME=kantor\nKANTOR_USER=%s\n' "$owner" >docker/.env
 echo "$tag: built"

@@ -143,11 +143,9 @@ def _host(
                 run(host, plan, recording, interrupts, view.show, past)
         conclude(folder)
         result = read_result(folder)
-    if result is None:
-        return interrupts.code or Exit.PROCESS_FAILED
-    if interrupts.code is not None and result.ended == "interrupted":
-        return interrupts.code
-    return verdict(result)  # a signal after its end changes nothing
+    if result is not None and result.ended == "done":
+        return verdict(result)  # a signal after that changes nothing
+    return interrupts.code or (verdict(result) if result is not None else Exit.PROCESS_FAILED)
 
 
 def participate_by_hand(

@@ -61,6 +61,15 @@ _WORLDSIM = """\
     secrets: [{{source: worldsim, target: worldsim.toml}}]
     volumes: ["${{KANTOR_RUNS:-./runs}}:/runs", "worldsim:/state"]
 """
+_KEYS = """\
+  keys:  # makes the identities: docker-compose run --rm keys
+    <<: *kantor
+    command: keys kantor --robots {robots}{people} --host worldsim --out /keys
+    restart: "no"
+    network_mode: none
+    volumes: ["${{KANTOR_KEYS:-./keys}}:/keys"]
+    profiles: [keys]
+"""
 _PARTICIPANT = """\
   {name}:
     <<: *robot
@@ -88,9 +97,11 @@ def compose(order: Order, file: Path) -> Exit:
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(text(order), encoding="utf-8")
     user = prepare(file.parent)
-    people = " --supervisor" if order.supervisor else ""
     print(f"{file}: {order.robots} robots, run by {user}; next, in {file.parent}/:")
-    print(f"  kantor keys kantor --robots {order.robots}{people} --host worldsim")
+    if order.hub is None:
+        print("  docker-compose run --rm keys")
+    else:
+        print("  put each robot's identity into keys/")
     print(f"  {_up(order)}")
     return Exit.DONE
 
@@ -135,6 +146,7 @@ def text(order: Order) -> str:
                 networks=", ".join(networks),
             )
         )
+        parts.append(_KEYS.format(robots=order.robots, people=_people(order)))
     for name in people:
         verb = name if name == "supervisor" else f"agent {name}"
         network = name if order.isolated else "fleet"
@@ -160,6 +172,10 @@ def _title(order: Order) -> str:
     return f"{order.robots} robots in containers{apart}{whose}. Written by `kantor compose`."
 
 
+def _people(order: Order) -> str:
+    return " --supervisor" if order.supervisor else ""
+
+
 def _up(order: Order) -> str:
     if order.hub is not None:
         return "docker-compose up --detach"
@@ -167,17 +183,17 @@ def _up(order: Order) -> str:
 
 
 def prepare(folder: Path) -> str:
-    """Make the run folder and `.env`, which says who runs the containers; who that is.
+    """Make the folders of the runs and of the identities, and `.env`, which says who runs the containers; who that is.
 
     Identities are for their owner's eyes only and the run folder is the user's, so containers run as the user; never
     as root.
     """
     root = os.getuid() == 0
     user = f"{_USER}:{_USER}" if root else f"{os.getuid()}:{os.getgid()}"
-    runs = folder / "runs"
-    runs.mkdir(exist_ok=True)
-    if root:
-        os.chown(runs, _USER, _USER)
+    for name in ("runs", "keys"):
+        (folder / name).mkdir(exist_ok=True)
+        if root:
+            os.chown(folder / name, _USER, _USER)
     env = folder / ".env"
     if not env.exists():
         env.write_text(f"COMPOSE_PROJECT_NAME=kantor\nKANTOR_USER={user}\n", encoding="utf-8")

@@ -39,6 +39,7 @@ def test_everybody_gets_an_identity_and_nobody_a_privilege(order: Order) -> None
         {"supervisor"} if order.supervisor else set()
     )
 
+    assert tree["services"].pop("keys")["network_mode"] == "none"
     assert set(tree["services"]) == people | {"worldsim"} == set(tree["secrets"])
     for name, service in tree["services"].items():
         assert [secret["source"] for secret in service["secrets"]] == [name]
