@@ -130,21 +130,21 @@ def _host(
     bus.check_endpoint(listen)
     identities = credentials.issue(secrets, fleet, scenario.roster)
     bus.init_log()
-    with Interrupts() as interrupts:
-        with ProgressView(scenario.name) as view:
-            warm_up()
-            users = credentials.users_file(secrets)
-            with bus.Host(identities[credentials.HOST], listen, users, scenario.roster) as host:
-                folder, recording = record()
-                view.note(f"world-sim of fleet {fleet} at {listen}, credentials in {secrets}/")
-                for name in scenario.roster:
-                    verb = name if name == "supervisor" else f"agent {name}"
-                    view.note(f"  kantor {verb} --connect {listen} --credentials {secrets}")
-                run(host, plan, recording, interrupts, view.show, past)
+    with Interrupts() as interrupts, ProgressView(scenario.name) as view:
+        warm_up()
+        users = credentials.users_file(secrets)
+        with bus.Host(identities[credentials.HOST], listen, users, scenario.roster) as host:
+            folder, recording = record()
+            view.note(f"world-sim of fleet {fleet} at {listen}, credentials in {secrets}/")
+            for name in scenario.roster:
+                verb = name if name == "supervisor" else f"agent {name}"
+                view.note(f"  kantor {verb} --connect {listen} --credentials {secrets}")
+            run(host, plan, recording, interrupts, view.show, past, say=view.note)
+    with Interrupts(patient=True):  # what comes when the mission is over changes nothing
         conclude(folder)
-        result = read_result(folder)
+    result = read_result(folder)
     if result is not None and result.ended == "done":
-        return verdict(result)  # a signal after that changes nothing
+        return verdict(result)
     return interrupts.code or (verdict(result) if result is not None else Exit.PROCESS_FAILED)
 
 

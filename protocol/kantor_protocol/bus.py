@@ -18,7 +18,7 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -28,11 +28,18 @@ from kantor_protocol import keys
 from kantor_protocol.credentials import OBSERVER, Identity
 from kantor_protocol.machine import ParticipantId
 from kantor_protocol.messages import MESSAGE_BYTES_MAX
+from kantor_protocol.quota import Bucket, Excess, Quota, excesses
 
 LEASE_MS = 1000
 """A frozen or cut-off process is noticed after this."""
 QUEUE_MAX = 16_384
 """Messages that wait for a reader."""
+POSE_BYTES_MAX = 256
+SHOWN_PER_S = 1000
+"""Messages on a pose key, and on a weights key, that reach observers. A pose is outdated by the next, and
+weights have keyframes."""
+_RECEIVE_BYTES = 32 * 1024
+_FRAME_BYTES = 64 * 1024
 _HANDSHAKE_S = 3.0
 _CLOSE_S = 5.0
 
@@ -62,7 +69,13 @@ class Heard(NamedTuple):
     payload: bytes
 
 
-Event = Joined | Left | Heard
+class Flooded(NamedTuple):
+    """A participant has gone beyond its quota for the first time."""
+
+    name: ParticipantId
+
+
+Event = Joined | Left | Heard | Flooded
 
 
 class Host:
@@ -87,19 +100,22 @@ class Host:
                 "password": identity.password,
                 "dictionary_file": str(users_file),
             },
+            # A flood reaches the router in small portions, so that the others' turn comes between them.
+            "transport/link/tcp/so_rcvbuf": _RECEIVE_BYTES,
+            "transport/link/tls/so_rcvbuf": _RECEIVE_BYTES,
+            # Longer ones are not put together. Without this a robot could have a gigabyte waiting.
+            "transport/link/rx/max_message_size": MESSAGE_BYTES_MAX + _FRAME_BYTES,
             "access_control": _access(fleet, roster),
             "low_pass_filter": [
-                {
-                    "id": "tx",
-                    "flows": ["ingress"],
-                    "messages": ["put"],
-                    "key_exprs": [keys.everything(fleet)],
-                    "size_limit": MESSAGE_BYTES_MAX,
-                }
+                _low_pass("all", keys.everything(fleet), MESSAGE_BYTES_MAX),
+                _low_pass("pose", keys.pose(fleet, "*"), POSE_BYTES_MAX),
             ],
+            "downsampling": _downsampling(fleet, roster),
         }
         self._fleet = fleet
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._listening = threading.Lock()
+        self._buckets = {name: Bucket(Quota.of(0.0)) for name in roster}
         try:
             self._session = zenoh.open(_config("router", listen=listen, settings=settings))
         except zenoh.ZError as error:
@@ -131,7 +147,19 @@ class Host:
     def send(self, name: ParticipantId, payload: bytes, *, patiently: bool) -> None:
         """Put on a participant's `rx`. patiently: wait for a full queue, up to 0.2 s, rather than drop."""
         congestion = self._block if patiently else self._drop
+        if patiently:  # what may be lost is news, and news asks for nothing
+            self._buckets[name].ask()
         self._session.put(self._rx[name], payload, congestion_control=congestion, express=True)
+
+    def limit(self, quotas: Mapping[ParticipantId, Quota]) -> None:
+        """How much to take in of what each says; before that, little more than answers."""
+        for name, quota in quotas.items():
+            self._buckets[name].quota = quota
+
+    @property
+    def excess(self) -> dict[ParticipantId, Excess]:
+        """What was beyond the quotas."""
+        return excesses(self._buckets.items())
 
     def publish_progress(self, payload: bytes) -> None:
         """Tell observers how the mission goes."""
@@ -143,14 +171,31 @@ class Host:
 
     def _on_message(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
-        if key is not None and self._events.qsize() < QUEUE_MAX:
+        if key is None or not self._listens(key.name, len(sample.payload)):
+            return
+        if self._events.qsize() < QUEUE_MAX:
             self._events.put(Heard(key.name, sample.payload.to_bytes()))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
-        if key is not None:
-            kind = Joined if sample.kind == zenoh.SampleKind.PUT else Left
-            self._events.put(kind(key.name, key.nonce))
+        if key is None:
+            return
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self._events.put(Left(key.name, key.nonce))
+        elif self._listens(key.name, len(key.nonce)):
+            self._events.put(Joined(key.name, key.nonce))
+
+    def _listens(self, name: ParticipantId, size: int) -> bool:
+        """Whether something that a participant says is within its quota."""
+        bucket = self._buckets.get(name)
+        if bucket is None:
+            return False
+        with self._listening:  # messages and tokens come in different threads
+            flooded = bucket.floods
+            taken = bucket.take(size, time.monotonic())
+            if bucket.floods and not flooded:
+                self._events.put(Flooded(name))
+            return taken
 
 
 class Line:
@@ -368,6 +413,33 @@ def _access(fleet: str, roster: tuple[ParticipantId, ...]) -> dict[str, Any]:
         "subjects": subjects,
         "policies": policies,
     }
+
+
+def _low_pass(label: str, key: str, bytes_max: int) -> dict[str, Any]:
+    """Nothing longer passes the router."""
+    return {
+        "id": label,
+        "flows": ["ingress"],
+        "messages": ["put"],
+        "key_exprs": [key],
+        "size_limit": bytes_max,
+    }
+
+
+def _downsampling(fleet: str, roster: tuple[ParticipantId, ...]) -> list[dict[str, Any]]:
+    """What observers can do without. A rule for each, since many may stand behind one router."""
+    return [
+        {
+            "id": f"{name}-shows",
+            "flows": ["ingress"],
+            "messages": ["put"],
+            "rules": [
+                {"key_expr": key(fleet, name), "freq": SHOWN_PER_S}
+                for key in (keys.pose, keys.weights)
+            ],
+        }
+        for name in roster
+    ]
 
 
 def _close(session: zenoh.Session, held: list[Any]) -> None:
