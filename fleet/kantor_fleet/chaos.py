@@ -193,7 +193,9 @@ class Containers:
         label = f"label=com.docker.compose.project={project}"
         ids = docker("ps", "--all", "--quiet", "--filter", label).split()
         found: list[dict[str, Any]] = json.loads(docker("inspect", *ids)) if ids else []
-        self._ids = {c["Config"]["Labels"]["com.docker.compose.service"]: c["Id"] for c in found}
+        self._ids: dict[ParticipantId, str] = {
+            c["Config"]["Labels"]["com.docker.compose.service"]: c["Id"] for c in found
+        }
         self._cut: dict[ParticipantId, list[str]] = {}
         world = next((c for c in found if c["Id"] == self._ids.get(WORLD_SIM)), None)
         if world is None:

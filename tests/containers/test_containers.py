@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.xdist_group("containers"), pytest.mark.timeout(600)]
 
 MakeFleet = Callable[..., Fleet]
 FIVE = Order(5, supervisor=True)
-NEAR = "radio.range_m=300"
+NEAR = "radio.range_m=300 energy.points=2500"
 TINY = "starts.random=true samples.count=400 targets.count=60 energy.points=800 radio.range_m=500"
 
 
@@ -109,11 +109,12 @@ def test_a_storm_over_containers(fleet_of: MakeFleet, kantor: "Kantor") -> None:
     fleet = fleet_of(FIVE, speed="2", set=NEAR)
     fleet.compose("up", "--detach")
     (kantor.folder / "storm.toml").write_text(STORM)
-    done = kantor("chaos", "docker", "storm.toml", "--project", fleet.project)
+    chaos = kantor.start("chaos", "docker", "storm.toml", "--project", fleet.project)
+    out, err = chaos.communicate(timeout=300.0)
 
-    assert done.code == 0, done.out + done.err
-    assert len(re.findall(r"^ok .*on record, (?:leave|join)", done.out, re.MULTILINE)) == 6
-    assert "FAIL" not in done.out
+    assert chaos.returncode == 0, out + err
+    assert len(re.findall(r"^ok .*on record, (?:leave|join)", out, re.MULTILINE)) == 6
+    assert "FAIL" not in out
     result = result_of(fleet.run_folder())  # chaos has verified the rest
     assert (result["ended"], result["violations"]) == ("done", 0)
     assert float(str(result["detection_rate"])) >= 0.8
