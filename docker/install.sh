@@ -15,8 +15,8 @@ dependencies)
 kantor)
     PIP_CONSTRAINT=constraints.txt pip install --quiet --no-compile --no-deps .
     cd /opt/kantor/lib/python3*/site-packages
-    # Without those that only PDF output and tracebacks in colour want.
-    /opt/kantor/bin/python -m compileall -q -j 0 --invalidation-mode unchecked-hash -x '/(fontTools|pygments)/' .
+    # Without those that only PDF output and tables of sweeps want.
+    /opt/kantor/bin/python -m compileall -q -j 0 --invalidation-mode unchecked-hash -x '/(fontTools|pygments|scipy/(io|signal|stats))/' .
     /opt/kantor/bin/python -c 'from kantor_fleet.preload import warm_up; warm_up()'
     ;;
 esac

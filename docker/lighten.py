@@ -20,10 +20,11 @@ _PLACES = (
     "numpy/distutils",
     "PIL/_avif*",
     "pillow.libs/libavif*",
+    "pygments/lexers/[a-z]*.py",
     "scipy/io/_fast_matrix_market",
     "zstandard/_cffi*",
 )
-"""No GPU in the image, no compiler, no AVIF; zstandard uses its C backend."""
+"""No GPU in the image, no compiler, no AVIF, no source to colour; zstandard uses its C backend."""
 
 
 def lighten(site: Path) -> None:
