@@ -9,6 +9,7 @@ fleet     robot-steps that one CPU second buys when the whole fleet is in one pr
 maps      what missions on an unknown map cost, and what robots tell of the map
 peers     the speed of other simulators, if they are installed
 lockstep  ticks a second with a process for every robot, beside a bare Zenoh barrier
+hub       robots times rate that one world-sim relays on the wall
 wire      bytes that a robot publishes in a tick, beside its whole weight vector
 
 Exits with 1 if a target is missed. Nothing is written unless --save names a file.
@@ -26,7 +27,7 @@ from typing import Any
 
 from tables import Table, show
 
-SECTIONS = ("planner", "spectral", "routes", "fleet", "maps", "peers", "lockstep", "wire")
+SECTIONS = ("planner", "spectral", "routes", "fleet", "maps", "peers", "lockstep", "hub", "wire")
 LIBRARIES = ("kantor", "eclipse-zenoh", "numpy", "numba", "msgspec")
 
 

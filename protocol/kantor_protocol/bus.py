@@ -1,7 +1,7 @@
 """The bus: the only file that knows Zenoh.
 
-World-sim is the router; every other process is a client of it, with an identity of its own. Access
-control makes world-sim the only way from one participant to another: a participant may put on its own
+World-sim is the router; every other process is a client of it, with an identity of its own: a password on
+`tcp/HOST:PORT`, a certificate on `tls/HOST:PORT`, where both sides prove who they are. Access control makes world-sim the only way from one participant to another: a participant may put on its own
 keys and read its own `rx`, nothing else. The traps that the settings below avoid are in
 protocol/README.md.
 
@@ -14,33 +14,32 @@ anew, so that world-sim sees it join with the nonce that it had.
 
 import contextlib
 import json
+import os
 import queue
 import socket
+import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from kantor_protocol import keys
-from kantor_protocol.credentials import OBSERVER, Identity
-from kantor_protocol.machine import ParticipantId
-from kantor_protocol.messages import MESSAGE_BYTES_MAX
+from kantor_protocol import keys, settings, tls
+from kantor_protocol.credentials import (
+    OBSERVER,
+    Certificate,
+    CredentialsError,
+    Identity,
+    Password,
+)
+from kantor_protocol.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.quota import Bucket, Excess, Quota, excesses
 
-LEASE_MS = 1000
-"""A frozen or cut-off process is noticed after this."""
+LEASE_MS = settings.LEASE_MS
 QUEUE_MAX = 16_384
 """Messages that wait for a reader."""
-POSE_BYTES_MAX = 256
-SHOWN_PER_S = 1000
-"""Messages on a pose key, and on a weights key, that reach observers. A pose is outdated by the next, and
-weights have keyframes."""
-_RECEIVE_BYTES = 32 * 1024
-_FRAME_BYTES = 64 * 1024
-_HANDSHAKE_S = 3.0
 _CLOSE_S = 5.0
 
 
@@ -87,43 +86,33 @@ class Host:
         listen: str,
         users_file: Path,
         roster: tuple[ParticipantId, ...],
+        say: Callable[[str], None] = lambda _line: None,
     ) -> None:
-        """listen: an endpoint such as `tcp/127.0.0.1:7447`. Raises BusError if it cannot be had."""
+        """listen: an endpoint such as `tcp/127.0.0.1:7447`. users_file: of passwords, for an identity that is one.
+
+        say: takes a line on whoever shows a certificate of the fleet's authority and is not let in; called
+        from a thread. Raises BusError if the endpoint cannot be had, CredentialsError if it is not of the
+        identity's kind.
+        """
+        check_endpoint(listen, identity)
         fleet = identity.fleet
-        settings = {
-            "scouting/delay": 0,
-            "open/return_conditions": {"connect_scouted": False, "declares": False},
-            # A frozen client must not hold the router for long (the unit is microseconds).
-            "transport/link/tx/queue/congestion_control/block/wait_before_close": 200_000,
-            "transport/auth/usrpwd": {
-                "user": identity.user,
-                "password": identity.password,
-                "dictionary_file": str(users_file),
-            },
-            # A flood reaches the router in small portions, so that the others' turn comes between them.
-            "transport/link/tcp/so_rcvbuf": _RECEIVE_BYTES,
-            "transport/link/tls/so_rcvbuf": _RECEIVE_BYTES,
-            # Longer ones are not put together. Without this a robot could have a gigabyte waiting.
-            "transport/link/rx/max_message_size": MESSAGE_BYTES_MAX + _FRAME_BYTES,
-            "access_control": _access(fleet, roster),
-            "low_pass_filter": [
-                _low_pass("all", keys.everything(fleet), MESSAGE_BYTES_MAX),
-                _low_pass("pose", keys.pose(fleet, "*"), POSE_BYTES_MAX),
-            ],
-            "downsampling": _downsampling(fleet, roster),
-        }
+        known = settings.hub(identity, roster, users_file)
         self._fleet = fleet
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._listening = threading.Lock()
         self._buckets = {name: Bucket(Quota.of(0.0)) for name in roster}
         try:
-            self._session = zenoh.open(_config("router", listen=listen, settings=settings))
+            self._session = _open("router", known, listen=listen)
         except zenoh.ZError as error:
             raise BusError(f"cannot listen on {listen}: {_short(error)}; choose another") from None
         self._block = zenoh.CongestionControl.BLOCK
         self._drop = zenoh.CongestionControl.DROP
         self._rx = {name: keys.rx(fleet, name) for name in roster}
         self._progress = keys.progress(fleet)
+        self._door = None
+        if isinstance(identity, Certificate):
+            wanted = (*roster, *identity.sites, OBSERVER)
+            self._door = _Door(self._session, identity, wanted, say)
         self._held: list[Any] = [
             self._session.declare_subscriber(keys.tx(fleet), self._on_message),
             self._session.liveliness().declare_subscriber(
@@ -167,6 +156,8 @@ class Host:
 
     def close(self) -> None:
         """Leave the bus."""
+        if self._door is not None:
+            self._door.close()
         _close(self._session, self._held)
 
     def _on_message(self, sample: zenoh.Sample) -> None:
@@ -196,6 +187,110 @@ class Host:
             if bucket.floods and not flooded:
                 self._events.put(Flooded(name))
             return taken
+
+
+class _Door:
+    """Tells whoever shows a certificate of the fleet's authority, and is not let in, why; and the host's log too.
+
+    For TLS such a certificate is sound, and Zenoh silently passes nothing of its holder's on.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        identity: Certificate,
+        wanted: Iterable[ParticipantId],
+        say: Callable[[str], None],
+    ) -> None:
+        self._identity = identity
+        self._wanted = frozenset(wanted)
+        self._refusals = tls.Refusals(say)
+        self._held: list[Any] = [
+            session.declare_queryable(keys.door(identity.fleet), self._on_question),
+            session.info.declare_link_events_listener(self._on_link),
+        ]
+
+    def close(self) -> None:
+        """Tell what has not been told."""
+        self._held.clear()
+        self._refusals.close()
+
+    def _objection(self, name: str) -> str:
+        return self._identity.objection(name, self._wanted)
+
+    def _on_question(self, query: zenoh.Query) -> None:
+        name = str(query.key_expr).rpartition("/")[2]
+        query.reply(keys.door(self._identity.fleet, name), self._objection(name).encode())
+
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        name = event.link.auth_identifier
+        if event.kind == zenoh.SampleKind.PUT and name and (objection := self._objection(name)):
+            self._refusals.tell(f"refused {name.partition('.')[0]}: {objection}")
+
+
+class Site:
+    """A router of a place: its robots connect to it, and it connects to world-sim's.
+
+    What each robot may do is enforced here, what all of them may do at world-sim. It connects again by itself;
+    without it its robots have left.
+    """
+
+    def __init__(
+        self,
+        identity: Certificate,
+        connect: str,
+        listen: str,
+        patience_s: float,
+        say: Callable[[str], None] = lambda _line: None,
+    ) -> None:
+        """Wait for world-sim up to `patience_s`, then listen. say: see Host. Raises BusError, CredentialsError."""
+        check_endpoint(listen, identity)
+        fleet = identity.fleet
+        self.members = tuple(name for name in identity.members if name != WORLD_SIM)
+        """Its robots."""
+        _check_free(listen)
+        _close(_client(connect, identity, patience_s), [])  # which is told why, if it is not let in
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        own = settings.site(identity, self.members)
+        try:
+            self._session = _open("router", own, connect=connect, listen=listen)
+        except zenoh.ZError as error:
+            raise BusError(f"cannot connect {listen} to {connect}: {_short(error)}") from None
+        self._door = _Door(self._session, identity, (*self.members, WORLD_SIM), say)
+        self._held: list[Any] = [
+            self._session.liveliness().declare_subscriber(
+                keys.alive(fleet), self._on_token, history=True
+            ),
+        ]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def next(self, timeout_s: float) -> Event | None:
+        """Who has come or gone, or None after the timeout."""
+        try:
+            return self._events.get(timeout=max(0.0, timeout_s))
+        except queue.Empty:
+            return None
+
+    @property
+    def connected(self) -> bool:
+        """Whether world-sim is there."""
+        return bool(self._session.info.routers_zid())
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._door.close()
+        _close(self._session, self._held)
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        key = keys.parse(str(sample.key_expr))
+        if key is not None:
+            kind = Joined if sample.kind == zenoh.SampleKind.PUT else Left
+            self._events.put(kind(key.name, key.nonce))
 
 
 class Line:
@@ -290,24 +385,30 @@ def watch(connect: str, identity: Identity, key: str, patience_s: float) -> Iter
         opened.close()
 
 
-def free_endpoint() -> str:
+def free_endpoint(protocol: str = "tcp") -> str:
     """A loopback endpoint that nobody uses now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
 
 
 def await_endpoint(
-    connect: str, patience_s: float, monotonic: Callable[[], float] = time.monotonic
+    connect: str,
+    patience_s: float,
+    identity: Identity | None = None,
+    monotonic: Callable[[], float] = time.monotonic,
 ) -> None:
-    """Return once something accepts connections there; raises BusError after `patience_s`."""
-    host, port = _address(connect)
+    """Return once something accepts connections there.
+
+    identity: if it is a certificate, also shake hands with it, which is worth an objection in words. Raises
+    BusError after `patience_s`, and at once if either side objects.
+    """
+    _, host, port = _address(connect)
     give_up = monotonic() + patience_s
     pause_s = 0.02
     while True:
         try:
-            with socket.create_connection((host, port), timeout=1.0):
-                return
+            objection = _look_in(host, port, identity)
         except socket.gaierror:
             raise BusError(f"{connect}: no such host; check --connect") from None
         except OSError:
@@ -316,130 +417,108 @@ def await_endpoint(
                     f"{connect}: nothing listens there after {patience_s:g} s; "
                     f"start `kantor worldsim` or check --connect"
                 ) from None
+        else:
+            if objection:
+                raise BusError(f"{connect}: {objection}")
+            return
         time.sleep(pause_s)
         pause_s = min(0.2, 1.5 * pause_s)
 
 
-def _address(endpoint: str) -> tuple[str, int]:
+def _look_in(host: str, port: int, identity: Identity | None) -> str:
+    """What world-sim or we have against each other. Raises OSError if nothing listens there."""
+    if isinstance(identity, Certificate):
+        return tls.objection(host, port, identity)
+    socket.create_connection((host, port), timeout=1.0).close()
+    return ""
+
+
+def _address(endpoint: str) -> tuple[str, str, int]:
     protocol, _, place = endpoint.partition("/")
     host, _, port = place.rpartition(":")
-    if protocol != "tcp" or not host or not port.isdigit() or int(port) > 65535:
-        raise BusError(f"{endpoint}: not an endpoint; write it as tcp/HOST:PORT")
-    return host.strip("[]"), int(port)
+    sound = protocol in {"tcp", "tls"} and host and port.isdecimal() and port.isascii()
+    if not sound or int(port) > 65535:
+        raise BusError(f"{endpoint}: not an endpoint; write it as tcp/HOST:PORT or tls/HOST:PORT")
+    return protocol, host.strip("[]"), int(port)
 
 
-def check_endpoint(endpoint: str) -> None:
-    """Raise BusError unless it reads tcp/HOST:PORT."""
-    _address(endpoint)
+def is_tls(endpoint: str) -> bool:
+    """Whether an endpoint is for certificates. Raises BusError if it is none."""
+    return _address(endpoint)[0] == "tls"
+
+
+def check_endpoint(endpoint: str, identity: Identity | None = None) -> None:
+    """Raise BusError unless it reads tcp/HOST:PORT or tls/HOST:PORT.
+
+    identity: raise CredentialsError unless it is of the kind that the endpoint is for.
+    """
+    protocol, _, place = endpoint.partition("/")
+    if is_tls(endpoint) and isinstance(identity, Password):
+        raise CredentialsError(
+            f"{endpoint}: {identity.user} has a password, and tls takes certificates; "
+            f"make them with `kantor keys`, or use tcp/{place}"
+        )
+    if protocol == "tcp" and isinstance(identity, Certificate):
+        raise CredentialsError(
+            f"{endpoint}: {identity.user} has a certificate, and tcp takes passwords; use tls/{place}"
+        )
+
+
+def _check_free(listen: str) -> None:
+    """Raise BusError if somebody else listens there."""
+    _, host, port = _address(listen)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            reason = error.strerror or error
+            raise BusError(f"cannot listen on {listen}: {reason}; choose another") from None
 
 
 def _client(connect: str, identity: Identity, patience_s: float) -> zenoh.Session:
-    await_endpoint(connect, patience_s)
-    settings = {
-        "connect/timeout_ms": round(_HANDSHAKE_S * 1000),
-        "connect/retry": {
-            "period_init_ms": 50,
-            "period_max_ms": 200,
-            "period_increase_factor": 1.5,
-        },
-        "transport/link/tx/lease": LEASE_MS,
-        "transport/auth/usrpwd": {"user": identity.user, "password": identity.password},
-    }
+    check_endpoint(connect, identity)
+    await_endpoint(connect, patience_s, identity)
     try:
-        return zenoh.open(_config("client", connect=connect, settings=settings))
+        session = _open("client", settings.client(identity), connect=connect)
     except zenoh.ZError:
         raise BusError(
             f"{connect}: refuses {identity.user}; its credentials are not this world-sim's"
         ) from None
+    if isinstance(identity, Certificate):
+        try:
+            _knock(connect, session, identity)
+        except BusError:
+            _close(session, [])
+            raise
+    return session
 
 
-def _config(
-    mode: str, *, connect: str | None = None, listen: str | None = None, settings: dict[str, Any]
-) -> zenoh.Config:
+def _knock(connect: str, session: zenoh.Session, identity: Certificate) -> None:
+    """Ask whether we are let in: a certificate may be sound and yet not the register's. Raises BusError."""
+    for reply in session.get(
+        keys.door(identity.fleet, identity.name), timeout=settings.HANDSHAKE_S
+    ):
+        if reply.ok is not None:
+            if objection := reply.ok.payload.to_bytes().decode(errors="replace"):
+                raise BusError(f"{connect}: refuses {identity.user}: {objection}")
+            return
+    raise BusError(f"{connect}: no world-sim of fleet {identity.fleet} answers; check --connect")
+
+
+def _open(
+    mode: str,
+    own: settings.Settings,
+    *,
+    connect: str | None = None,
+    listen: str | None = None,
+) -> zenoh.Session:
+    """Raises zenoh.ZError."""
     config = zenoh.Config()
-    every = {
-        "mode": mode,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "connect/endpoints": [connect] if connect else [],
-        "listen/endpoints": [listen] if listen else [],
-        # Chunks of shared memory are lost when a receiver is not scheduled for 100 ms.
-        "transport/shared_memory/enabled": False,
-    }
-    for key, value in (every | settings).items():
+    for key, value in (settings.everywhere(mode, connect, listen) | own).items():
         config.insert_json5(key, json.dumps(value))
-    return config
-
-
-def _access(fleet: str, roster: tuple[ParticipantId, ...]) -> dict[str, Any]:
-    """Who may do what on the router. Whatever is not allowed here is denied."""
-    rules: list[dict[str, Any]] = []
-    subjects: list[dict[str, Any]] = []
-    policies: list[dict[str, Any]] = []
-
-    def allow(user: str, *grants: tuple[str, str, list[str], list[str]]) -> None:
-        for label, flow, messages, expressions in grants:
-            rules.append(
-                {
-                    "id": f"{user}-{label}",
-                    "permission": "allow",
-                    "flows": [flow],
-                    "messages": messages,
-                    "key_exprs": expressions,
-                }
-            )
-        subjects.append({"id": user, "usernames": [user]})
-        policies.append({"rules": [f"{user}-{label}" for label, *_ in grants], "subjects": [user]})
-
-    for name in roster:
-        own = [keys.tx(fleet, name), keys.pose(fleet, name), keys.weights(fleet, name)]
-        allow(
-            name,
-            ("says", "ingress", ["put"], own),
-            ("listens", "ingress", ["declare_subscriber"], [keys.rx(fleet, name)]),
-            ("hears", "egress", ["put"], [keys.rx(fleet, name)]),
-            ("lives", "ingress", ["liveliness_token"], [keys.alive(fleet, name)]),
-        )
-    everything = [keys.everything(fleet)]
-    allow(
-        OBSERVER,
-        ("listens", "ingress", ["declare_subscriber"], everything),
-        ("hears", "egress", ["put"], everything),
-    )
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
-
-
-def _low_pass(label: str, key: str, bytes_max: int) -> dict[str, Any]:
-    """Nothing longer passes the router."""
-    return {
-        "id": label,
-        "flows": ["ingress"],
-        "messages": ["put"],
-        "key_exprs": [key],
-        "size_limit": bytes_max,
-    }
-
-
-def _downsampling(fleet: str, roster: tuple[ParticipantId, ...]) -> list[dict[str, Any]]:
-    """What observers can do without. A rule for each, since many may stand behind one router."""
-    return [
-        {
-            "id": f"{name}-shows",
-            "flows": ["ingress"],
-            "messages": ["put"],
-            "rules": [
-                {"key_expr": key(fleet, name), "freq": SHOWN_PER_S}
-                for key in (keys.pose, keys.weights)
-            ],
-        }
-        for name in roster
-    ]
+    return zenoh.open(config)
 
 
 def _close(session: zenoh.Session, held: list[Any]) -> None:
@@ -462,3 +541,45 @@ def _short(error: Exception) -> str:
 def init_log() -> None:
     """Zenoh's own log: silent, since kantor tells what a user can mend, unless RUST_LOG says more."""
     zenoh.init_log_from_env_or("off")
+
+
+@contextlib.contextmanager
+def host_log(identity: Identity, say: Callable[[str], None]) -> Iterator[None]:
+    """`init_log` for a host; with certificates, also a line on whoever comes without a sound one.
+
+    Zenoh tells of them in its log alone (zenoh#2712), without an address and with a misleading hint, and its log
+    goes to standard output. In here its lines are read instead, while our own output goes on where it went.
+    say: called from a thread.
+    """
+    if isinstance(identity, Password) or "RUST_LOG" in os.environ:
+        init_log()
+        yield
+        return
+    refusals = tls.Refusals(say)
+    sys.stdout.flush()
+    usual = sys.stdout
+    reading, writing = os.pipe()
+    kept = os.dup(1)
+    os.dup2(writing, 1)
+    os.close(writing)
+    sys.stdout = os.fdopen(os.dup(kept), "w", encoding="utf-8", errors="replace", buffering=1)
+    zenoh.init_log_from_env_or("zenoh_link_tls=warn")
+
+    def read() -> None:
+        with os.fdopen(reading, encoding="utf-8", errors="replace") as lines:
+            for line in lines:
+                if reason := tls.logged_reason(line):
+                    refusals.tell(reason)
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)  # closes the pipe, unless somebody else holds it
+        os.close(kept)
+        reader.join(_CLOSE_S)
+        refusals.close()
+        sys.stdout.flush()
+        sys.stdout.close()
+        sys.stdout = usual

@@ -13,8 +13,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from kantor_fleet.authority import Wanted, issue, today
 from kantor_fleet.compose import Order, prepare, text
-from kantor_protocol import credentials
 
 ROOT = Path(__file__).parents[2]
 IMAGE = "kantor-test"
@@ -113,12 +113,9 @@ class Fleet:
         self.folder = folder
         self.project = re.sub(r"[^a-z0-9]", "", f"kantor{folder.name}{os.getpid()}".lower())
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "compose.yaml").write_text(_plain(text(order)), encoding="utf-8")
+        (folder / "compose.yaml").write_text(text(order), encoding="utf-8")
         prepare(folder)
-        people = [f"r{i}" for i in range(1, order.robots + 1)] + ["supervisor"]
-        credentials.issue(folder / "keys", "kantor", people)
-        if os.getuid() == 0:
-            call("chown", "-R", "10001:10001", folder / "keys")
+        keys(folder / "keys", Wanted("kantor", order.robots, order.supervisor))
         self._environment = {
             "COMPOSE_PROJECT_NAME": self.project,
             "KANTOR_IMAGE": IMAGE,
@@ -200,13 +197,11 @@ def _moment(text_: str) -> datetime:
     return datetime.fromisoformat(f"{text_[:26].rstrip('Z'):0<26}+00:00")
 
 
-def _plain(compose_text: str) -> str:
-    """Passwords over TCP in place of certificates."""
-    return (
-        compose_text.replace("tls/", "tcp/")
-        .replace("--credentials /run/secrets/worldsim.toml", "--credentials /keys")
-        .replace(':/runs",', ':/runs", "./keys:/keys",')
-    )
+def keys(folder: Path, wanted: Wanted) -> None:
+    """Certificates, for the eyes of whoever runs the containers."""
+    issue(folder, wanted, today())
+    if os.getuid() == 0:
+        call("chown", "-R", "10001:10001", folder)
 
 
 def resident_mb(process: int) -> float:

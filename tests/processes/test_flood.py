@@ -14,8 +14,6 @@ import zenoh
 
 from kantor_protocol import credentials, keys
 from kantor_protocol.bus import (
-    POSE_BYTES_MAX,
-    SHOWN_PER_S,
     Flooded,
     Heard,
     Host,
@@ -26,6 +24,7 @@ from kantor_protocol.bus import (
     watch,
 )
 from kantor_protocol.quota import BURST_BYTES, BURST_MESSAGES, Quota
+from kantor_protocol.settings import POSE_BYTES_MAX, SHOWN_PER_S
 
 if TYPE_CHECKING:
     from conftest import Kantor

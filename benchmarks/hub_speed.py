@@ -1,0 +1,411 @@
+"""What one hub carries: robots times rate that world-sim relays on the wall, and what that costs it.
+
+World-sim is the real one in a process of its own: router, access control, doorway, relay, radio, referees,
+record on disk. Robots are real clients of its bus with the real planner; many of them share a process and one
+loop, so that the machine has time left for the hub. Their clocks differ by up to 5 % and jitter, as robots' do.
+
+`answer` is the time from a robot's report until it has the world's answer, at the robot. A robot that has none
+when its next step is due holds, so a rate is carried if 99 in 100 answers take less than a period.
+"""
+
+import gc
+import math
+import os
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tables import Table
+
+from kantor_agent.core import Agent
+from kantor_fleet.catalog import find
+from kantor_fleet.local import _LIGHT_RUNTIME
+from kantor_fleet.preload import warm_up
+from kantor_protocol import bus, credentials
+from kantor_protocol.clock import clocks
+from kantor_protocol.life import Life, Memory
+from kantor_protocol.machine import Body, Envelope, Inputs, Pose
+from kantor_protocol.messages import (
+    VERSION,
+    Go,
+    Mission,
+    PoseMessage,
+    Ready,
+    Report,
+    Stop,
+    Turn,
+    decode_to_participant,
+    encode,
+)
+from kantor_protocol.process import AGAIN_S
+from kantor_protocol.scenario import Scenario, from_tree, to_tree
+from kantor_worldsim.plan import Plan
+from kantor_worldsim.process import run
+from kantor_worldsim.recording import Recording
+from kantor_worldsim.world import Site
+
+COUNTS, COUNTS_QUICK = (10, 50, 100, 200), (10, 50)
+RATES_HZ = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0)
+WARM_S, MEASURED_S = 1.0, 3.0
+"""Real seconds of a mission that are left out, and that count."""
+START_S = 60.0
+ROBOTS_PER_PROCESS = 100
+FLEET = "hub"
+PERIOD_S = 0.1
+"""Of the scenario. Other rates are the same mission at another speed."""
+DEGREE = 5.0
+"""Robots in range of one, on average, where they start."""
+SIDE_M, CLUSTERS = 8000.0, 8
+POLL_S = 0.001
+
+
+class Load(NamedTuple):
+    """One mission."""
+
+    count: int
+    rate_hz: float
+    scheme: str
+    """`tcp` or `tls`."""
+
+
+class Cost(NamedTuple):
+    """What the hub spent on one mission."""
+
+    steps: int
+    """Robot-ticks that it took in."""
+    cpu_s: float
+    """Of the whole process, Zenoh's threads included."""
+    main_s: float
+    """Of the thread that relays."""
+    real_s: float
+
+
+class Pace(NamedTuple):
+    """What robots saw of one mission."""
+
+    cost: Cost
+    answers_s: list[float]
+    """From a report to its answer."""
+    held: int
+    """Steps that were due and could not be made, since the world's answer was not there."""
+
+    @property
+    def p99_s(self) -> float:
+        """Within which 99 of 100 answers came."""
+        return statistics.quantiles(self.answers_s, n=100)[98]
+
+    @property
+    def us(self) -> float:
+        """CPU of the hub per robot-tick."""
+        return 1e6 * self.cost.cpu_s / self.cost.steps
+
+
+def measure(*, quick: bool) -> Table:
+    """For each number of robots the highest rate that is carried, and what a robot-tick costs there."""
+    warm_up()
+    get_context("forkserver").set_forkserver_preload(["kantor_fleet.preloaded"])
+    rows = []
+    for scheme in SCHEMES:
+        for count in COUNTS_QUICK if quick else COUNTS:
+            load, pace = _highest(count, scheme)
+            cost = pace.cost
+            per_core = cost.steps / cost.cpu_s
+            rows.append(
+                (
+                    scheme,
+                    f"{count}",
+                    f"{load.rate_hz:.0f}" if _carries(load, pace) else "-",
+                    f"{count * load.rate_hz:,.0f}",
+                    f"{cost.steps / cost.real_s:,.0f}",
+                    f"{1e3 * statistics.median(pace.answers_s):.1f}",
+                    f"{1e3 * pace.p99_s:.1f}",
+                    f"{100 * pace.held / max(1, len(pace.answers_s) + pace.held):.1f}",
+                    f"{pace.us:.0f}",
+                    f"{1e6 * cost.main_s / cost.steps:.0f}",
+                    f"{per_core:,.0f}",
+                )
+            )
+    return Table(
+        "hub: robots times rate that one world-sim carries on the wall",
+        (
+            "link",
+            "robots",
+            "highest rate, Hz",
+            "asked, robot-ticks/s",
+            "done/s",
+            "answer p50, ms",
+            "p99, ms",
+            "held, %",
+            "hub CPU, us/robot-tick",
+            "of that its loop",
+            "robot-ticks per CPU second",
+        ),
+        rows,
+        (
+            f"rates tried: {', '.join(f'{rate:g}' for rate in RATES_HZ)} Hz, {MEASURED_S:g} s each;",
+            "carried: p99 of answers below a period, and 95 % of the steps done;",
+            "robots share the machine with the hub: the rate is what both together reach.",
+        ),
+    )
+
+
+def _highest(count: int, scheme: str) -> tuple[Load, Pace]:
+    """The highest rate that is carried; or the lowest, if none is. It starts where a core would do it."""
+    tried: dict[int, tuple[Load, Pace]] = {}
+
+    def attempt(rung: int) -> bool:
+        load = Load(count, RATES_HZ[rung], scheme)
+        tried[rung] = load, _mission(load)
+        return _carries(*tried[rung])
+
+    rung = min(range(len(RATES_HZ)), key=lambda i: abs(math.log(RATES_HZ[i] * count / 2000.0)))
+    if attempt(rung):
+        while rung + 1 < len(RATES_HZ) and attempt(rung + 1):
+            rung += 1
+        return tried[rung]
+    while rung and not attempt(rung - 1):
+        rung -= 1
+    return tried[max(0, rung - 1)]
+
+
+def _carries(load: Load, pace: Pace) -> bool:
+    done = pace.cost.steps / pace.cost.real_s
+    return pace.p99_s < 1.0 / load.rate_hz and done > 0.95 * load.count * load.rate_hz
+
+
+def _mission(load: Load) -> Pace:
+    """A mission with the hub in one process and the robots in a few."""
+    context = get_context("forkserver")
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
+        place = Path(folder)
+        endpoint = _endpoint(load, place)
+        names = _scenario(load).robot_ids
+        pipes = [_start(stack, context, _be_hub, load, endpoint, place)]
+        for first in range(0, load.count, ROBOTS_PER_PROCESS):
+            some = names[first : first + ROBOTS_PER_PROCESS]
+            pipes.append(_start(stack, context, _be_robots, some, endpoint, place))
+        cost = _told(pipes[0], load)
+        parts = []
+        for pipe in pipes[1:]:
+            pipe.send(None)  # whoever has lost the last word from the hub ends as well
+            parts.append(_told(pipe, load))
+    answers_s = [answer for part, _ in parts for answer in part]
+    return Pace(cost, answers_s, sum(held for _, held in parts))
+
+
+def _told(pipe: Connection, load: Load) -> Any:
+    if not pipe.poll(START_S + WARM_S + MEASURED_S):
+        raise RuntimeError(f"{load}: it does not come to an end")
+    return pipe.recv()
+
+
+def _start(
+    stack: ExitStack, context: object, target: Callable[..., None], *arguments: object
+) -> Connection:
+    ours, theirs = context.Pipe()  # type: ignore[attr-defined]
+    process = context.Process(target=target, args=(*arguments, theirs))  # type: ignore[attr-defined]
+    process.start()
+    theirs.close()
+    stack.callback(process.join, 5.0)
+    stack.callback(process.kill)
+    return ours
+
+
+SCHEMES = ("tcp",)
+
+
+def _endpoint(load: Load, place: Path) -> str:
+    """Where the hub listens; identities of everybody are in the folder then."""
+    credentials.issue(place, FLEET, _scenario(load).robot_ids)
+    return bus.free_endpoint()
+
+
+def _scenario(load: Load) -> Scenario:
+    """Robots anywhere in a domain with many clusters of samples."""
+    range_m = math.sqrt(DEGREE * SIDE_M**2 / max(1, load.count - 1) / math.pi)
+    centres_m = [SIDE_M * (i + 0.5) / CLUSTERS for i in range(CLUSTERS)]
+    density = [
+        {"mean_m": [x_m, y_m], "variance_m2": [40_000.0, 40_000.0]}
+        for x_m in centres_m
+        for y_m in centres_m
+    ]
+    tree = to_tree(find("fleet"))
+    tree |= {
+        "name": "hub",
+        "domain": {"min_m": [0.0, 0.0], "max_m": [SIDE_M, SIDE_M]},
+        "robots": {"count": load.count},
+        "starts": {"random": True},
+        "samples": {"count": 100 * load.count},
+        "energy": {"points": 2_000_000, "steps": 2_000_000},
+        "radio": {"range_m": range_m},
+        "density": density,
+        "metrics": {},
+        "clock": {"period_s": PERIOD_S, "spread": 0.05, "jitter_s": 0.05},
+        "limit_s": (WARM_S + MEASURED_S) * PERIOD_S * load.rate_hz,
+    }
+    return from_tree(tree, "hub")
+
+
+# The hub's process.
+
+
+def _be_hub(load: Load, endpoint: str, place: Path, pipe: Connection) -> None:
+    bus.init_log()
+    scenario, folder = _scenario(load), place / "run"
+    folder.mkdir()
+    plan = Plan(scenario, 0, Site.of(scenario, 0), "wall", load.rate_hz * PERIOD_S)
+    recording = Recording(scenario, 0, "wall", folder, speed=plan.speed)
+    meter = _Meter(lambda: recording.metrics.steps)
+    users, host = credentials.users_file(place), credentials.find(place, credentials.HOST)
+    with bus.Host(host, endpoint, users, scenario.roster) as router:
+        result = run(router, plan, recording, lambda: False, meter.look)
+        if result.violations:
+            raise RuntimeError(f"{load}: {result.complaints[0]}")
+        pipe.send(meter.cost)
+
+
+class _Meter:
+    """What the hub has spent between the end of the warm-up and its last word to observers."""
+
+    def __init__(self, steps: Callable[[], int]) -> None:
+        self._steps = steps
+        self._seen: list[Cost] = []
+
+    def look(self, progress: object) -> None:
+        """Whenever observers are told."""
+        if getattr(progress, "phase", "") == "running":
+            reading = Cost(
+                self._steps(), time.process_time(), time.thread_time(), time.monotonic()
+            )
+            if not self._seen or reading.real_s > self._seen[0].real_s + WARM_S:
+                self._seen.append(reading)
+
+    @property
+    def cost(self) -> Cost:
+        """Between the first and the last look that count."""
+        _, first, *_, last = self._seen
+        return Cost(*(b - a for a, b in zip(first, last, strict=True)))
+
+
+# The robots' processes.
+
+
+def _be_robots(names: Sequence[str], endpoint: str, place: Path, pipe: Connection) -> None:
+    os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
+    bus.init_log()
+    with ExitStack() as stack:
+        robots = [stack.enter_context(_robot(name, endpoint, place)) for name in names]
+        gc.freeze()
+        while not pipe.poll():
+            acted = [robot.act() for robot in robots]
+            if not any(acted):
+                time.sleep(POLL_S)
+        pipe.send(([answer for r in robots for answer in r.answers_s], sum(r.held for r in robots)))
+        os._exit(0)  # closing a hundred sessions one by one takes longer than the mission
+
+
+@contextmanager
+def _robot(name: str, endpoint: str, place: Path) -> "Iterator[_Robot]":
+    nonce = f"{os.getpid()}-{threading.get_native_id()}"
+    with bus.line(endpoint, credentials.find(place, name), nonce, START_S) as line:
+        yield _Robot(line, name)
+
+
+class _Robot:
+    """A participant on the wall in a loop that it shares; without a diary on disk."""
+
+    def __init__(self, line: bus.Line, name: str) -> None:
+        self._line, self._name = line, name
+        self._life: Life | None = None
+        self._go: Go | None = None
+        self._inbox: list[Envelope] = []
+        self._said_s = 0.0
+        self._waits = False
+        self.answers_s: list[float] = []
+        self.held = 0
+        self.over = False
+
+    def act(self) -> bool:
+        """Take what has come, and step if that is due; whether there was anything to do."""
+        busy = False
+        while (payload := self._line.next(0.0)) is not None:
+            self._take(decode_to_participant(payload))
+            busy = True
+        if self._life is not None and self._go is not None and not self.over:
+            busy = self._step(self._life) or busy
+        return busy
+
+    def _take(self, message: object) -> None:
+        if isinstance(message, Mission):
+            self._prepare(message)
+        elif isinstance(message, Go):
+            self._start(message)
+        elif isinstance(message, Turn) and self._life is not None:
+            self._inbox += message.inputs.inbox
+            self._observation = message.inputs.observation
+            if self._waits and self._observation.step == self._life.step_count:
+                self._waits = False
+                self.answers_s.append(time.monotonic() - self._said_s)
+        elif isinstance(message, Stop):
+            self.over = True
+
+    def _prepare(self, mission: Mission) -> None:
+        scenario, i = mission.scenario, mission.scenario.robot_ids.index(self._name)
+        pose = Pose(*mission.starts.open("<f8", 2)[i].tolist())
+        samples_m = mission.samples.open("<f8", 2)
+
+        def build(body: Body) -> Agent:
+            return Agent(self._name, scenario, mission.seed, body, samples_m)
+
+        self._life = Life(build, Memory(), mission.body or Body(pose))
+        self._clock = clocks(scenario, mission.seed)[self._name]
+        self._line.send(encode(Ready(VERSION, self._line.nonce)), patiently=True)
+
+    def _start(self, go: Go) -> None:
+        assert go.observation is not None
+        self._go, self._observation = go, go.observation
+        self._origin_ns = time.monotonic_ns() - round(go.now_ns / go.speed)
+        self._ordinal = 1
+        self._skip(go.now_ns)
+
+    def _skip(self, now_ns: int) -> None:
+        while self._clock.due_ns(self._ordinal) <= now_ns:
+            self._ordinal += 1
+
+    def _step(self, life: Life) -> bool:
+        assert self._go is not None
+        now_ns = round((time.monotonic_ns() - self._origin_ns) * self._go.speed)
+        if now_ns < self._clock.due_ns(self._ordinal):
+            if self._waits and time.monotonic() - self._said_s > AGAIN_S:
+                self._say()
+            return False
+        self._skip(now_ns)
+        if self._waits:
+            self.held += 1
+            return False
+        inputs = Inputs(now_ns, self._observation, tuple(self._inbox))
+        self._inbox.clear()
+        outputs = life.step(inputs)
+        heard = tuple((envelope.source, envelope.sequence) for envelope in inputs.inbox)
+        self._report = encode(
+            Report(
+                VERSION, self._line.nonce, outputs, inputs.now_ns, heard, inputs.observation.step
+            )
+        )
+        self._said_s, self._waits = time.monotonic(), True
+        self._say()
+        pose = PoseMessage(VERSION, outputs.step, now_ns, outputs.pose)
+        self._line.publish_pose(encode(pose))
+        if outputs.weights:
+            self._line.publish_weights(outputs.weights)
+        return True
+
+    def _say(self) -> None:
+        self._line.send(self._report, patiently=False)
