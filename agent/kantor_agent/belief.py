@@ -7,7 +7,6 @@ import numpy.typing as npt
 
 from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
 from kantor_protocol.kernels import kernel
-from kantor_protocol.messages import News
 from kantor_protocol.packing import pack_pairs
 from kantor_protocol.registers import Registers
 from kantor_protocol.replica import LOWERED, NOBODY, Manner, Replica, Store, spend
@@ -189,15 +188,10 @@ class Belief:
         found = nearest(self.grid, x_m, y_m, _NO_SKIP, np.zeros(count), near)
         return near[:found]
 
-    def learn(self, source: int, news: News) -> bool:
-        """Take in what another participant sent; False when it is malformed."""
-        taken = self.replica.learn(source, news.have, news.logs, news.claims, news.registers)
-        if self._store is not self.replica.store:
-            self._follow_store()
-        return taken
-
     def advance(self, now_ns: int) -> None:
         """Bring walking samples to `now_ns` and drop those that messages have emptied."""
+        if self._store is not self.replica.store:  # it has learned more than there was room for
+            self._follow_store()
         if self._walk.advance(now_ns):
             build(self.grid, self.weights)
             return
@@ -212,7 +206,3 @@ class Belief:
             self._follow_store()
             used = _ship_packed(*self._to_ship, x_m, y_m)
         return self._packed[:used].tobytes()
-
-    def lowered(self) -> bytes:
-        """Packed pairs (sample, units left) of what fell in this step."""
-        return self.replica.packed_lowered()

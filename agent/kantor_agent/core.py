@@ -52,7 +52,7 @@ class Agent:
             Purpose.SAMPLE_WALK,
             most_steps=_WALK_STEPS_MAX,
         )
-        self._belief = Belief(walk, units, replica)
+        self._replica, self._belief = replica, Belief(walk, units, replica)
         self._radio = Radio(me, scenario, body.epoch)
         self._planner = PLANNERS[scenario.planner.name](scenario)
         self._vehicle = VEHICLES[scenario.vehicle.name](scenario.vehicle)
@@ -68,7 +68,7 @@ class Agent:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the class."""
-        self._radio.hear(inputs.inbox, self._belief.learn)
+        self._radio.hear(inputs.inbox, self._replica.learn)
         self._locate(inputs.observation)
         self._belief.advance(inputs.now_ns)
         elapsed_ns = max(0, min(inputs.now_ns - self._now_ns, self._period_ns))
@@ -96,16 +96,14 @@ class Agent:
         return self._belief.spend(self._pose.x_m, self._pose.y_m)
 
     def _publish(self, spent: bytes) -> Outputs:
-        state = self._state
+        state, replica = self._state, self._replica
         if state is not State.EXPLORING:
             self._goal = None
-            self._belief.replica.claim(NOBODY, self._now_ns)
-        lowered = self._belief.lowered()
-        weights = self._publisher.step(
-            self._belief.replica.lowered(), last=state is not State.EXPLORING
-        )
-        envelope = self._radio.say(self._belief.replica, self._step, self._pose)
-        self._belief.replica.end_step()
+            replica.claim(NOBODY, self._now_ns)
+        lowered = replica.packed_lowered()
+        weights = self._publisher.step(replica.lowered(), last=state is not State.EXPLORING)
+        envelope = self._radio.say(replica, self._step, self._pose)
+        replica.end_step()
         return Outputs(
             step=self._step,
             pose=self._pose,

@@ -18,7 +18,6 @@ from kantor_agent.vehicles import LATER_NS, VEHICLES
 from kantor_protocol.evidence import Evidence, entries, void
 from kantor_protocol.grid import NOWHERE, Frame
 from kantor_protocol.machine import Body, Inputs, Observation, Outputs, ParticipantId, Pose, State
-from kantor_protocol.messages import News
 from kantor_protocol.radio import Radio, replica_of
 from kantor_protocol.scenario import Scenario
 
@@ -69,7 +68,7 @@ class Mapper:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the module."""
-        self._radio.hear(inputs.inbox, self._learn)
+        self._radio.hear(inputs.inbox, self._replica.learn)
         self._locate(inputs.observation)
         elapsed_ns = max(0, min(inputs.now_ns - self._now_ns, self._period_ns))
         self._now_ns, self._step = inputs.now_ns, self._step + 1
@@ -85,9 +84,6 @@ class Mapper:
     @property
     def _tick(self) -> int:
         return self._now_ns // self._period_ns
-
-    def _learn(self, source: int, news: News) -> bool:
-        return self._replica.learn(source, news.have, news.logs, news.claims, news.registers)
 
     def _locate(self, observation: Observation) -> None:
         """Take the pose that the world accepted. A late word on an older step changes nothing."""

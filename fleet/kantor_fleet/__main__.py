@@ -56,7 +56,7 @@ def worldsim(
     *,
     listen: str = "tcp/127.0.0.1:7447",
     credentials: Path = Path("credentials"),
-    fleet: str = "kantor",
+    fleet: str | None = None,
     seed: int = 0,
     exchange: Literal["lockstep", "wall"] = "wall",
     speed: float = 1.0,
@@ -71,9 +71,10 @@ def worldsim(
 
     Args:
         scenario: A packaged name or a TOML file.
-        listen: Endpoint of the bus, tcp/HOST:PORT.
-        credentials: Folder of the identities; world-sim writes what is missing.
-        fleet: Name of the fleet in every key.
+        listen: Endpoint of the bus: tcp/HOST:PORT for passwords, tls/HOST:PORT for certificates.
+        credentials: tcp: folder of the passwords; world-sim writes what is missing. tls: what `kantor keys` has
+            made, the folder or world-sim's file.
+        fleet: Name of the fleet in every key, `kantor` by default; certificates are of a fleet already.
         seed: Decides every draw.
         exchange: lockstep: step by step together. wall: every robot on its own clock.
         speed: wall only: simulated seconds in a real one.
@@ -113,7 +114,7 @@ def agent(
 
     Args:
         id: Which robot, such as r1.
-        connect: World-sim's endpoint, tcp/HOST:PORT.
+        connect: World-sim's endpoint, tcp/HOST:PORT or tls/HOST:PORT.
         credentials: The credentials folder, or this robot's file.
         state: Folder of its diary; started again with it, the robot goes on where it was.
         patience: Seconds to wait for world-sim to come up.
@@ -135,7 +136,7 @@ def supervisor(
     """The supervisor by hand, for centralized scenarios.
 
     Args:
-        connect: World-sim's endpoint, tcp/HOST:PORT.
+        connect: World-sim's endpoint, tcp/HOST:PORT or tls/HOST:PORT.
         credentials: The credentials folder, or the supervisor's file.
         state: Folder of its diary.
         patience: Seconds to wait for world-sim to come up.
@@ -378,7 +379,7 @@ def tap(
     """Print what goes over the bus, decoded; it reads and never writes.
 
     Args:
-        connect: World-sim's endpoint, tcp/HOST:PORT.
+        connect: World-sim's endpoint, tcp/HOST:PORT or tls/HOST:PORT.
         credentials: The credentials folder, or the observer's file.
         only: Kinds to print: pose, weights, tx, rx, world; by default all.
         count: Stop after so many messages; 0: never.
@@ -387,6 +388,49 @@ def tap(
     from kantor_fleet.tap import tap as tap_bus  # noqa: PLC0415
 
     return tap_bus(connect, credentials, frozenset(only), count, patience)
+
+
+def keys(
+    fleet: Annotated[str, tyro.conf.Positional],
+    /,
+    *,
+    robots: int = 0,
+    supervisor: bool = False,
+    host: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    site: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    days: int = 365,
+    renew: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    revoke: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    list: bool = False,  # noqa: A002  the flag is --list
+    out: Path = Path("keys"),
+) -> int:
+    """Make a fleet's certificates: its private authority, once, and a file for each member.
+
+    Run again it keeps what there is and adds what is missing. Hand each file to whoever runs that member, and to
+    nobody else; authority.toml stays. What has changed in the register reaches world-sim with worldsim.toml.
+
+    Args:
+        fleet: Name of the fleet in every key.
+        robots: Robots r1 to r<robots>; those that there are stay.
+        supervisor: Also the supervisor.
+        host: A name or an address by which others reach world-sim, or a site's router: north=10.0.0.5. Any number
+            of times. Each has localhost, 127.0.0.1, ::1 and its id anyway.
+        site: A site and the robots that stand behind it, such as north=r1,r2,r3; any number of times.
+        days: How long the new certificates count.
+        renew: Make a new certificate for this member; the old one ceases to count. Any number of times.
+        revoke: This member's certificate ceases to count. Any number of times.
+        list: Say which certificates there are, and until when they count; nothing is made.
+        out: The folder.
+    """
+    from kantor_fleet.authority import Wanted, issue, listing, today  # noqa: PLC0415
+
+    if list:
+        lines = listing(out, fleet, today())
+    else:
+        wanted = Wanted(fleet, robots, supervisor, host, site, days, renew, revoke)
+        lines = issue(out, wanted, today())
+    print("\n".join(lines))
+    return Exit.DONE
 
 
 VERBS: dict[str, Callable[..., int]] = {
@@ -401,6 +445,7 @@ VERBS: dict[str, Callable[..., int]] = {
     "verify": verify,
     "reproduce": reproduce,
     "tap": tap,
+    "keys": keys,
 }
 
 

@@ -1,14 +1,15 @@
 """Processes started one by one, each in its own terminal or on its own machine."""
 
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from kantor_fleet.exits import Exit, fail, warn
 from kantor_fleet.interrupts import Interrupts
 from kantor_protocol import bus, credentials
-from kantor_protocol.credentials import FLEET_PATTERN, Identity
-from kantor_protocol.machine import ParticipantId
+from kantor_protocol.credentials import FLEET_PATTERN, Certificate, CredentialsError, Identity
+from kantor_protocol.machine import SUPERVISOR, ParticipantId
 from kantor_protocol.process import NotWantedError, StateError
 from kantor_protocol.scenario import Scenario
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from kantor_worldsim.plan import Plan
     from kantor_worldsim.recording import Past, Recording
 
+_FLEET = "kantor"
 RunParticipant = Callable[[str, Identity, float, Callable[[str], None], Path], str]
 
 
@@ -26,7 +28,7 @@ def host_by_hand(
     speed: float,
     listen: str,
     secrets: Path,
-    fleet: str,
+    fleet: str | None,
     start_after_s: float | None,
     out: Path,
     exact_every: int | None,
@@ -48,7 +50,7 @@ def host_by_hand(
     return _host(plan, listen, secrets, fleet, record)
 
 
-def resume_by_hand(folder: Path, listen: str, secrets: Path, fleet: str) -> Exit:
+def resume_by_hand(folder: Path, listen: str, secrets: Path, fleet: str | None) -> Exit:
     """World-sim in this terminal, for a run that was cut short. Raises BusError, OSError."""
     from kantor_worldsim.plan import Plan  # noqa: PLC0415
     from kantor_worldsim.recording import Past, Recording, ResumeError  # noqa: PLC0415
@@ -80,7 +82,7 @@ def _host(
     plan: "Plan",
     listen: str,
     secrets: Path,
-    fleet: str,
+    fleet: str | None,
     record: "Callable[[], tuple[Path, Recording]]",
     past: "Past | None" = None,
 ) -> Exit:
@@ -91,27 +93,60 @@ def _host(
     from kantor_worldsim.process import run  # noqa: PLC0415
 
     scenario = plan.scenario
-    if not FLEET_PATTERN.fullmatch(fleet):
-        fail(Exit.USAGE, f"--fleet {fleet}: use lower-case letters, digits and dashes")
-    bus.check_endpoint(listen)
-    if secrets.is_file() or 'certificate = ' in (secrets / "worldsim.toml").read_text() if (secrets / "worldsim.toml").exists() or secrets.is_file() else False:
-        identities = {credentials.HOST: credentials.find(secrets, credentials.HOST)}
-    else:
-        identities = credentials.issue(secrets, fleet, scenario.roster)
-    bus.init_log()
-    with Interrupts() as interrupts, ProgressView(scenario.name) as view:
+    identity = _host_identity(listen, secrets, fleet, scenario)
+    with (
+        bus.host_log(identity, lambda line: view.note(line)),  # noqa: PLW0108  view comes later
+        Interrupts() as interrupts,
+        ProgressView(scenario.name) as view,
+    ):
         warm_up()
         users = credentials.users_file(secrets)
-        with bus.Host(identities[credentials.HOST], listen, users, scenario.roster) as host:
+        with bus.Host(identity, listen, users, scenario.roster, view.note) as host:
             folder, recording = record()
-            view.note(f"world-sim of fleet {fleet} at {listen}, credentials in {secrets}/")
+            view.note(f"world-sim of fleet {identity.fleet} at {listen}, credentials in {secrets}")
             for name in scenario.roster:
                 verb = name if name == "supervisor" else f"agent {name}"
                 view.note(f"  kantor {verb} --connect {listen} --credentials {secrets}")
-            run(host, plan, recording, interrupts, view.show, past)
+            run(host, plan, recording, interrupts, view.show, past, say=view.note)
     conclude(folder)
     result = read_result(folder)
     return interrupts.code or (verdict(result) if result is not None else Exit.PROCESS_FAILED)
+
+
+def _host_identity(listen: str, place: Path, fleet: str | None, scenario: Scenario) -> Identity:
+    """World-sim's identity, for a mission with this roster. Raises BusError, CredentialsError.
+
+    Passwords are made here; certificates never are.
+    """
+    if not bus.is_tls(listen):
+        name = fleet or _FLEET
+        if not FLEET_PATTERN.fullmatch(name):
+            fail(Exit.USAGE, f"--fleet {name}: use lower-case letters, digits and dashes")
+        return credentials.issue(place, name, scenario.roster)[credentials.HOST]
+    identity = credentials.find(place, credentials.HOST)
+    bus.check_endpoint(listen, identity)
+    if not isinstance(identity, Certificate):
+        raise TypeError(identity)  # pragma: no cover  check_endpoint has refused it
+    if fleet not in {None, identity.fleet}:
+        fail(
+            Exit.USAGE, f"--fleet {fleet}: {place} is of fleet {identity.fleet}; leave --fleet out"
+        )
+    _check_register(identity, scenario, place)
+    warn(identity.warnings((*scenario.roster, credentials.OBSERVER), datetime.now(UTC)))
+    return identity
+
+
+def _check_register(identity: Certificate, scenario: Scenario, place: Path) -> None:
+    """Everybody who takes part must have a certificate, or have had one. Raises CredentialsError."""
+    withdrawn = {name.partition(".")[0] for name in identity.revoked}
+    missing = [name for name in scenario.roster if name not in identity.members]
+    for name in missing:
+        if name not in withdrawn:
+            wanted = "--supervisor" if name == SUPERVISOR else f"--robots {len(scenario.robot_ids)}"
+            raise CredentialsError(
+                f"{place}: the register has no {name}; `kantor keys {identity.fleet} {wanted}`"
+            )
+    warn(f"{name} is revoked and will not be let in" for name in missing)
 
 
 def participate_by_hand(
@@ -123,9 +158,8 @@ def participate_by_hand(
     state: Path,
 ) -> Exit:
     """A participant in this terminal. Raises BusError, CredentialsError."""
-    bus.check_endpoint(connect)
-    # A robot may start before world-sim, which writes the credentials: look for them when it is up.
-    if not place.exists() or place.is_dir():
+    # A robot may start before world-sim, which writes the passwords: look for them when it is up.
+    if not bus.is_tls(connect) and (not place.exists() or place.is_dir()):
         bus.await_endpoint(connect, patience_s)
     identity = credentials.find(place, name)
     bus.init_log()

@@ -27,13 +27,13 @@ from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.log import log_to
 from kantor_protocol import bus, credentials, diary, keys
 from kantor_protocol.credentials import Identity
-from kantor_protocol.faults import Late
 from kantor_protocol.machine import SUPERVISOR, ParticipantId
 from kantor_protocol.messages import Progress, RefusedError, decode_progress
 from kantor_protocol.process import NotWantedError, StateError
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.hands import Hands
 from kantor_worldsim.hands import Order as Deed
+from kantor_worldsim.plan import Plan, late
 from kantor_worldsim.recording import RESULT
 
 FLEET = "kantor"
@@ -92,13 +92,11 @@ class Fleet:
         self._frozen: set[ParticipantId] = set()
         self._impostors: dict[ParticipantId, tuple[ForkServerProcess, float]] = {}
         self.world_sim = self._start_world_sim(resume=False)
-        late = {
-            name for fault in order.scenario.faults if isinstance(fault, Late) for name in fault.who
-        }
+        absent = set(late(order.scenario))
         self.participants: dict[ParticipantId, ForkServerProcess] = {
             name: self._start_participant(name, name)
             for name in order.scenario.roster
-            if name not in late
+            if name not in absent
         }
 
     def _start(self, name: str, target: object, *arguments: object) -> ForkServerProcess:
@@ -332,7 +330,6 @@ def _be_world_sim(
     resume: bool,  # noqa: FBT001  a target of a process
     stopping: bool,  # noqa: FBT001
 ) -> None:
-    from kantor_worldsim.plan import Plan  # noqa: PLC0415  the fork server has it
     from kantor_worldsim.process import run  # noqa: PLC0415  the fork server has it
     from kantor_worldsim.recording import (  # noqa: PLC0415
         OverError,
@@ -374,7 +371,9 @@ def _be_world_sim(
                     past=past,
                 )
                 say(f"run {recording.run}" + (", resumed" if past is not None else ""))
-                result = run(host, plan, recording, interrupts, past=past, hands=_hands(pipe))
+                result = run(
+                    host, plan, recording, interrupts, past=past, hands=_hands(pipe), say=say
+                )
         except bus.BusError as error:
             say(str(error))
             sys.exit(Exit.UNREACHABLE)

@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-from kantor_fleet.exits import Exit
+from kantor_fleet.exits import Exit, fail
 from kantor_fleet.interrupts import Interrupts
 from kantor_protocol import bus, credentials
+from kantor_protocol.credentials import Certificate
 
 _LOOK_S = 0.2
 """From one look at the connection to the next."""
@@ -12,13 +13,15 @@ _LOOK_S = 0.2
 
 def serve(name: str, connect: str, listen: str, place: Path, patience_s: float) -> Exit:
     """Serve the site until a signal comes. Raises BusError, CredentialsError."""
-    bus.check_endpoint(connect)
-    bus.check_endpoint(listen)
     identity = credentials.find(place, f"site-{name}")
-    bus.init_log()
+    for endpoint in (connect, listen):
+        bus.check_endpoint(endpoint, identity)
+    if not isinstance(identity, Certificate):
+        fail(Exit.USAGE, f"{place}: a password; a site needs a certificate of `kantor keys --site`")
     with (
+        bus.host_log(identity, _say),
         Interrupts() as interrupts,
-        bus.Site(identity, connect, listen, patience_s) as site,
+        bus.Site(identity, connect, listen, patience_s, _say) as site,
     ):
         _say(f"site {name} at {listen}, for {', '.join(site.members)}")
         connected = False

@@ -7,7 +7,7 @@ from kantor_agent.core import Agent
 from kantor_agent.mapper import Mapper
 from kantor_protocol.faults import Kill
 from kantor_protocol.life import Mortal
-from kantor_protocol.machine import SUPERVISOR, Body, ParticipantId, Pose, StateMachine
+from kantor_protocol.machine import SUPERVISOR, Body, ParticipantId, StateMachine
 from kantor_protocol.scenario import Scenario
 from kantor_supervisor.allocation import Allocation
 from kantor_supervisor.core import Supervisor
@@ -20,17 +20,16 @@ def team(scenario: Scenario, seed: int, site: Site) -> dict[ParticipantId, State
     """Everybody in the roster; whom the scenario has killed can be killed."""
     killed = {name for fault in scenario.faults if isinstance(fault, Kill) for name in fault.who}
     made: dict[ParticipantId, StateMachine] = {}
-    for name in scenario.roster:
-        build = partial(participant, name, scenario, seed, site)
-        made[name] = Mortal(build, _at_start(name, scenario, site)) if name in killed else build()
+    for name, pose in site.poses(scenario).items():
+        build, body = partial(participant, name, scenario, seed, site), Body(pose)
+        made[name] = Mortal(build, body) if name in killed else build(body)
     return made
 
 
 def participant(
-    name: ParticipantId, scenario: Scenario, seed: int, site: Site, body: Body | None = None
+    name: ParticipantId, scenario: Scenario, seed: int, site: Site, body: Body
 ) -> StateMachine:
-    """One participant as it takes over a body, by default its own at time 0."""
-    body = body or _at_start(name, scenario, site)
+    """One participant as it takes over a body."""
     frame = site.ground.frame if site.ground is not None else None
     if name == SUPERVISOR:
         if frame is not None:
@@ -39,13 +38,6 @@ def participant(
     if frame is not None:
         return Mapper(name, scenario, seed, body, frame)
     return Agent(name, scenario, seed, body, site.samples_m)
-
-
-def _at_start(name: ParticipantId, scenario: Scenario, site: Site) -> Body:
-    if name == SUPERVISOR:
-        return Body(Pose(*scenario.supervisor_m))
-    x_m, y_m = site.starts_m[scenario.robot_ids.index(name)].tolist()
-    return Body(Pose(x_m, y_m))
 
 
 def play(

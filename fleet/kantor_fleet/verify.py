@@ -35,13 +35,10 @@ def verify(folder: Path) -> Exit:
     return Exit.DONE if all(held for held, _ in found) else Exit.NOT_MET
 
 
-def verdicts(folder: Path) -> "list[Verdict]":
-    """A verdict on each thing that can be verified."""
+def verdicts(folder: Path, records: list[tuple[bytes, Record]] | None = None) -> "list[Verdict]":
+    """A verdict on each thing that can be verified. records: the journal, if it has been read."""
     manifest = _manifest(folder)
-    try:
-        records = list(read(folder / JOURNAL))
-    except FileNotFoundError:
-        fail(Exit.USAGE, f"{folder / JOURNAL}: no such file; give a folder that a run left")
+    records = _journal(folder) if records is None else records
     if not records or not isinstance(records[0][1], Opening):
         return [(False, f"{JOURNAL}: no opening record in it")]
     found = list(_verdicts_on_file(folder, manifest, records))
@@ -70,6 +67,13 @@ def _manifest(folder: Path) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("format") != 1:
         fail(Exit.USAGE, f"{path}: written by another version; verify it with that one")
     return manifest
+
+
+def _journal(folder: Path) -> list[tuple[bytes, Record]]:
+    try:
+        return list(read(folder / JOURNAL))
+    except FileNotFoundError:
+        fail(Exit.USAGE, f"{folder / JOURNAL}: no such file; give a folder that a run left")
 
 
 Verdict = tuple[bool, str]

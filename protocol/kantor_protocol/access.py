@@ -15,7 +15,9 @@ class Grant(NamedTuple):
     """Something that a subject may do, seen from the router that enforces it."""
 
     flow: Literal["ingress", "egress"]
-    message: Literal["put", "declare_subscriber", "liveliness_token"]
+    message: Literal[
+        "put", "declare_subscriber", "liveliness_token", "query", "reply", "declare_queryable"
+    ]
     keys: tuple[str, ...]
 
     @property
@@ -38,6 +40,16 @@ def observer(fleet: str) -> Grants:
     return (
         Grant("ingress", "declare_subscriber", everything),
         Grant("egress", "put", everything),
+    )
+
+
+def anybody(fleet: str) -> Grants:
+    """Whoever has a certificate of the fleet's authority, even if it is not let in, may ask why."""
+    door = (keys.door(fleet),)
+    return (
+        Grant("ingress", "query", door),
+        Grant("egress", "declare_queryable", door),
+        Grant("egress", "reply", door),
     )
 
 

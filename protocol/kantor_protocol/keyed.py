@@ -91,18 +91,3 @@ def uniform(seed: int, purpose: int, who: int, step: int, index: int) -> float:
 def generator(seed: int, purpose: Purpose) -> np.random.Generator:
     """Numpy's generator (Philox4x64) for draws that one process makes once, such as the samples."""
     return np.random.Generator(np.random.Philox(key=np.array([seed, purpose], dtype=np.uint64)))
-
-
-def philox_plain(seed: int, counter: tuple[int, int, int, int]) -> tuple[int, int, int, int]:
-    """Philox4x32-10 in plain integers, the reference of the compiled form."""
-    words, key = list(counter), [seed & 0xFFFFFFFF, seed >> 32]
-    for _ in range(10):
-        product_0, product_1 = 0xD2511F53 * words[0], 0xCD9E8D57 * words[2]
-        words = [
-            (product_1 >> 32) ^ words[1] ^ key[0],
-            product_1 & 0xFFFFFFFF,
-            (product_0 >> 32) ^ words[3] ^ key[1],
-            product_0 & 0xFFFFFFFF,
-        ]
-        key = [(key[0] + 0x9E3779B9) & 0xFFFFFFFF, (key[1] + 0xBB67AE85) & 0xFFFFFFFF]
-    return words[0], words[1], words[2], words[3]

@@ -6,6 +6,7 @@ kantor/v1/<fleet>/<id>/tx        participant -> world-sim
 kantor/v1/<fleet>/<id>/rx        world-sim -> participant
 kantor/v1/<fleet>/<id>/alive/<nonce>   liveliness token of one process
 kantor/v1/<fleet>/world/<name>   world-sim -> observers
+kantor/v1/<fleet>/door/<name>    asked by whoever has a certificate of that name; world-sim answers
 """
 
 from typing import NamedTuple
@@ -54,6 +55,11 @@ def alive(fleet: str, name: ParticipantId = "*", nonce: str = "*") -> str:
 def progress(fleet: str) -> str:
     """How the mission goes."""
     return f"{_ROOT}/{fleet}/{WORLD}/progress"
+
+
+def door(fleet: str, name: str = "*") -> str:
+    """Where the holder of a certificate asks whether it is let in."""
+    return f"{_ROOT}/{fleet}/door/{name}"
 
 
 def everything(fleet: str) -> str:

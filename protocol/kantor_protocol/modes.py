@@ -58,8 +58,15 @@ def visit_at(
 ) -> npt.NDArray[np.int64]:
     """(K * K,) what a visit at one place adds."""
     visited = np.zeros(modes * modes, dtype=np.int64)
-    cos_x, cos_y, sines = np.zeros(modes), np.zeros(modes), np.zeros(modes)
+    _visit_at(x_m, y_m, rectangle, np.zeros((3, modes)), visited)
+    return visited
+
+
+@kernel
+def _visit_at(
+    x_m: float, y_m: float, rectangle: np.ndarray, room: np.ndarray, visited: np.ndarray
+) -> None:
+    cos_x, cos_y, sines = room[0], room[1], room[2]
     harmonics(phase(x_m, rectangle[0], rectangle[2]), cos_x, sines)
     harmonics(phase(y_m, rectangle[1], rectangle[3]), cos_y, sines)
     visit(cos_x, cos_y, visited)
-    return visited

@@ -23,7 +23,7 @@ from kantor_protocol.clock import clocks
 from kantor_protocol.credentials import Identity
 from kantor_protocol.diary import DiaryFile
 from kantor_protocol.life import Life
-from kantor_protocol.machine import SUPERVISOR, Body, Envelope, Inputs, Outputs, Pose, StateMachine
+from kantor_protocol.machine import Body, Envelope, Inputs, Outputs, StateMachine
 from kantor_protocol.messages import (
     VERSION,
     Go,
@@ -164,11 +164,9 @@ class _Participant:
         self._mission, self._life, self._wall, self._owed = mission, None, None, None
         self._say(f"{self._me}: mission {mission.scenario.name}, seed {mission.seed}")
 
-    def _goes_as_far_as(self, body: Body | None) -> bool:
+    def _goes_as_far_as(self, body: Body) -> bool:
         life = self._life
-        if life is None or body is None:
-            return body is None
-        return (life.epoch, life.step_count) >= (body.epoch, body.step)
+        return life is not None and (life.epoch, life.step_count) >= (body.epoch, body.step)
 
     def _act(self) -> None:
         """Do what is due. Raises OSError if it cannot be noted."""
@@ -196,10 +194,9 @@ class _Participant:
         if self._diary is not None:
             self._diary.close()
         self._diary = DiaryFile(self._path, mission.run)
-        body = mission.body or Body(_start(mission, self._me))
-        self._life = Life(partial(self._build, mission), self._diary, body)
+        self._life = Life(partial(self._build, mission), self._diary, mission.body)
         if self._life.step_count:
-            came = "new incarnation" if self._life.epoch > body.epoch else "goes on"
+            came = "new incarnation" if self._life.epoch > mission.body.epoch else "goes on"
             self._say(f"{self._me}: {came}, epoch {self._life.epoch}, step {self._life.step_count}")
         self._tell_ready()
 
@@ -266,14 +263,6 @@ class _Participant:
         self._line.publish_pose(encode(PoseMessage(VERSION, outputs.step, now_ns, outputs.pose)))
         if outputs.weights:
             self._line.publish_weights(outputs.weights)
-
-
-def _start(mission: Mission, name: str) -> Pose:
-    """Where a participant is at time 0."""
-    if name == SUPERVISOR:
-        return Pose(*mission.scenario.supervisor_m)
-    x_m, y_m = mission.starts.open("<f8", 2)[mission.scenario.robot_ids.index(name)].tolist()
-    return Pose(x_m, y_m)
 
 
 class _Wall:

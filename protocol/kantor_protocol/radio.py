@@ -14,6 +14,9 @@ from kantor_protocol.weights import Units
 CONTACT_PERIODS = 8
 """Whoever was not heard for more of the own steps is out of contact."""
 
+Learn = Callable[[int, bytes, bytes, bytes, bytes], bool]
+"""Takes in a message by the slot of its sender and the parts of its News; see `Replica.learn`."""
+
 
 class Radio:
     """Turns what a replica has to say into envelopes, and envelopes into what it learns.
@@ -34,25 +37,24 @@ class Radio:
         self._unheard_steps = -patience_steps(me, scenario)  # the first word takes its time
         """Own steps since the supervisor was heard."""
 
-    def hear(self, inbox: Iterable[Envelope], learn: Callable[[int, News], bool]) -> None:
-        """Pass every sound message of a step on to `learn(slot of the sender, news)`; count the others."""
+    def hear(self, inbox: Iterable[Envelope], learn: Learn) -> None:
+        """Have every sound message of a step learned; count the others."""
         self._unheard_steps += 1
         for envelope in inbox:
             place = self._places.get(envelope.source)
             try:
-                taken = place is not None and self._take(place, decode_news(envelope.body), learn)
+                news = decode_news(envelope.body)
             except RefusedError:
-                taken = False
-            self.refused += not taken
-
-    def _take(self, place: int, news: News, learn: Callable[[int, News], bool]) -> bool:
-        slot = place + news.epoch * self._origins
-        if not learn(slot, news):
-            return False
-        if place == self._supervisor:
-            self._supervisor_slot = max(self._supervisor_slot, slot)
-            self._unheard_steps = 0
-        return True
+                place = None
+            if place is None:
+                self.refused += 1
+                continue
+            slot = place + news.epoch * self._origins
+            if not learn(slot, news.have, news.logs, news.claims, news.registers):
+                self.refused += 1
+            elif place == self._supervisor:
+                self._supervisor_slot = max(self._supervisor_slot, slot)
+                self._unheard_steps = 0
 
     def say(self, replica: Replica, step: int, pose: Pose) -> Envelope:
         """What whoever it talks to lacks."""

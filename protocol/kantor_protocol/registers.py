@@ -326,13 +326,13 @@ class Registers:
 
 
 @kernel
-def _find(content: np.ndarray, origins: int, wanted: int, register: np.ndarray) -> int:
+def _find(content: bytes, origins: int, wanted: int, register: np.ndarray) -> int:
     width = register.shape[0]
     at = 0
     for _ in range(origins):
         _stamp, at = take_uint(content, at)
     found = 0
-    while 0 <= at < content.shape[0]:
+    while 0 <= at < len(content):
         origin, stamp, numbers, at = _take_head(content, at, origins, width)
         for i in range(numbers):
             number, at = take_int(content, at)
@@ -348,5 +348,5 @@ def read_register(
 ) -> tuple[int, Register] | None:
     """Stamp and numbers of an origin's register in a message; stamp 0 if absent, None if malformed."""
     register = np.zeros(width, dtype=np.int64)
-    stamp = _find(np.frombuffer(content, dtype=np.uint8), origins, origin, register)
+    stamp = _find(content, origins, origin, register)
     return None if stamp < 0 else (stamp, register)

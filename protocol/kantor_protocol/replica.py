@@ -576,7 +576,6 @@ class Replica:
         """Have kernels work on the store as it is, with scratch for as many slots."""
         slots = self.slots
         self._out = np.zeros(20 * _ENTRIES_MAX + 120 * slots + 64, dtype=np.uint8)
-        self._taken = np.zeros(slots, dtype=np.int64)
         self._least = np.zeros(2 * slots, dtype=np.int32)
         self._fields = (*self.store, self._law)
 
@@ -595,29 +594,24 @@ class Replica:
         """Whether no sample has weight left in this participant's view."""
         return self.store.counters.item(_HOLDING) == 0
 
-    def entries(self, origin: int) -> list[tuple[int, int]]:
-        """The held log of an origin, as (sample, value); with min only the own log is held."""
-        row, length = (origin if self.manner.ledger else 0), int(self.store.length[origin])
-        return [(index, value) for index, value in self.store.logs[row, :length].tolist()]
-
     def learn(
         self, source: int, have: bytes, logs: bytes, claims: bytes, registers: bytes = b""
     ) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
-        told = self._told(have) if registers else 0
-        if registers and not self.registers.sound(registers, told):
-            return False
+        told = 0
+        if registers:
+            told = count_slots(have, self.manner.roster, 2 if self.manner.claims else 1)
+            if not self.registers.sound(registers, told):
+                return False
         outcome = _learn(*self._fields, have, logs, claims, source)
-        while outcome not in (_LEARNT, _MALFORMED):
+        while outcome != _LEARNT:
+            if outcome == _MALFORMED:
+                return False
             self._make_room(outcome)
             outcome = _learn(*self._fields, have, logs, claims, source)
-        if outcome == _LEARNT and registers:
+        if registers:
             self.registers.learn(source, registers, told)
-        return bool(outcome == _LEARNT)
-
-    def _told(self, have: bytes) -> int:
-        told: int = count_slots(have, self.manner.roster, 2 if self.manner.claims else 1)
-        return told
+        return True
 
     def _make_room(self, outcome: int) -> None:
         """What `_learn` asks for."""
@@ -674,13 +668,6 @@ class Replica:
         """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
         claim(self.store.claims, self.store.counters, self.manner.me, sample, now_ns)
 
-    def taken(self) -> npt.NDArray[np.int64]:
-        """Samples that others have claimed and this participant must leave; a view."""
-        if not self.manner.claims:
-            return self._taken[:0]
-        count = taken(self.store.claims, self.store.counters, self.manner.me, self._taken)
-        return self._taken[:count]
-
     def compose(self, target: int = NOBODY) -> tuple[bytes, bytes, bytes]:
         """(have, logs, claims) for one message to everybody, or to one participant."""
         end_of_have, end_of_logs, end = _compose(*self._fields, self._out, self._least, target)
@@ -698,8 +685,6 @@ class Replica:
 
     def packed_lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""
-        if not self.fell:
-            return b""
         store = self.store
         used = _pack_lowered(store.weights, store.lowered, store.counters, self._out)
         if used == _NO_ROOM_TO_PACK:
@@ -725,41 +710,6 @@ def _unclaimed(slots: int) -> npt.NDArray[np.int64]:
     claims = np.zeros((4, slots), dtype=np.int64)
     claims[_SAMPLE] = NOBODY
     return claims
-
-
-@kernel
-def _read_logs(logs: np.ndarray, rows: np.ndarray, valued: bool) -> int:
-    at = 0
-    row = 0
-    while at < logs.shape[0]:
-        origin, at = take_uint(logs, at)
-        start, at = take_uint(logs, at)
-        _span, at = take_uint(logs, at)
-        count, at = take_uint(logs, at)
-        index = 0
-        if at < 0 or start > LENGTH_MAX or count > logs.shape[0]:
-            return -1
-        for i in range(count):
-            step, at = take_int(logs, at)
-            value = 0
-            if valued:
-                value, at = take_uint(logs, at)
-            if at < 0:
-                return -1
-            index += step
-            rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3] = origin, start + i, index, value
-            row += 1
-    return row
-
-
-def read_logs(logs: bytes, *, valued: bool = True) -> npt.NDArray[np.int64] | None:
-    """The entries in a message, as rows (origin, position, sample, value); None if malformed.
-
-    valued: entries have values, see Manner. With min, positions count the entries that were sent, which may be fewer than the span.
-    """
-    rows = np.zeros((len(logs) + 1, 4), dtype=np.int64)
-    count = _read_logs(np.frombuffer(logs, dtype=np.uint8), rows, valued)
-    return None if count < 0 else rows[:count]
 
 
 @kernel

@@ -46,7 +46,9 @@ class Walk:
 
     def advance(self, now_ns: int) -> bool:
         """Bring `xy_m` to simulated time `now_ns`, never back; True if the points moved."""
-        due = now_ns // self._period_ns if self._diffusion_m > 0.0 else 0
+        if not self._diffusion_m > 0.0:
+            return False
+        due = now_ns // self._period_ns
         moved = due > self.steps
         if moved and self._most_steps is not None:
             due = min(due, self.steps + self._most_steps)

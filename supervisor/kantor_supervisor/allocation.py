@@ -11,7 +11,6 @@ from kantor_protocol.clock import clocks
 from kantor_protocol.evidence import entries
 from kantor_protocol.grid import Frame
 from kantor_protocol.machine import Body, Inputs, Outputs, ParticipantId, State
-from kantor_protocol.messages import News
 from kantor_protocol.radio import Radio, replica_of
 from kantor_protocol.scenario import Scenario
 
@@ -38,7 +37,7 @@ class Allocation:
     def step(self, inputs: Inputs, /) -> Outputs:
         """Take in what the robots sent, give targets, tell everybody what they lack."""
         self._step += 1
-        self._radio.hear(inputs.inbox, self._learn)
+        self._radio.hear(inputs.inbox, self._replica.learn)
         self._chart.fold(self._replica)
         tick = inputs.now_ns // self._period_ns
         for robot, task in self._dispatch.decide(*self._roll_call(tick), tick).items():
@@ -53,9 +52,6 @@ class Allocation:
         )
         self._replica.end_step()
         return outputs
-
-    def _learn(self, source: int, news: News) -> bool:
-        return self._replica.learn(source, news.have, news.logs, news.claims, news.registers)
 
     def _roll_call(self, tick: int) -> tuple[list[Member], list[int]]:
         """The robots in contact with the tasks that they have been given; the targets of the others."""

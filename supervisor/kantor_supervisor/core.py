@@ -5,7 +5,6 @@ It hears every robot, merges what they know by the mission's rule (eq. 8), and t
 """
 
 from kantor_protocol.machine import Body, Inputs, Outputs, ParticipantId, State
-from kantor_protocol.messages import News
 from kantor_protocol.radio import Radio, replica_of
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.weights import Units, WeightsPublisher
@@ -29,7 +28,7 @@ class Supervisor:
     def step(self, inputs: Inputs, /) -> Outputs:
         """Take in what the robots sent, tell everybody what they lack."""
         self._step += 1
-        self._radio.hear(inputs.inbox, self._learn)
+        self._radio.hear(inputs.inbox, self._replica.learn)
         finished = self._replica.empty
         outputs = Outputs(
             step=self._step,
@@ -42,6 +41,3 @@ class Supervisor:
         )
         self._replica.end_step()
         return outputs
-
-    def _learn(self, source: int, news: News) -> bool:
-        return self._replica.learn(source, news.have, news.logs, news.claims, news.registers)

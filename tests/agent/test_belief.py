@@ -10,11 +10,11 @@ from scipy.optimize import linprog
 
 from kantor_agent.belief import Belief
 from kantor_protocol.keyed import Purpose
-from kantor_protocol.messages import News
 from kantor_protocol.packing import Pairs
 from kantor_protocol.replica import Replica
 from kantor_protocol.walk import Walk
 from kantor_protocol.weights import Units
+from replicas import entries
 from strategies import Points, crowds, examples, scattered
 
 Plan = list[tuple[int, int]]
@@ -165,7 +165,7 @@ def test_last_point_ships_what_is_left() -> None:
     for _ in range(4):
         spend(other, 0.0, 0.0)
     have, logs, claims = other.replica.compose(0)
-    one.learn(1, News(1, 1, 0.0, 0.0, have, logs, claims))
+    one.replica.learn(1, have, logs, claims)
     one.advance(0)
 
     assert one.weights.tolist() == [1]
@@ -186,7 +186,7 @@ def test_belief_holds_when_logs_outgrow_their_room(*, ledger: bool) -> None:
             belief.advance(0)
             belief.replica.end_step()
     have, logs, claims = other.replica.compose(0)
-    assert one.learn(1, News(1, 1, 0.0, 0.0, have, logs, claims))
+    assert one.replica.learn(1, have, logs, claims)
     one.advance(0)
     left = [min(a, b) for a, b in zip(one.weights.tolist(), other.weights.tolist(), strict=True)]
     if ledger:
@@ -196,7 +196,7 @@ def test_belief_holds_when_logs_outgrow_their_room(*, ledger: bool) -> None:
 
     assert one.weights.tolist() == [max(0, weight) for weight in left]
     plan = spend(one, 50.0, 50.0)
-    assert one.replica.entries(0)[-1][0] == plan[-1][0]
+    assert entries(one.replica, 0)[-1][0] == plan[-1][0]
     assert sum(one.weights.tolist()) == sum(max(0, weight) for weight in left) - 1
 
 
@@ -224,7 +224,7 @@ def test_exactly_the_samples_with_weight_can_be_found(
             other.spend(x_m, y_m)
         elif act == "news":
             have, logs, claims = other.replica.compose(0)
-            belief.learn(1, News(1, 1, 0.0, 0.0, have, logs, claims))
+            belief.replica.learn(1, have, logs, claims)
         belief.advance(now_ns)
         alive = {j for j, weight in enumerate(belief.weights.tolist()) if weight > 0}
 
@@ -269,7 +269,7 @@ def test_lowered_entries_are_the_difference_of_the_vectors(
     for x_m, y_m in places_m:
         before = belief.weights.tolist()
         belief.spend(x_m, y_m)
-        arrays = Pairs().decode(belief.lowered(), 6)
+        arrays = Pairs().decode(belief.replica.packed_lowered(), 6)
         assert arrays is not None
         for sample, left in zip(arrays[0].tolist(), arrays[1].tolist(), strict=True):
             assert left < before[sample]

@@ -333,7 +333,7 @@ class Troubled:
         skew_s: Callable[[int], float] = lambda _step: 0.0,
     ) -> None:
         self._build = lambda body: participant(name, scenario, 1, site, body)
-        self.machine = self._build(None)
+        self.machine = self._build(Body(site.poses(scenario)[name]))
         self._deaths, self._silent, self._skew_s = deaths, silent, skew_s
         self._step, self._epoch = 0, 0
 

@@ -23,8 +23,9 @@ from kantor_protocol.messages import News, decode_news
 from kantor_protocol.modes import VISIT
 from kantor_protocol.packing import Pairs
 from kantor_protocol.registers import read_register
-from kantor_protocol.replica import read_have, read_logs
+from kantor_protocol.replica import read_have
 from kantor_protocol.scenario import Scenario, parse
+from replicas import read_logs
 
 FOLDER = Path(__file__).parent / "transcripts"
 BASE = """

@@ -18,6 +18,9 @@ import msgspec
 import numpy as np
 import pytest
 
+if __name__ == "__main__":
+    sys.path[0] = str(Path(__file__).resolve().parents[1])
+
 from kantor_agent import core as agent_core
 from kantor_agent.belief import Belief
 from kantor_agent.core import Agent
@@ -31,7 +34,7 @@ from kantor_protocol.machine import EVERYBODY, WORLD_SIM, Body
 from kantor_protocol.messages import decode_inputs
 from kantor_protocol.radio import Radio
 from kantor_protocol.registers import Registers
-from kantor_protocol.replica import Replica, read_logs
+from kantor_protocol.replica import Replica
 from kantor_protocol.scenario import Scenario
 from kantor_protocol.weights import WeightsPublisher
 from kantor_worldsim import loop, outages
@@ -39,6 +42,7 @@ from kantor_worldsim.channel import Channel
 from kantor_worldsim.outages import Outages
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import World
+from replicas import read_logs
 
 LIMIT = 200
 """Missions within which every mutant must be caught."""
@@ -443,10 +447,13 @@ def hostile_message_taken_in(patch: Patch) -> None:
 def sound_message_refused(patch: Patch) -> None:
     due = _now_and_then(100)
 
-    def make(take: Any) -> Any:
-        return lambda self, *arguments: not due() and take(self, *arguments)
+    def make(hear: Any) -> Any:
+        def heard(self: Radio, inbox: Any, learn: Any) -> None:
+            hear(self, inbox, lambda *parts: not due() and learn(*parts))
 
-    _wrap(patch, Radio, "_take", make)
+        return heard
+
+    _wrap(patch, Radio, "hear", make)
 
 
 @mutant("a new incarnation counts its messages from 1 again", _has(Kill, disk=("torn", "lost")))

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 from kantor_fleet.exits import Exit
-from kantor_fleet.team import play, team
+from kantor_fleet.team import team
 from kantor_fleet.verify import verify
 from kantor_protocol.machine import Inputs, Outputs, ParticipantId
 from kantor_protocol.scenario import Scenario, parse
-from kantor_worldsim.loop import in_process, simulate
+from kantor_worldsim.loop import Exchange, in_process, simulate
+from kantor_worldsim.metrics import Result
 from kantor_worldsim.recording import MANIFEST, Recording
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
@@ -68,8 +69,13 @@ def troubled(*overrides: str) -> Scenario:
     return parse(SMALL + TROUBLE, "troubled", (*roomy, "radio.drop=0.2", *overrides))
 
 
-def recording_of(scenario: Scenario, folder: Path) -> Recording:
-    return Recording(scenario, 1, "in-process", folder)
+def recorded(scenario: Scenario, folder: Path, machines: Exchange | None = None) -> Result:
+    """Play a mission into a run folder."""
+    recording = Recording(scenario, 1, "in-process", folder)
+    site = Site.of(scenario, 1)
+    stage = Stage(scenario, 1, site, [recording.take])
+    simulate(stage, machines or in_process(team(scenario, 1, site)), 1, lambda: False)
+    return recording.finish()
 
 
 def as_exchange(folder: Path, exchange: str) -> None:
@@ -84,9 +90,7 @@ def test_ordered_faults_are_executed_again(
 ) -> None:
     """Deaths, absences and new incarnations are in the scenario: every byte comes out the same."""
     scenario = troubled(*PACES[pace])
-    recording = recording_of(scenario, tmp_path)
-    play(scenario, 1, Site.of(scenario, 1), [recording.take])
-    recording.finish()
+    recorded(scenario, tmp_path)
     code = verify(tmp_path)
 
     out = capsys.readouterr().out
@@ -100,14 +104,12 @@ def test_incarnations_are_replayed(
 ) -> None:
     """As on the wall: machines go on over their deaths, or take over the body as the world knew it."""
     scenario = troubled(*PACES[pace])
-    recording = recording_of(scenario, tmp_path)
-    play(scenario, 1, Site.of(scenario, 1), [recording.take])
-    steps = recording.finish()
+    recorded(scenario, tmp_path)
     as_exchange(tmp_path, "wall")
     verify(tmp_path)
 
     out = capsys.readouterr().out
-    assert f"steps of {len(scenario.roster)} participants, all the same" in out, steps
+    assert f"steps of {len(scenario.roster)} participants, all the same" in out, out
 
 
 class Forgetful:
@@ -128,10 +130,7 @@ def test_absence_that_nobody_ordered_is_replayed(
 ) -> None:
     """Executed again it would not happen; the inboxes are on record all the same."""
     scenario = parse(SMALL, "small", ("limit_s=3", "energy.steps=60"))
-    recording = recording_of(scenario, tmp_path)
-    stage = Stage(scenario, 1, Site.of(scenario, 1), [recording.take])
-    simulate(stage, Forgetful(scenario), 1, lambda: False)  # type: ignore[arg-type]
-    result = recording.finish()
+    result = recorded(scenario, tmp_path, Forgetful(scenario))  # type: ignore[arg-type]
     code = verify(tmp_path)
 
     out = capsys.readouterr().out

@@ -175,11 +175,6 @@ def inputs() -> Mutations:
     return messages(encode(given) for each in _every() for given in each.inputs)
 
 
-def outputs() -> Mutations:
-    """What participants did."""
-    return messages(encode(done) for each in _every() for done in each.outputs)
-
-
 def from_participants() -> Mutations:
     """Reports and Ready."""
     done = [outputs for each in _every() for outputs in each.outputs]

@@ -104,6 +104,35 @@ def test_a_decoder_that_breaks_the_rule_is_told(
     assert all(len(path.read_bytes()) > 300 for path in tmp_path.iterdir() if path.suffix != ".txt")
 
 
+def test_a_decoder_that_keeps_memory_is_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """No single input is to blame: the command repeats them all."""
+    kept: list[bytes] = []
+
+    def leaks(_folder: Path) -> Decode:
+        return lambda content: not kept.append(b"x" * (4000 + len(content)))
+
+    monkeypatch.setitem(TARGETS, "news", TARGETS["news"]._replace(start=leaks))
+    arguments = ["fuzz.py", "--only", "news", "--inputs", "22000", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", arguments)
+
+    assert fuzz.main() == 1
+    told = capfd.readouterr().out
+    assert re.search(r"FAIL \d+ MiB more than before", told)
+    assert "--only news --seed 0 --batch 0 --inputs 22000" in told
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_freed_is_no_growth() -> None:
+    """However large it was, and wherever malloc had it."""
+    before = fuzz.held_bytes()
+    for mib in (30, 29, 28):
+        assert len(b"x" * (mib << 20)) == mib << 20
+
+    assert fuzz.held_bytes() - before < 4 << 20
+
+
 def test_a_sound_decoder_is_tallied(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

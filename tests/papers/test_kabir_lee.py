@@ -17,14 +17,12 @@ from scipy.optimize import linprog
 from scipy.spatial import cKDTree
 
 from kantor_fleet.catalog import find
-from kantor_fleet.team import team
+from kantor_fleet.team import play
 from kantor_protocol.packing import Pairs
 from kantor_protocol.scenario import Scenario
-from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.metrics import Metrics, Result, Row
 from kantor_worldsim.recording import Recording
 from kantor_worldsim.records import Batch, Record
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 from strategies import mission
 
@@ -50,8 +48,7 @@ def flown(name: str, overrides: tuple[str, ...], seed: int) -> Flight:
     scenario = find(name, overrides)
     site = Site.of(scenario, seed)
     recording = Recording(scenario, seed, "in-process")
-    stage = Stage(scenario, seed, site, [recording.take])
-    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    play(scenario, seed, site, [recording.take])
     result = recording.finish()
     assert result.complaints == ()
     return Flight(result, recording.metrics.rows)
@@ -329,8 +326,7 @@ def small(*overrides: str) -> Small:
             shipped.extend([place] if act.outputs.spent else [])
             told.append((act.now_ns // scenario.period_ns, shipped.copy(), robots_m.copy()))
 
-    stage = Stage(scenario, 1, site, [follow])
-    simulate(stage, in_process(team(scenario, 1, site)), 1, lambda: False)
+    play(scenario, 1, site, [follow])
     at_end_of = {tick: (points, places) for tick, points, places in told}
     instants = [
         Instant(row, np.array(at_end_of[row.tick][0]).reshape(-1, 2), at_end_of[row.tick][1])
@@ -432,8 +428,7 @@ def shipments(scenario: Scenario) -> Iterator[tuple[Places, dict[int, int], Plac
     """Each point of a lone robot: from where, what it filled, the samples, and what they had left."""
     site = Site.of(scenario, 1)
     records: list[Record] = []
-    stage = Stage(scenario, 1, site, [records.append])
-    simulate(stage, in_process(team(scenario, 1, site)), 1, lambda: False)
+    play(scenario, 1, site, [records.append])
     left = [5] * 12
     pairs = Pairs()
     for record in records:

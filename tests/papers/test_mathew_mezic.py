@@ -14,14 +14,12 @@ import numpy.typing as npt
 
 from kantor_agent.planners.spectral import mean_over_mixture
 from kantor_fleet.catalog import find
-from kantor_fleet.team import team
+from kantor_fleet.team import play
 from kantor_protocol.modes import VISIT, rectangle_of, visit_at
 from kantor_protocol.scenario import Scenario
 from kantor_worldsim.checkers import Checker
-from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.metrics import Metrics
 from kantor_worldsim.records import Act, Batch, Record
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 
 SEEDS = 3
@@ -51,8 +49,7 @@ def flown(overrides: tuple[str, ...], seed: int) -> Flight:
         if isinstance(record, Batch):
             acts.extend(act for act in record.acts if act.outputs and act.outputs.spent)
 
-    stage = Stage(scenario, seed, site, [metrics.take, checker.take, keep])
-    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    play(scenario, seed, site, [metrics.take, checker.take, keep])
     assert checker.complaints == []
     return Flight(scenario, 100.0 * len(metrics.finds) / len(site.targets_m), acts)
 

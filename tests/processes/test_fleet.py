@@ -11,11 +11,9 @@ import pytest
 
 from fleets import await_line, children_named, result_of
 from kantor_fleet.catalog import find
-from kantor_fleet.team import team
+from kantor_fleet.team import play
 from kantor_protocol.scenario import Scenario
-from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.metrics import Metrics
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 
 if TYPE_CHECKING:
@@ -30,8 +28,7 @@ LOSSY = (
 def detection(scenario: Scenario, seed: int) -> float:
     """The detection rate in virtual time."""
     site, metrics = Site.of(scenario, seed), Metrics()
-    stage = Stage(scenario, seed, site, [metrics.take])
-    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    play(scenario, seed, site, [metrics.take])
     return len(metrics.finds) / len(site.targets_m)
 
 

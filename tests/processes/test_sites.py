@@ -40,60 +40,18 @@ MISSION = (
 )  # fmt: skip
 
 
-def free() -> str:
-    """A loopback endpoint that nobody uses now."""
-    return free_endpoint().replace("tcp/", "tls/")
-
-
-def keys_for(folder: Path) -> None:
-    """Stand-in for kantor keys."""
-    keys = folder / "keys"
-    keys.mkdir()
-
-    def run(*a: str) -> None:
-        subprocess.run(["openssl", *a], check=True, capture_output=True, cwd=keys)
-
-    run("ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", "ca.key")
-    run("req", "-x509", "-new", "-key", "ca.key", "-days", "30", "-subj", "/CN=ca", "-out", "ca.pem",
-        "-addext", "basicConstraints=critical,CA:TRUE")  # fmt: skip
-    ids = ("worldsim", "site-north", "r1", "r2", "r3", "observer")
-    members = {name: f"{name}.0a" for name in ids}
-    for name in ids:
-        run("ecparam", "-name", "prime256v1", "-genkey", "-noout", "-out", "x.sec1")
-        run("pkcs8", "-topk8", "-nocrypt", "-in", "x.sec1", "-out", f"{name}.key")
-        run("req", "-new", "-key", f"{name}.key", "-subj", f"/CN={name}.0a", "-out", "x.csr")
-        (keys / "x.ext").write_text(
-            "subjectAltName=DNS:localhost,IP:127.0.0.1\nbasicConstraints=CA:FALSE\n"
-            "extendedKeyUsage=serverAuth,clientAuth\n"
-        )
-        run("x509", "-req", "-in", "x.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-CAcreateserial",
-            "-days", "30", "-extfile", "x.ext", "-out", f"{name}.pem")  # fmt: skip
-        text = f'fleet = "kantor"\nuser = "{name}"\n'
-        for field, file in (
-            ("authority", "ca.pem"), ("certificate", f"{name}.pem"), ("key", f"{name}.key")
-        ):  # fmt: skip
-            text += f'{field} = """\n{(keys / file).read_text()}"""\n'
-        shown = {"worldsim": ids, "site-north": ("worldsim", "r1", "r2")}.get(name, ())
-        if shown:
-            text += "[members]\n" + "".join(f'{i} = "{members[i]}"\n' for i in shown)
-        if name == "worldsim":
-            text += '[sites]\nsite-north = ["r1", "r2"]\n'
-        (keys / f"{name}.toml").write_text(text)
-
-
 class Place:
     """A hub and a site on this machine, with the keys of a fleet of three, two of them at the site."""
 
     def __init__(self, kantor: "Kantor") -> None:
         self.kantor = kantor
-        self.hub, self.north = free(), free()
-        keys_for(kantor.folder)
+        self.hub, self.north = free_endpoint("tls"), free_endpoint("tls")
+        made = kantor("keys", "kantor", "--robots", 3, "--site", "north=r1,r2")
+        assert made.code == 0, made.err
 
     def start(self, *arguments: object, at: str, user: str) -> "subprocess.Popen[str]":
         """A process with the identity of a user."""
-        return self.kantor.start(
-            *arguments, "--connect", at, "--credentials", f"keys/{user}.toml"
-        )
+        return self.kantor.start(*arguments, "--connect", at, "--credentials", f"keys/{user}.toml")
 
     def world_sim(self, *arguments: object) -> "subprocess.Popen[str]":
         """World-sim, up and waiting."""

@@ -5,7 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.replica import Replica, read_logs
+from kantor_protocol.replica import Replica
+from replicas import entries, read_logs
 from strategies import examples
 
 BOUND = 50
@@ -27,7 +28,7 @@ def replica(me: int, origins: int = 3, *, relay: bool = False, patience: int = 2
 
 def log(held: Replica, origin: int) -> list[int]:
     """What somebody holds of an origin's log."""
-    return [index for index, _ in held.entries(origin)]
+    return [index for index, _ in entries(held, origin)]
 
 
 def test_an_entry_is_one_number_on_the_air() -> None:

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import replicas
 from kantor_protocol.registers import Registers, read_register
 from kantor_protocol.replica import NOBODY, Replica, read_have, spend
 from kantor_protocol.slots import EPOCHS_MAX, known_to, slots_told
@@ -55,7 +56,7 @@ def tell(held: Replica, *others: Replica, target: int = NOBODY) -> None:
 
 def whole_log(held: Replica) -> bytes:
     """The own log as one suffix: origin, start, span, count, then (folded difference, units); small numbers."""
-    entries = held.entries(held.manner.me)
+    entries = replicas.entries(held, held.manner.me)
     content, before = [held.manner.me, 0, len(entries), len(entries)], 0
     for sample, units in entries:
         step, before = sample - before, sample
@@ -195,10 +196,10 @@ def test_boast_about_the_own_log_is_left() -> None:
     """Who claims to hold more of a log than its writer has written is told nothing, and harms nobody."""
     held = replica(0)
     buy(held, 1, 2)
-    before = held.entries(0)
+    before = replicas.entries(held, 0)
 
     assert held.learn(1, bytes([9, 0, 0, 9, 0, 0]), bytes([0, 0, 2, 2, 0, 1, 0, 1]), b"")
-    assert (held.entries(0), held.compose()[1]) == (before, b"")
+    assert (replicas.entries(held, 0), held.compose()[1]) == (before, b"")
     assert held.weights.tolist() == [4, 2, 4, 4, 4, 4]
 
 
@@ -212,7 +213,7 @@ def test_old_words_of_the_dead_are_data() -> None:
     for _ in range(2):
         assert reader.learn(1, *words)
 
-    assert (reader.entries(1), reader.entries(4)) == ([(2, 3)], [(2, 1)])
+    assert (replicas.entries(reader, 1), replicas.entries(reader, 4)) == ([(2, 3)], [(2, 1)])
     assert reader.weights[2] == 0
 
 
@@ -226,7 +227,7 @@ def test_a_new_incarnation_learns_what_it_once_said() -> None:
         tell(young, reader)
         tell(reader, young)
 
-    assert young.entries(1) == [(2, 3)]
+    assert replicas.entries(young, 1) == [(2, 3)]
     assert young.weights.tolist() == reader.weights.tolist()
     assert young.compose()[1] == reader.compose()[1] == b""
 
@@ -238,7 +239,7 @@ def test_claim_of_the_dead_expires() -> None:
     tell(dead, reader)
     taken = []
     for _ in range(40):
-        taken.append((3 in reader.taken(), 3 in young.taken()))
+        taken.append((3 in replicas.taken(reader), 3 in replicas.taken(young)))
         tell(young, reader)
         tell(reader, young)
 
@@ -253,7 +254,7 @@ def test_claim_before_time_began_is_told_as_of_its_beginning() -> None:
     one.claim(3, -(10**13))
     tell(one, two)
 
-    assert two.taken().tolist() == [3]
+    assert replicas.taken(two) == [3]
     assert two.store.claims[1, 0] == 0
 
 
@@ -353,5 +354,9 @@ def test_whole_state_is_the_join_of_its_deltas(
     assert at_once.learn(0, bytes(2 * 3 * ROSTER), told, b"")
 
     for slot in range(3 * ROSTER):
-        assert bit_by_bit.entries(slot) == at_once.entries(slot) == writers[slot].entries(slot)
+        assert (
+            replicas.entries(bit_by_bit, slot)
+            == replicas.entries(at_once, slot)
+            == replicas.entries(writers[slot], slot)
+        )
     assert at_once.weights.tolist() == bit_by_bit.weights.tolist()

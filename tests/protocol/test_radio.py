@@ -17,7 +17,7 @@ def heard(*envelopes: Envelope, taken: bool = True) -> tuple[list[int], int]:
     radio = Radio("r2", TEAM)
     places: list[int] = []
 
-    def learn(source: int, _news: News) -> bool:
+    def learn(source: int, *_parts: bytes) -> bool:
         places.append(source)
         return taken
 

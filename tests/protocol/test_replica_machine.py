@@ -13,6 +13,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+import replicas
 from kantor_protocol.replica import NOBODY, Replica, spend
 from kantor_protocol.weights import Units
 from strategies import examples
@@ -197,7 +198,7 @@ class Replicas(RuleBasedStateMachine):
         for held in self.made if self.made and self.made[0].manner.ledger else []:
             spent: Counter[int] = Counter()
             for origin in range(held.slots):
-                entries, bought = held.entries(origin), self.bought.get(origin, [])
+                entries, bought = replicas.entries(held, origin), self.bought.get(origin, [])
                 assert entries == bought[: len(entries)]
                 assert origin != held.manner.me or len(entries) == len(bought)
                 for sample, units in entries:
@@ -211,8 +212,8 @@ class Replicas(RuleBasedStateMachine):
         for held in self.made if self.made and not self.made[0].manner.ledger else []:
             for slot, author in self.authors.items():
                 length = int(held.store.length[slot]) if slot < held.slots else 0
-                assert length <= len(author.entries(slot))
-                for sample, value in author.entries(slot)[:length]:
+                assert length <= len(replicas.entries(author, slot))
+                for sample, value in replicas.entries(author, slot)[:length]:
                     assert held.weights[sample] <= value
 
     @invariant()

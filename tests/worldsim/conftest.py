@@ -5,11 +5,9 @@ from collections.abc import Callable
 
 import pytest
 
-from kantor_fleet.team import team
+from kantor_fleet.team import play
 from kantor_protocol.scenario import Scenario
-from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.records import Record
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 from strategies import mission
 
@@ -21,8 +19,7 @@ ROOMY = ("samples.count=60", "energy.points=90", "energy.steps=60", "targets.cou
 def _played(scenario: Scenario, seed: int) -> tuple[Record, ...]:
     site = Site.of(scenario, seed)
     records: list[Record] = []
-    stage = Stage(scenario, seed, site, [records.append])
-    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    play(scenario, seed, site, [records.append])
     return tuple(records)
 
 

@@ -18,11 +18,12 @@ from kantor_protocol.messages import News, decode_news, encode
 from kantor_protocol.modes import VISIT
 from kantor_protocol.packing import Pairs, put_uint
 from kantor_protocol.registers import read_register
-from kantor_protocol.replica import read_have, read_logs
+from kantor_protocol.replica import read_have
 from kantor_protocol.weights import WeightsMessage, WeightsSubscriber
 from kantor_worldsim.channel import DROPPED, Verdict
 from kantor_worldsim.checkers import Checker, check
 from kantor_worldsim.records import Act, Batch, Ending, Incident, Opening, Record
+from replicas import read_logs
 from strategies import SEEDS, examples
 
 Play = Callable[..., tuple[Record, ...]]

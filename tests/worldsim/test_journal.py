@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from kantor_fleet.team import team
+from kantor_fleet.team import play
 from kantor_protocol.scenario import load
 from kantor_worldsim.journal import (
     METRICS_TOPIC,
@@ -24,7 +24,6 @@ from kantor_worldsim.journal import (
     file_digest,
     read,
 )
-from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.metrics import Metrics, Result
 from kantor_worldsim.recording import (
     JOURNAL,
@@ -36,7 +35,6 @@ from kantor_worldsim.recording import (
     folder_for,
 )
 from kantor_worldsim.records import Record, decode_record, encode_record
-from kantor_worldsim.stage import Stage
 from kantor_worldsim.world import Site
 from strategies import examples, mission
 
@@ -94,8 +92,7 @@ def run_in(folder: Path, *overrides: str) -> Result:
     scenario = mission(*overrides)
     site = Site.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process", folder)
-    stage = Stage(scenario, 1, site, [recording.take])
-    simulate(stage, in_process(team(scenario, 1, site)), 1, lambda: False)
+    play(scenario, 1, site, [recording.take])
     return recording.finish()
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_fleet.team import team
+from kantor_fleet.team import play, team
 from kantor_protocol.clock import Clock, clocks
 from kantor_protocol.machine import Exchange, Inputs, Outputs, ParticipantId, Pose
 from kantor_protocol.scenario import Scenario
@@ -77,8 +77,7 @@ def test_same_seed_gives_the_same_record() -> None:
     first, second = (digest(tuple(run(scenario))) for _ in range(2))
     site = Site.of(scenario, 2)
     others: list[Record] = []
-    stage = Stage(scenario, 2, site, [others.append])
-    simulate(stage, in_process(team(scenario, 2, site)), 2, lambda: False)
+    play(scenario, 2, site, [others.append])
 
     assert first == second
     assert digest(tuple(others)) != first
@@ -86,7 +85,7 @@ def test_same_seed_gives_the_same_record() -> None:
 
 DIGESTS = """
 import sys
-from kantor_fleet.team import team
+from kantor_fleet.team import play, team
 from kantor_protocol.scenario import parse
 from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.recording import Recording
@@ -98,8 +97,7 @@ for coordination in ("centralized", "decentralized"):
     scenario = parse(text, "-", [f"coordination={coordination}", *overrides])
     site = Site.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process")
-    stage = Stage(scenario, 1, site, [recording.take])
-    simulate(stage, in_process(team(scenario, 1, site)), 1, lambda: False)
+    play(scenario, 1, site, [recording.take])
     print(recording.finish().digest)
 """
 

@@ -15,11 +15,12 @@ from kantor_protocol.grid import FREE, OCCUPIED
 from kantor_protocol.machine import Envelope, Pose, State
 from kantor_protocol.messages import Array, News, RefusedError, decode_news, encode_news
 from kantor_protocol.packing import put_int, put_uint
-from kantor_protocol.replica import read_have, read_logs
+from kantor_protocol.replica import read_have
 from kantor_worldsim.checkers import Checker, check
 from kantor_worldsim.map_checker import MapRules
 from kantor_worldsim.records import Act, Batch, Incident, Opening, Record
 from mapping import ROOMS, explored, on_map, site_of
+from replicas import read_logs
 
 Records = Sequence[Record]
 Change = Callable[[Act], Act]

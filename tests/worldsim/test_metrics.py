@@ -10,7 +10,7 @@ import pytest
 
 from kantor_fleet.catalog import find
 from kantor_fleet.run import summary
-from kantor_fleet.team import team
+from kantor_fleet.team import play, team
 from kantor_protocol.machine import (
     EVERYBODY,
     SUPERVISOR,
@@ -211,8 +211,7 @@ def _walking_run() -> Iterable[Record]:
     scenario = mission("samples.diffusion_m=3.0", "metrics.every=1")
     records: list[Record] = []
     site = Site.of(scenario, 1)
-    stage = Stage(scenario, 1, site, [records.append])
-    simulate(stage, in_process(team(scenario, 1, site)), 1, lambda: False)
+    play(scenario, 1, site, [records.append])
     return records
 
 
@@ -311,8 +310,7 @@ def full_runs() -> Callable[[str], Result]:
             scenario = find(name)
             site = Site.of(scenario, 0)
             recording = Recording(scenario, 0, "in-process")
-            stage = Stage(scenario, 0, site, [recording.take])
-            simulate(stage, in_process(team(scenario, 0, site)), 0, lambda: False)
+            play(scenario, 0, site, [recording.take])
             results[name] = recording.finish()
         return results[name]
 
@@ -574,8 +572,7 @@ def test_metrics_file_has_the_rows(tmp_path: Path) -> None:
     scenario = mission("merge=min", "claims=false", "metrics.every=1")
     site = Site.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process", tmp_path)
-    stage = Stage(scenario, 1, site, [recording.take])
-    simulate(stage, in_process(team(scenario, 1, site)), 1, lambda: False)
+    play(scenario, 1, site, [recording.take])
     recording.finish()
     head, *lines = (tmp_path / "metrics.csv").read_text(encoding="utf-8").splitlines()
     rows = recording.metrics.rows

@@ -11,11 +11,12 @@ from hypothesis import strategies as st
 from grounds import HEADINGS, Place, drawn, grounds, places
 from kantor_protocol.evidence import CODES, NO_RETURN, beam_rad
 from kantor_protocol.grid import FREE
-from kantor_protocol.keyed import Purpose, philox_plain
+from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import Pose
 from kantor_protocol.scenario import Sensor
 from kantor_worldsim.maps import Cells, Ground
 from kantor_worldsim.sensors import RangeFinder, walls_between, way_to_wall
+from plain_philox import philox_plain
 from strategies import SEEDS, examples
 
 Codes = npt.NDArray[np.uint16]

@@ -20,7 +20,7 @@ from kantor_protocol.grid import FREE, OCCUPIED, UNKNOWN
 from kantor_protocol.life import Mortal
 from kantor_protocol.machine import Inputs, Outputs
 from kantor_protocol.messages import decode_news
-from kantor_protocol.replica import Replica, read_have, read_logs
+from kantor_protocol.replica import Replica, read_have
 from kantor_worldsim.checkers import check
 from kantor_worldsim.loop import in_process, simulate
 from kantor_worldsim.maps import Ground, parts
@@ -29,6 +29,7 @@ from kantor_worldsim.records import Act, Batch, Opening, Record
 from kantor_worldsim.stage import Stage
 from kantor_worldsim.survey import KIND, TOLD, Survey
 from mapping import ROOMS, explored, on_map, site_of
+from replicas import read_logs
 from strategies import examples
 
 Records = Sequence[Record]

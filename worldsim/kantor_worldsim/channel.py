@@ -380,6 +380,8 @@ class Channel:
     def take(self, name: ParticipantId, now_ns: int) -> tuple[Envelope, ...]:
         """What has arrived at a participant by now, in order of (arrival, source, sequence)."""
         waiting = self._under_way[name]
+        if not waiting or waiting[0][0] > now_ns:
+            return ()
         arrived = []
         while waiting and waiting[0][0] <= now_ns:
             arrived.append(heappop(waiting)[4])

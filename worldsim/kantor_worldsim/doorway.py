@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from kantor_protocol.bus import LEASE_MS, BusError, Heard, Host, Joined, Left
+from kantor_protocol.bus import LEASE_MS, BusError, Flooded, Heard, Host, Joined, Left
 from kantor_protocol.machine import (
     WORLD_SIM,
     Body,
@@ -58,6 +58,7 @@ class Doorway:
         stopped: Callable[[], bool],
         show: Callable[[Progress], None],
         hands: Hands | None,
+        say: Callable[[str], None],
     ) -> None:
         self.host = host
         self.stopped = stopped
@@ -78,6 +79,7 @@ class Doorway:
         self._run = recording.run
         self._metrics: Following = recording.metrics
         self._show = show
+        self._say = say
         self._admission = Admission(plan.scenario.roster)
         self._met: set[str] = set()
         """Nonces of the processes that have got ready."""
@@ -151,6 +153,8 @@ class Doorway:
             self._leave(event)
         elif isinstance(event, Heard):
             return self._hear(event)
+        elif isinstance(event, Flooded):
+            self._say(f"{event.name} floods the bus; what is beyond its quota is not taken in")
         return None
 
     def dismiss(self, reason: str, patience_s: float) -> None:

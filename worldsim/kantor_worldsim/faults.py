@@ -121,6 +121,9 @@ class LinkFaults:
         self._queued = np.zeros((1, len(self._queues)), dtype=np.int64)
         self._beside = np.zeros((1, 4), dtype=np.int64)
         self._out = np.zeros((1, 3), dtype=np.int64)
+        self._field: Field | None = None
+        self._standing: tuple[Any, ...] = ()
+        """Arguments of the kernels that stay the same from call to call."""
 
     @classmethod
     def of(cls, scenario: Scenario, seed: int) -> "LinkFaults | None":
@@ -147,7 +150,9 @@ class LinkFaults:
         if sent[0].now_ns >= self._over_ns:
             return sent, ruled, 0
         self._enqueue(sent)
-        law = (*self.table, *field, *self._ranges_m, rows, *ruled)
+        if field is not self._field:
+            self._field, self._standing = field, (*self.table, *field, *self._ranges_m)
+        law = (*self._standing, rows, *ruled)
         on_air, besides = self._bring(sent, law) if self._has_beside else (sent, 0)
         made, lost = self._judge(law, besides)
         if made > self._out.shape[0]:

@@ -46,11 +46,16 @@ def settling_ns(scenario: Scenario, hops: int) -> int:
         1 if radio.drop <= 0.0 else math.ceil(math.log(_UNLUCKY) / math.log(min(radio.drop, 0.99)))
     )
     patience = max(patience_steps(name, scenario) for name in scenario.roster)
-    way_ns = round((radio.delay_s + radio.jitter_s + radio.reorder_s) * 1e9)
     slowest_ns = round(scenario.period_ns * (1.0 + scenario.clock.spread)) + round(
         scenario.clock.jitter_s * 1e9
     )
-    return (hops + 1) * (tries * (patience + 2) * slowest_ns + way_ns)
+    return (hops + 1) * (tries * (patience + 2) * slowest_ns + _way_ns(scenario))
+
+
+def _way_ns(scenario: Scenario) -> int:
+    """How long a message is under way at most, without faults."""
+    radio = scenario.radio
+    return round((radio.delay_s + radio.jitter_s + radio.reorder_s) * 1e9)
 
 
 class _Known(NamedTuple):
@@ -111,8 +116,7 @@ class Liveness:
         self._changed_ns = 0
         self._late_ns: list[int] = []
         """When messages arrive that a fault has held up: they are news from before."""
-        radio = scenario.radio
-        self._way_ns = round((radio.delay_s + radio.jitter_s + radio.reorder_s) * 1e9)
+        self._way_ns = _way_ns(scenario)
         self._spent: dict[int, list[bytes]] = {}
         """What each slot has shipped."""
         self._said: set[str] = set()
@@ -132,7 +136,7 @@ class Liveness:
         if outputs.spent:
             self._spent.setdefault(state.slot, []).append(outputs.spent)
         before = self._poses.get(act.name)
-        if before is None or (pose.x_m, pose.y_m) != (before.x_m, before.y_m):
+        if before is None or pose.x_m != before.x_m or pose.y_m != before.y_m:
             self._poses[act.name], self._changed_ns = pose, now_ns
         if act.name != SUPERVISOR and self._scenario.centralized:
             self._check_contact(state, act, outputs)

@@ -206,12 +206,13 @@ class _Mission:
         There is no reason yet to end before its first moment.
         """
         outages, stage = self._outages, self._stage
-        due = [event for event in batch if self._is_asked(*event)] if outages.some else batch
+        quiet = outages.quiet(batch[0][0], batch[-1][0])
+        due = batch if quiet else [event for event in batch if self._is_asked(*event)]
         turns = {
             name: stage.turn(name, due_ns, outages.skew_ns(name, due_ns)) for due_ns, name in due
         }
         outputs = self._exchange({name: turn.inputs for name, turn in turns.items()})
-        if outages.some_die_mid_step:
+        if outages.some_die_mid_step and not quiet:
             outputs = self._cut_short(due, outputs)
         for moment_ns, acting in groupby(due, key=itemgetter(0)):
             if moment_ns > batch[0][0] and self._reason(moment_ns):

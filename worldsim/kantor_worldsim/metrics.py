@@ -25,7 +25,8 @@ about: every shipped point where it was shipped, what is left shared evenly by t
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import msgspec
@@ -36,6 +37,7 @@ from kantor_protocol.faults import kind_of
 from kantor_protocol.kernels import kernel, sum_kernel
 from kantor_protocol.keyed import Purpose
 from kantor_protocol.machine import ParticipantId, State
+from kantor_protocol.quota import Excess
 from kantor_protocol.walk import Walk
 from kantor_worldsim import exact
 from kantor_worldsim import reading as of
@@ -275,6 +277,9 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     map: MapResult | None = None
     """Of a mission that explores a map; bounds, energy and mass then say nothing but mass_left, the share
     of cells that nobody has seen."""
+    excess: dict[ParticipantId, Excess] = {}
+    """Who flooded the bus, and how much of it was not taken in since it was beyond its quota. It counts for no
+    other figure."""
 
 
 # Slots of Tally.counts and Tally.shipped.
@@ -720,6 +725,7 @@ class Following:
         digest: str,
         wall_s: float,
         refused_at_door: int = 0,
+        excess: Mapping[ParticipantId, Excess] = MappingProxyType({}),
         record: str,
         complaints: tuple[str, ...],
     ) -> Result:
@@ -770,6 +776,7 @@ class Following:
             restarts=self._restarts,
             incarnations=sum(self._epochs.values()),
             rejoin_s=Rejoining.of(self._rejoined_ns),
+            excess=dict(excess),
             **self._measured(),
         )
 

@@ -100,31 +100,29 @@ class _Window(NamedTuple):
 class Outages:
     """The process faults of a scenario as time goes by."""
 
-    def __init__(self, scenario: Scenario, after_ns: int = -1, done: int = 0) -> None:
-        """after_ns: deeds up to then are done already; done: so many are."""
-        self._deeds = [deed for deed in deeds_of(scenario)[done:] if deed.at_ns > after_ns]
+    def __init__(self, scenario: Scenario, done: int = 0) -> None:
+        """done: so many deeds are done already."""
+        self._deeds = deeds_of(scenario)[done:]
         self._period_ns = scenario.period_ns
         faults = [fault for fault in scenario.faults if isinstance(fault, OnProcesses)]
-        self.some = bool(faults)
-        """Whether anybody ever fails."""
-        self._faults = {
-            name: [fault for fault in faults if name in fault.who]
-            for name in (*scenario.roster, WORLD_SIM)
-        }
+        names = (*scenario.roster, WORLD_SIM)
         windows = [_Window.of(fault) for fault in faults]
         self._stops = {
             name: [w for w in windows if w.fault.stops and {name, WORLD_SIM} & set(w.fault.who)]
-            for name in self._faults
+            for name in names
         }
         self._deaths = {
             name: [w for w in windows if name in w.fault.who and _is_mid_step(w.fault)]
-            for name in self._faults
+            for name in names
         }
         self.some_die_mid_step = any(self._deaths.values())
         """Whether anybody ever dies in a step."""
+        struck = [w for w in windows if w.fault.stops or _is_mid_step(w.fault)]
+        self._first_ns = min((w.from_ns for w in struck), default=_NEVER_NS)
+        self._last_ns = max((w.until_ns for w in struck), default=0)
         self._clocks = {
-            name: [fault for fault in self._faults[name] if isinstance(fault, Clock)]
-            for name in self._faults
+            name: [fault for fault in faults if isinstance(fault, Clock) and name in fault.who]
+            for name in names
         }
 
     @property
@@ -132,15 +130,13 @@ class Outages:
         """When the next deed is due."""
         return self._deeds[0].at_ns if self._deeds else None
 
-    def take(self, now_ns: int) -> list[Deed]:
-        """The deeds that are due, handed out once."""
-        due = [deed for deed in self._deeds if deed.at_ns <= now_ns]
-        self._deeds = self._deeds[len(due) :]
-        return due
-
     def pop(self) -> Deed:
         """The next deed, handed out once."""
         return self._deeds.pop(0)
+
+    def quiet(self, from_ns: int, to_ns: int) -> bool:
+        """Whether nobody is idle and nobody dies in a step from one time to another, both included."""
+        return to_ns < self._first_ns or from_ns >= self._last_ns
 
     def idle(self, name: ParticipantId, now_ns: int) -> bool:
         """Whether a participant takes no step now, because of its own or of world-sim's state."""
@@ -153,13 +149,6 @@ class Outages:
         """Whether the next step of a participant is the one in which it dies, or was."""
         deaths = self._deaths[name]
         return bool(deaths) and any(death.from_ns <= now_ns < death.until_ns for death in deaths)
-
-    def lost(self, name: ParticipantId, now_ns: int) -> bool:
-        """Whether a participant is dead and will not come back."""
-        return any(
-            isinstance(fault, Kill) and fault.until_ns is None and fault.from_ns <= now_ns
-            for fault in self._faults[name]
-        )
 
     def skew_ns(self, name: ParticipantId, now_ns: int) -> int:
         """How far the clock of a participant is ahead. No clock shows a time before the start."""

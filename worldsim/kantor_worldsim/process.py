@@ -8,9 +8,11 @@ it is said again, and one that is in it is not done twice.
 from collections.abc import Callable
 
 from kantor_protocol.bus import Host
+from kantor_protocol.clock import clocks
 from kantor_protocol.messages import (
     Progress,
 )
+from kantor_protocol.quota import quotas
 from kantor_worldsim.doorway import COME_BACK_S, RETURN_S, Doorway
 from kantor_worldsim.hands import Hands
 from kantor_worldsim.lockstep import Lockstep
@@ -26,6 +28,10 @@ def _unseen(_progress: Progress) -> None:
     """Progress that nobody here looks at."""
 
 
+def _unsaid(_line: str) -> None:
+    """News that nobody here reads."""
+
+
 def run(
     host: Host,
     plan: Plan,
@@ -34,13 +40,16 @@ def run(
     show: Callable[[Progress], None] = _unseen,
     past: Past | None = None,
     hands: Hands | None = None,
+    say: Callable[[str], None] = _unsaid,
 ) -> Result:
     """Run a mission to its end, or until `stopped()`. The record is closed in every case.
 
     show: takes what observers on the bus are told as well. past: what recording has taken already; the
     mission goes on from there. hands: who carries out the scenario's faults of processes.
+    say: takes one line of news for a person.
     """
-    doorway = Doorway(host, plan, recording, stopped, show, hands)
+    host.limit(quotas(clocks(plan.scenario, plan.seed), plan.exchange, plan.speed))
+    doorway = Doorway(host, plan, recording, stopped, show, hands, say)
     listeners = [recording.take, doorway.tell]
     if past is None:
         stage = Stage(plan.scenario, plan.seed, plan.site, listeners)
@@ -57,6 +66,7 @@ def run(
         reason = simulate(stage, Lockstep(doorway), plan.seed, stopped)
     doorway.dismiss(reason, 0.0 if past is None else COME_BACK_S)
     recording.refused_at_door = doorway.refused
+    recording.excess = host.excess
     result = recording.finish()
     doorway.tell_progress("over", reason)
     return result

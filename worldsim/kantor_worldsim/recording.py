@@ -14,6 +14,8 @@ from typing import IO, Any, NamedTuple
 
 import msgspec
 
+from kantor_protocol.machine import ParticipantId
+from kantor_protocol.quota import Excess
 from kantor_protocol.scenario import Scenario, to_toml
 from kantor_worldsim.checkers import Checker
 from kantor_worldsim.exploration import Exploration
@@ -134,6 +136,8 @@ class Recording:
         """The last record, encoded."""
         self.refused_at_door = 0
         """Messages to world-sim that it could not take in; whoever runs the bus counts them."""
+        self.excess: dict[ParticipantId, Excess] = {}
+        """What it did not listen to, by participant; likewise."""
         self._scenario = scenario
         self._seed = seed
         self._exchange = exchange
@@ -191,6 +195,7 @@ class Recording:
             digest=self.journal.digest.hex,
             wall_s=self._monotonic() - self._started,
             refused_at_door=self.refused_at_door,
+            excess=self.excess,
             record=self.journal.cut or "whole",
             complaints=tuple(self.checker.complaints),
         )

@@ -72,6 +72,14 @@ class Site(NamedTuple):
         targets_m = targets_of(msgspec.structs.replace(scenario, domain=over_map), seed)
         return cls(np.zeros((0, 2)), targets_m, starts_m, ground, tuple(warnings))
 
+    def poses(self, scenario: Scenario) -> dict[ParticipantId, Pose]:
+        """Where everybody in the roster is at time 0."""
+        robots = zip(scenario.robot_ids, self.starts_m.tolist(), strict=True)
+        poses = {name: Pose(x_m, y_m) for name, (x_m, y_m) in robots}
+        if scenario.centralized:
+            poses[SUPERVISOR] = Pose(*scenario.supervisor_m)
+        return poses
+
 
 def ground_of(scenario: Scenario) -> tuple[Ground, list[str]]:
     """The true map of a scenario that has one, and warnings about its file. Raises ScenarioError."""
@@ -135,12 +143,7 @@ class World:
         self._speed_m_s = scenario.vehicle.speed_m_s
         self._range_m = scenario.sensor.range_m
         self._room = np.zeros(site.targets_m.shape[0], dtype=np.int64)
-        self._bodies = {
-            name: _Body(Pose(float(x), float(y)))
-            for name, (x, y) in zip(scenario.robot_ids, site.starts_m, strict=True)
-        }
-        if scenario.centralized:
-            self._bodies[SUPERVISOR] = _Body(Pose(*scenario.supervisor_m))
+        self._bodies = {name: _Body(pose) for name, pose in site.poses(scenario).items()}
         self._ground = site.ground
         if site.ground is not None:
             self._range_finder = RangeFinder(scenario.sensor, site.ground, seed)

@@ -38,8 +38,9 @@ def differing(scenario: Scenario, seed: int, records: Iterable[Record]) -> Itera
     if not said or epoch > EPOCHS_MAX:
         return
     dice = Dice(seed, _SUBJECT)
-    late = {i: i + dice.unit() * _LATE for i in range(2 * len(said))}
-    shuffled = [(said + said)[i] for i in sorted(late, key=late.__getitem__)]
+    twice = said + said
+    late = [i + dice.unit() * _LATE for i in range(len(twice))]
+    shuffled = [twice[i] for i in sorted(range(len(twice)), key=late.__getitem__)]
     one, other = (_learned(scenario, epoch, order) for order in (said, shuffled))
     if one.manner.ledger and not np.array_equal(one.store.length, other.store.length):
         yield "join: logs have other lengths when they are learned in another order"
@@ -65,7 +66,7 @@ def _learned(scenario: Scenario, epoch: int, said: Sequence[_Said]) -> Replica:
     for _ in range(_PASSES):
         for slot, news in said:
             replica.learn(slot, news.have, news.logs, news.claims, news.registers)
-            replica.end_step()
+        replica.end_step()
         held = int(replica.store.length.sum())
         if held == before:
             break

@@ -212,7 +212,8 @@ def _judged(order: Order, failures: list[str]) -> Flight:
     if result is None:
         failures.append("result: there is none")
         return Flight(order.seed, order.exchange, "crashed", 0.0, tuple(failures), Counter())
-    records = [record for _, record in read(folder / JOURNAL)]
+    journal = list(read(folder / JOURNAL))
+    records = [record for _, record in journal]
     struck, liveness = Struck(), Liveness()
     for record in records:
         struck.take(record)
@@ -220,7 +221,7 @@ def _judged(order: Order, failures: list[str]) -> Flight:
     complaints = [*failures, *result.complaints]
     if result.ended != "done" or result.record != "whole":
         complaints.append(f"end: {result.ended}; record {result.record}")
-    complaints += [f"verify: {line}" for held, line in verdicts(folder) if not held]
+    complaints += [f"verify: {line}" for held, line in verdicts(folder, journal) if not held]
     complaints += liveness.complaints
     complaints += [f"{i.who}: let in" for i in _incidents(records) if i.what == "let in"]
     rejoined_s: tuple[float, ...] = ()

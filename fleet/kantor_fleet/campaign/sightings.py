@@ -59,7 +59,10 @@ class _Ears(_Sight):
 
     def __init__(self, opening: Opening) -> None:
         super().__init__(opening)
-        self._newest: dict[tuple[ParticipantId, ParticipantId], int] = {}
+        self._newest: dict[ParticipantId, dict[ParticipantId, int]] = {
+            name: {} for name in self.scenario.roster
+        }
+        """For each hearer, by source."""
         self._missing: dict[tuple[ParticipantId, ParticipantId], set[int]] = {}
         """Numbers below the newest of a link that were not heard."""
         self._restarted: set[ParticipantId] = set()
@@ -67,24 +70,29 @@ class _Ears(_Sight):
         self._refused: dict[ParticipantId, int] = {}
 
     def act(self, act: Act, outputs: Outputs) -> None:
-        name, newest, born = act.name, self._newest, self._born
+        name, born = act.name, self._born
+        newest = self._newest[name]
         for source, sequence in act.heard:
             if sequence >= FIRST_SEQUENCE:
                 continue
-            link = (name, source)
-            last = newest.get(link, -1)
+            last = newest.get(source, -1)
             if sequence > last:
-                newest[link] = sequence
+                newest[source] = sequence
                 if sequence > last + 1:
-                    self._missing.setdefault(link, set()).update(range(last + 1, sequence))
+                    skipped = range(last + 1, sequence)
+                    self._missing.setdefault((name, source), set()).update(skipped)
             else:
-                self._note_old(link, sequence, last)
+                self._note_old((name, source), sequence, last)
             if born and sequence <= born.get(source, -1):
                 self.seen["word of a former incarnation"] += 1
-        if outputs.refused > self._refused.get(name, 0) and act.heard:
+        if outputs.refused != self._refused.get(name, 0):
+            self._note_refused(act, outputs.refused)
+
+    def _note_refused(self, act: Act, refused: int) -> None:
+        if refused > self._refused.get(act.name, 0) and act.heard:
             forged = any(sequence >= FIRST_SEQUENCE for _, sequence in act.heard)
             self.seen["hostile message refused"] += forged
-        self._refused[name] = outputs.refused
+        self._refused[act.name] = refused
 
     def _note_old(
         self, link: tuple[ParticipantId, ParticipantId], sequence: int, newest: int

@@ -1,0 +1,90 @@
+"""How much a participant may say."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kantor_protocol.clock import clocks
+from kantor_protocol.messages import MESSAGE_BYTES_MAX
+from kantor_protocol.quota import BURST_BYTES, BURST_MESSAGES, Bucket, Excess, Quota, quotas
+from kantor_protocol.scenario import parse
+from strategies import examples
+
+SIZES = st.integers(0, 2 * MESSAGE_BYTES_MAX)
+PAUSES_S = st.floats(0.0, 2.0)
+SCENARIO = """
+name = "turns"
+coordination = "centralized"
+domain = { min_m = [0, 0], max_m = [100, 100] }
+robots = { count = 4 }
+starts = { random = true }
+clock = { period_s = 0.5, order = "turn" }
+energy = { points = 40, steps = 100 }
+samples = { count = 10 }
+density = [{ mean_m = [50, 50], variance_m2 = [100, 100] }]
+"""
+
+
+@examples(200)
+@given(st.floats(0.0, 500.0), st.lists(st.tuples(PAUSES_S, SIZES, st.booleans()), max_size=400))
+def test_whatever_is_said_no_more_is_taken_than_was_asked_for_and_earned(
+    steps_per_s: float, said: list[tuple[float, int, bool]]
+) -> None:
+    """Messages and bytes are within the quota at any time, and what is not taken is counted."""
+    quota = Quota.of(steps_per_s)
+    bucket = Bucket(quota)
+    now_s = 0.0
+    asked = taken = taken_bytes = 0
+    excess = Excess(0, 0)
+    for pause_s, size, is_asked in said:
+        now_s += pause_s
+        if is_asked:
+            bucket.ask()
+            asked += 1
+        if bucket.take(size, now_s):
+            taken, taken_bytes = taken + 1, taken_bytes + size
+        else:
+            excess = Excess(excess.messages + 1, excess.bytes + size)
+        earned, earned_bytes = now_s * quota.messages_per_s, now_s * quota.bytes_per_s
+        assert taken <= BURST_MESSAGES + asked + earned + 1e-6
+        assert taken_bytes <= BURST_BYTES + asked * MESSAGE_BYTES_MAX + earned_bytes + 1e-3
+        assert bucket.excess == excess
+        assert bucket.floods == (excess.messages > 0)
+
+
+@examples(100)
+@given(st.lists(st.integers(0, MESSAGE_BYTES_MAX), max_size=2000), st.integers(0, 5000))
+def test_an_answer_is_always_taken(sizes: list[int], flood: int) -> None:
+    """Turn by turn, however fast turns follow each other, and whatever was said before."""
+    bucket = Bucket(Quota.of(0.0))
+    for _ in range(flood):
+        bucket.take(MESSAGE_BYTES_MAX, 0.0)
+    for size in sizes:
+        bucket.ask()
+        assert bucket.take(size, 0.0)
+
+
+@examples(50)
+@given(st.sampled_from((0.1, 1.0, 10.0, 100.0)), st.lists(st.floats(0.0, 10.0), max_size=5))
+def test_a_sound_robot_is_within_its_quota(speed: float, frozen_s: list[float]) -> None:
+    """It steps by its clock and says what is not heard again; frozen worlds find all of that at once."""
+    period_s = 0.1 / speed
+    bucket = Bucket(Quota.of(1.0 / period_s))
+    now_s = 0.0
+    for freeze_s in [*frozen_s, 0.0]:
+        for _ in range(500):
+            now_s += period_s
+            assert bucket.take(500, now_s)
+        now_s += freeze_s
+        assert all(bucket.take(500, now_s) for _ in range(int(freeze_s / 0.2)))
+
+
+def test_a_quota_follows_from_the_mission() -> None:
+    """Who steps oftener may say more; who is asked for each step has that from being asked."""
+    scenario = parse(SCENARIO, "test")
+    wall = quotas(clocks(scenario, 0), "wall", 2.0)
+    turns = quotas(clocks(scenario, 0), "lockstep", 2.0)
+
+    assert list(wall) == list(scenario.roster)
+    assert wall["r1"] == Quota.of(4.0)
+    assert wall["supervisor"] == Quota.of(16.0)
+    assert set(turns.values()) == {Quota.of(0.0)}
