@@ -65,6 +65,7 @@ def worldsim(
     exact: bool = False,
     chaos: Path | None = None,
     resume: Path | None = None,
+    state: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
 ) -> int:
     """World-sim by hand: host the bus, wait for the roster, run the mission, record it.
@@ -84,21 +85,25 @@ def worldsim(
         chaos: A TOML file of [[faults]] that are added to the scenario's own.
         resume: The folder of a run that was cut short: go on with its mission. Participants that wait
             for it come back by themselves; give the same --listen, --credentials and --fleet.
+        state: A folder in which it notes its run. Started again with it on the same machine (or in the same
+            container), it goes on with that run if it was cut short.
         set: Override a key of the scenario.
     """
-    from kantor_fleet.by_hand import host_by_hand, resume_by_hand  # noqa: PLC0415
+    from kantor_fleet.by_hand import go_on_by_hand, host_by_hand, resume_by_hand  # noqa: PLC0415
     from kantor_fleet.catalog import find  # noqa: PLC0415
 
     if resume is not None:
         if set or chaos is not None:
             fail(Exit.USAGE, "--resume: the run has its scenario; leave out --set and --chaos")
         return resume_by_hand(resume, listen, credentials, fleet)
+    if state is not None and (code := go_on_by_hand(state, listen, credentials, fleet)) is not None:
+        return code
     _check_seed(seed)
     _check_speed(speed)
     mission = find(scenario, set, chaos)
     every = _exact(mission, 0, exchange, exact=exact)
     return host_by_hand(
-        mission, seed, exchange, speed, listen, credentials, fleet, start_after, out, every
+        mission, seed, exchange, speed, listen, credentials, fleet, start_after, out, every, state
     )
 
 
@@ -390,6 +395,59 @@ def tap(
     return tap_bus(connect, credentials, frozenset(only), count, patience)
 
 
+def compose(
+    *,
+    robots: int = 5,
+    supervisor: bool = False,
+    isolated: bool = False,
+    scenario: str = "fleet",
+    hub: str | None = None,
+    out: Path = Path("compose.yaml"),
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
+) -> int:
+    """Write a compose file for a fleet: world-sim and every robot in a container of its own.
+
+    Beside it come `runs/`, and `.env` with the user that runs the containers.
+
+    Args:
+        robots: How many.
+        supervisor: Have a supervisor as well, in the profile `centralized`.
+        isolated: Each robot on a network of its own with world-sim.
+        scenario: A packaged name, or /runs/FILE.toml for a file in the run folder.
+        hub: The endpoint of a world-sim elsewhere, tls/HOST:PORT; then only the robots are in the file.
+        out: The file.
+        set: Override a key of the scenario.
+    """
+    from kantor_fleet.compose import Order  # noqa: PLC0415
+    from kantor_fleet.compose import compose as write  # noqa: PLC0415
+
+    return write(Order(robots, supervisor, isolated, scenario, set, hub), out)
+
+
+def chaos(
+    where: Annotated[Literal["docker"], tyro.conf.Positional],
+    storm: Annotated[Path, tyro.conf.Positional],
+    /,
+    *,
+    project: str = "kantor",
+    patience: float = 120.0,
+) -> int:
+    """Kill, pause and cut off containers of a running fleet by a schedule, and check the record afterwards.
+
+    Exit code 1 if the mission was not met, a rule was broken, or world-sim did not see what was done.
+
+    Args:
+        where: docker: a compose project on this machine's engine.
+        storm: A TOML file of [[faults]]: kill, pause, and partition with shape "isolate"; times of the mission.
+        project: Name of the compose project.
+        patience: Seconds to wait for the mission to begin.
+    """
+    from kantor_fleet.chaos import chaos_docker  # noqa: PLC0415
+
+    del where
+    return chaos_docker(storm, project, patience)
+
+
 def keys(
     fleet: Annotated[str, tyro.conf.Positional],
     /,
@@ -445,6 +503,8 @@ VERBS: dict[str, Callable[..., int]] = {
     "verify": verify,
     "reproduce": reproduce,
     "tap": tap,
+    "compose": compose,
+    "chaos": chaos,
     "keys": keys,
 }
 

@@ -5,6 +5,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from kantor_fleet import standing
 from kantor_fleet.exits import Exit, fail, warn
 from kantor_fleet.interrupts import Interrupts
 from kantor_protocol import bus, credentials
@@ -32,8 +33,12 @@ def host_by_hand(
     start_after_s: float | None,
     out: Path,
     exact_every: int | None,
+    state: Path | None = None,
 ) -> Exit:
-    """World-sim in this terminal, for a new run. Raises ScenarioError, BusError, OSError."""
+    """World-sim in this terminal, for a new run. Raises ScenarioError, BusError, OSError.
+
+    state: where it notes which run it is in.
+    """
     from kantor_worldsim.plan import Plan  # noqa: PLC0415  robots by hand do not need these
     from kantor_worldsim.recording import Recording, folder_for  # noqa: PLC0415
     from kantor_worldsim.world import Site  # noqa: PLC0415
@@ -45,6 +50,8 @@ def host_by_hand(
 
     def record() -> tuple[Path, "Recording"]:
         folder = folder_for(scenario, seed, out)
+        if state is not None:
+            standing.note(state, folder)
         return folder, Recording(scenario, seed, exchange, folder, exact_every, speed=speed)
 
     return _host(plan, listen, secrets, fleet, record)
@@ -69,6 +76,33 @@ def resume_by_hand(folder: Path, listen: str, secrets: Path, fleet: str | None) 
         return folder, Recording(scenario, seed, exchange, folder, every, past=past)
 
     return _host(plan, listen, secrets, fleet, record, past)
+
+
+def go_on_by_hand(state: Path, listen: str, secrets: Path, fleet: str | None) -> Exit | None:
+    """World-sim in this terminal, for the run that it is in; None if another is to begin.
+
+    A mission that was not met is not tried again: whoever starts failed processes anew would do so for ever.
+    """
+    from kantor_fleet.run import conclude, read_result, verdict  # noqa: PLC0415
+    from kantor_worldsim.recording import REPORT, OverError, Past, ResumeError  # noqa: PLC0415
+
+    folder = standing.run_in(state)
+    if folder is None:
+        return None
+    try:
+        Past.of(folder)
+    except OverError as over:
+        result = read_result(folder)
+        code = Exit.PROCESS_FAILED if result is None else verdict(result)
+        if not (folder / REPORT).exists():  # killed on its last steps
+            conclude(folder)
+            return code
+        if code is not Exit.DONE:
+            warn([f"{over}, and was not met; a new container begins another"])
+        return code or None
+    except ResumeError:  # nothing has happened in it
+        return None
+    return resume_by_hand(folder, listen, secrets, fleet)
 
 
 def _check_faults(scenario: Scenario, exchange: str) -> None:
@@ -108,8 +142,11 @@ def _host(
                 verb = name if name == "supervisor" else f"agent {name}"
                 view.note(f"  kantor {verb} --connect {listen} --credentials {secrets}")
             run(host, plan, recording, interrupts, view.show, past, say=view.note)
-    conclude(folder)
+    with Interrupts(patient=True):  # what comes when the mission is over changes nothing
+        conclude(folder)
     result = read_result(folder)
+    if result is not None and result.ended == "done":
+        return verdict(result)
     return interrupts.code or (verdict(result) if result is not None else Exit.PROCESS_FAILED)
 
 

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from kantor_protocol import bus
+from kantor_protocol import bus, memory
 from kantor_protocol.clock import clocks
 from kantor_protocol.credentials import Identity
 from kantor_protocol.diary import DiaryFile
@@ -110,6 +110,8 @@ class _Participant:
         self._wall: _Wall | None = None
         self._cannot = False
         """The diary could not be written when that was last tried."""
+        self._shown = 0
+        """Steps of this process."""
         self.refused = 0
         """Messages from world-sim that could not be read."""
 
@@ -263,6 +265,11 @@ class _Participant:
         self._line.publish_pose(encode(PoseMessage(VERSION, outputs.step, now_ns, outputs.pose)))
         if outputs.weights:
             self._line.publish_weights(outputs.weights)
+        self._shown += 1
+        if (
+            self._shown.bit_count() == 1
+        ):  # kernels are loaded by the first steps, and now and then by a later one
+            memory.leave_compiler()
 
 
 class _Wall:

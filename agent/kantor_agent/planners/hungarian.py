@@ -6,7 +6,6 @@ are therefore assigned to frontiers that lie half a sensor range apart, and from
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 from kantor_agent.planners.team import Situation, Task
 from kantor_protocol.grid import NOWHERE
@@ -93,6 +92,8 @@ def _cheapest(travel: npt.NDArray[np.float64]) -> list[tuple[int, int]]:
     possible = np.isfinite(travel)
     if not possible.any():
         return []
+    from scipy.optimize import linear_sum_assignment  # noqa: PLC0415  20 MB that other planners do without
+
     never = (min(travel.shape) + 1.0) * (travel[possible].max() + 1.0)
     robots, spots = linear_sum_assignment(np.where(possible, travel, never))
     pairs = zip(robots.tolist(), spots.tolist(), strict=True)

@@ -15,7 +15,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import linear_sum_assignment
 
 from kantor_agent.chart import Chart
 from kantor_agent.planners.team import Member, Situation, Task
@@ -441,6 +440,8 @@ class Regions:
         """(n, regions)"""
         rest = (robots, self.accessible, self.diagonal)
         measure_inaccessible(*grid, contour[:edges], *rest, *measured)
+        from scipy.optimize import linear_sum_assignment  # noqa: PLC0415  20 MB that other planners do without
+
         owners, theirs = linear_sum_assignment(self.distance)
         self.owned = np.full(robots.shape[0], NO_REGION)
         """(n,) eq. 4-5; NO_REGION for some if there are fewer regions than robots."""

@@ -1,0 +1,41 @@
+"""What a process lets go of, and what still works then."""
+
+import subprocess
+import sys
+
+_SCRIPT = """
+import re
+from pathlib import Path
+import numpy as np
+from numba import njit
+from kantor_protocol.memory import leave_compiler
+
+def resident_kb():
+    return int(re.search(r"RssFile:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
+
+def compiled(n):
+    @njit
+    def kernel(x):
+        return np.sort(x * n).sum()
+    return kernel
+
+first = compiled(1)
+assert first(np.arange(4.0)) == 6.0
+before = resident_kb()
+leave_compiler()
+print(before - resident_kb())
+assert first(np.arange(4.0)) == 6.0
+assert compiled(2)(np.arange(4.0)) == 12.0
+leave_compiler()
+assert compiled(3)(np.arange(4.0)) == 18.0
+"""
+
+
+def test_the_compiler_is_left_and_comes_back() -> None:
+    """Tens of megabytes are not resident any more; what is compiled runs, and the next compiles."""
+    done = subprocess.run(
+        [sys.executable, "-c", _SCRIPT], capture_output=True, text=True, check=False
+    )
+
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) > 20_000
