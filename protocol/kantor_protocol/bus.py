@@ -301,7 +301,8 @@ class Line:
         fleet, name = identity.fleet, identity.user
         self.nonce = nonce
         self._session = session
-        self._received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._received: queue.SimpleQueue[bytes | BusError] = queue.SimpleQueue()
+        self._identity = identity
         self._block = zenoh.CongestionControl.BLOCK
         self._drop = zenoh.CongestionControl.DROP
         self._tx, self._pose = keys.tx(fleet, name), keys.pose(fleet, name)
@@ -310,13 +311,21 @@ class Line:
             session.declare_subscriber(keys.rx(fleet, name), self._on_message),
             session.liveliness().declare_token(keys.alive(fleet, name, nonce)),
         ]
+        if isinstance(identity, Certificate):
+            self._held.append(session.info.declare_transport_events_listener(self._on_transport))
 
     def next(self, timeout_s: float | None) -> bytes | None:
-        """The next message from world-sim, or None after the timeout."""
+        """The next message from world-sim, or None after the timeout.
+
+        Raises BusError if world-sim was started again and does not let us in any more.
+        """
         try:
-            return self._received.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
+            got = self._received.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
         except queue.Empty:
             return None
+        if isinstance(got, BusError):
+            raise got
+        return got
 
     def send(self, payload: bytes, *, patiently: bool) -> None:
         """Put on the own `tx`. patiently: wait for a full queue rather than drop."""
@@ -338,6 +347,15 @@ class Line:
     def _on_message(self, sample: zenoh.Sample) -> None:
         if self._received.qsize() < QUEUE_MAX:
             self._received.put(sample.payload.to_bytes())
+
+    def _on_transport(self, event: zenoh.TransportEvent) -> None:
+        """We are connected again: perhaps to a world-sim with another register."""
+        assert isinstance(self._identity, Certificate)
+        with contextlib.suppress(zenoh.ZError):  # it is closed meanwhile
+            if event.kind == zenoh.SampleKind.PUT and (
+                objection := _answer_at_door(self._session, self._identity)
+            ):
+                self._received.put(BusError(f"refuses {self._identity.user}: {objection}"))
 
 
 class Watch:
@@ -498,14 +516,24 @@ def _client(connect: str, identity: Identity, patience_s: float) -> zenoh.Sessio
 
 def _knock(connect: str, session: zenoh.Session, identity: Certificate) -> None:
     """Ask whether we are let in: a certificate may be sound and yet not the register's. Raises BusError."""
-    for reply in session.get(
-        keys.door(identity.fleet, identity.name), timeout=settings.HANDSHAKE_S
-    ):
-        if reply.ok is not None:
-            if objection := reply.ok.payload.to_bytes().decode(errors="replace"):
-                raise BusError(f"{connect}: refuses {identity.user}: {objection}")
-            return
-    raise BusError(f"{connect}: no world-sim of fleet {identity.fleet} answers; check --connect")
+    objection = _answer_at_door(session, identity)
+    if objection is None:
+        raise BusError(
+            f"{connect}: no world-sim of fleet {identity.fleet} answers; check --connect"
+        )
+    if objection:
+        raise BusError(f"{connect}: refuses {identity.user}: {objection}")
+
+
+def _answer_at_door(session: zenoh.Session, identity: Certificate) -> str | None:
+    """What the router has against us; None if nobody answers. One that has just been opened may take a moment."""
+    give_up = time.monotonic() + settings.HANDSHAKE_S
+    while time.monotonic() < give_up:
+        for reply in session.get(keys.door(identity.fleet, identity.name), timeout=1.0):
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes().decode(errors="replace")
+        time.sleep(0.02)
+    return None
 
 
 def _open(

@@ -2,7 +2,7 @@
 
 import signal
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -179,6 +179,31 @@ def test_a_revoked_robot_without_manners_is_not_heard(folder: Path) -> None:
 
     assert said == [
         "refused r3: its certificate has been revoked; `kantor keys demo --renew r3` makes a new one"
+    ]
+
+
+def test_a_robot_that_is_revoked_meanwhile_is_told(folder: Path) -> None:
+    """World-sim is started again with the newer register: r3 learns why it is out, r1 just goes on."""
+    endpoint, said = free_endpoint("tls"), []
+    with ExitStack() as robots:
+        with hosted(identity(folder, "worldsim"), endpoint, said) as host:
+            r1, r3 = (
+                robots.enter_context(line(endpoint, identity(folder, name), name, PATIENCE_S))
+                for name in ("r1", "r3")
+            )
+            assert {host.next(PATIENCE_S), host.next(PATIENCE_S)} == {
+                Joined("r1", "r1"), Joined("r3", "r3"),
+            }  # fmt: skip
+        make(folder, revoke=("r3",))
+        with hosted(identity(folder, "worldsim"), endpoint, said) as host:
+            assert host.next(PATIENCE_S) == Joined("r1", "r1")
+            with pytest.raises(BusError, match="refuses r3: its certificate has been revoked"):
+                r3.next(PATIENCE_S)
+            host.send("r1", b"go on", patiently=True)
+            assert r1.next(PATIENCE_S) == b"go on"
+
+    assert [text.partition(";")[0] for text in said] == [
+        "refused r3: its certificate has been revoked"
     ]
 
 
