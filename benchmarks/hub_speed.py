@@ -321,8 +321,10 @@ class _Meter:
 
     @property
     def cost(self) -> Cost:
-        """Between the first and the last look that count."""
-        _, first, *_, last = self._seen
+        """Between the first and the last look that count; a machine that is too busy has fewer."""
+        first, last = (self._seen[1:] or self._seen)[0], self._seen[-1]
+        if last.steps == first.steps:
+            raise RuntimeError("the machine is too busy to measure anything; try again")
         return Cost(*(b - a for a, b in zip(first, last, strict=True)))
 
 
