@@ -56,6 +56,8 @@ COUNTS, COUNTS_QUICK = (10, 50, 100, 200), (10, 50)
 LINKS = ("tcp", "tls", "site")
 """Passwords over TCP; certificates over TLS; and the same with a site's router between all robots and the hub."""
 RATES_HZ = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0)
+SITE_MAX = 100
+"""Robots behind one site."""
 WARM_S, MEASURED_S = 1.0, 3.0
 """Real seconds of a mission that are left out, and that count."""
 START_S = 60.0
@@ -104,6 +106,8 @@ class Pace(NamedTuple):
     @property
     def p99_s(self) -> float:
         """Within which 99 of 100 answers came."""
+        if len(self.answers_s) < 100:
+            return math.inf
         return statistics.quantiles(self.answers_s, n=100)[98]
 
     @property
@@ -116,7 +120,7 @@ class Pace(NamedTuple):
         """CPU of the site per robot-tick, handshakes included."""
         if self.site_cpu_s is None:
             return None
-        return 1e6 * self.site_cpu_s / len(self.answers_s)
+        return 1e6 * self.site_cpu_s / max(1, len(self.answers_s))
 
 
 def measure(*, quick: bool) -> Table:
@@ -126,6 +130,8 @@ def measure(*, quick: bool) -> Table:
     rows = []
     for link in LINKS:
         for count in COUNTS_QUICK if quick else COUNTS:
+            if link == "site" and count > SITE_MAX:
+                continue
             load, pace = _highest(count, link)
             cost = pace.cost
             per_core = cost.steps / cost.cpu_s
@@ -136,7 +142,7 @@ def measure(*, quick: bool) -> Table:
                     f"{load.rate_hz:.0f}" if _carries(load, pace) else "-",
                     f"{count * load.rate_hz:,.0f}",
                     f"{cost.steps / cost.real_s:,.0f}",
-                    f"{1e3 * statistics.median(pace.answers_s):.1f}",
+                    f"{1e3 * statistics.median(pace.answers_s or [math.inf]):.1f}",
                     f"{1e3 * pace.p99_s:.1f}",
                     f"{100 * pace.held / max(1, len(pace.answers_s) + pace.held):.1f}",
                     f"{pace.us:.0f}",
@@ -321,9 +327,10 @@ class _Meter:
 
     @property
     def cost(self) -> Cost:
-        """Between the first and the last look that count."""
-        _, first, *_, last = self._seen
-        return Cost(*(b - a for a, b in zip(first, last, strict=True)))
+        """Between the first and the last look that count; a machine that is too busy has fewer."""
+        first, last = (self._seen[1:] or self._seen)[0], self._seen[-1]
+        spent = Cost(*(b - a for a, b in zip(first, last, strict=True)))
+        return spent._replace(steps=max(1, spent.steps), real_s=max(PERIOD_S, spent.real_s))
 
 
 def _be_site(connect: str, listen: str, place: Path, pipe: Connection) -> None:

@@ -24,7 +24,7 @@ def command_of(unit: str, instance: str, folder: Path) -> list[str]:
     """The command of a unit, with systemd's specifiers and the variables of kantor.env filled in."""
     lines = (UNITS / unit).read_text().splitlines()
     (line,) = (line for line in lines if line.startswith("ExecStart="))
-    for specifier, value in (("%i", instance), ("%d", folder), ("%S", folder)):
+    for specifier, value in (("%i", instance), ("%d", folder), ("%S", folder), ("%t", folder)):
         line = line.replace(specifier, str(value))
     for name, value in SETTINGS.items():
         line = line.replace(f"${{{name}}}", value).replace(f"${name}", value)

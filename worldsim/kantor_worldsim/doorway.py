@@ -41,6 +41,9 @@ COME_BACK_S = 3.0
 """How soon whoever is cut off because world-sim was frozen is back."""
 PROGRESS_S = 0.2
 """From one word to observers to the next."""
+AGAIN_S = 1.0
+"""After so long, whoever is there and has not answered is told again. Behind a site's router a process may be
+seen before it can be reached."""
 POLL_S = 0.02
 """From one look at what is awaited to the next."""
 
@@ -83,6 +86,8 @@ class Doorway:
         self._admission = Admission(plan.scenario.roster)
         self._met: set[str] = set()
         """Nonces of the processes that have got ready."""
+        self._briefed_s: dict[ParticipantId, float] = {}
+        """When each that is there and not ready was told its mission."""
         self._away: set[ParticipantId] = set()
         """Those that left without an excuse, or never came."""
         self._doubtful: set[ParticipantId] = set()
@@ -145,6 +150,7 @@ class Doorway:
     def next(self, timeout_s: float) -> tuple[ParticipantId, Report] | None:
         """The next report, or None when something else came or the timeout passed."""
         self._mind_own_absence()
+        self._brief_again()
         event = self.host.next(timeout_s)
         self._looked_s = time.monotonic()
         if isinstance(event, Joined):
@@ -208,8 +214,20 @@ class Doorway:
         refusal = Refusal(VERSION, event.nonce, reason)
         self.host.send(event.name, encode(refusal), patiently=True)
 
+    def _brief_again(self) -> None:
+        """Tell those that are there and not ready what may not have reached them."""
+        now_s = time.monotonic()
+        due = [name for name, told_s in self._briefed_s.items() if now_s - told_s > AGAIN_S]
+        for name in due:
+            nonce = self._admission.player(name)
+            if nonce is None or name in self.ready:
+                del self._briefed_s[name]
+            else:
+                self._brief(Joined(name, nonce))
+
     def _brief(self, event: Joined) -> None:
         plan = self._plan
+        self._briefed_s[event.name] = time.monotonic()
         mission = Mission(
             VERSION,
             event.nonce,

@@ -16,7 +16,7 @@ from kantor_protocol.messages import (
     Turn,
     encode,
 )
-from kantor_worldsim.doorway import Doorway, wait_for
+from kantor_worldsim.doorway import AGAIN_S, Doorway, wait_for
 from kantor_worldsim.hands import Order
 
 BARRIER_S = 10.0
@@ -32,16 +32,18 @@ class Lockstep:
     def __call__(
         self, inputs: Mapping[ParticipantId, Inputs], /
     ) -> Mapping[ParticipantId, Outputs]:
-        """Step all of a batch. Whoever comes back meanwhile is asked again."""
+        """Step all of a batch. Whoever comes back meanwhile, or is silent, is asked again."""
         doorway = self._doorway
         outputs: dict[ParticipantId, Outputs] = {}
-        asked: dict[ParticipantId, int] = {}
+        asked: dict[ParticipantId, tuple[int, float]] = {}
         give_up = time.monotonic() + BARRIER_S
         while time.monotonic() < give_up:
             for name in inputs:
-                visit = doorway.visits[name]
-                if name in doorway.ready and name not in outputs and asked.get(name) != visit:
-                    asked[name] = visit
+                visit, now_s = doorway.visits[name], time.monotonic()
+                before, asked_s = asked.get(name, (-1, 0.0))
+                due = before != visit or now_s - asked_s > AGAIN_S
+                if name in doorway.ready and name not in outputs and due:
+                    asked[name] = visit, now_s
                     doorway.host.send(name, encode(Turn(VERSION, inputs[name])), patiently=True)
             if all(name in outputs or not doorway.is_expected(name) for name in inputs):
                 break
