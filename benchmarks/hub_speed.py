@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 from tables import Table
 
 from kantor_agent.core import Agent
+from kantor_fleet import authority
 from kantor_fleet.catalog import find
 from kantor_fleet.local import _LIGHT_RUNTIME
 from kantor_fleet.preload import warm_up
@@ -52,11 +53,13 @@ from kantor_worldsim.recording import Recording
 from kantor_worldsim.world import Site
 
 COUNTS, COUNTS_QUICK = (10, 50, 100, 200), (10, 50)
+LINKS = ("tcp", "tls", "site")
+"""Passwords over TCP; certificates over TLS; and the same with a site's router between all robots and the hub."""
 RATES_HZ = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0)
 WARM_S, MEASURED_S = 1.0, 3.0
 """Real seconds of a mission that are left out, and that count."""
 START_S = 60.0
-ROBOTS_PER_PROCESS = 100
+ROBOTS_PER_PROCESS = 50
 FLEET = "hub"
 PERIOD_S = 0.1
 """Of the scenario. Other rates are the same mission at another speed."""
@@ -71,8 +74,8 @@ class Load(NamedTuple):
 
     count: int
     rate_hz: float
-    scheme: str
-    """`tcp` or `tls`."""
+    link: str
+    """One of LINKS."""
 
 
 class Cost(NamedTuple):
@@ -95,6 +98,8 @@ class Pace(NamedTuple):
     """From a report to its answer."""
     held: int
     """Steps that were due and could not be made, since the world's answer was not there."""
+    site_cpu_s: float | None = None
+    """Of a site's router, from its start to its end."""
 
     @property
     def p99_s(self) -> float:
@@ -106,20 +111,27 @@ class Pace(NamedTuple):
         """CPU of the hub per robot-tick."""
         return 1e6 * self.cost.cpu_s / self.cost.steps
 
+    @property
+    def site_us(self) -> float | None:
+        """CPU of the site per robot-tick, handshakes included."""
+        if self.site_cpu_s is None:
+            return None
+        return 1e6 * self.site_cpu_s / len(self.answers_s)
+
 
 def measure(*, quick: bool) -> Table:
     """For each number of robots the highest rate that is carried, and what a robot-tick costs there."""
     warm_up()
     get_context("forkserver").set_forkserver_preload(["kantor_fleet.preloaded"])
     rows = []
-    for scheme in SCHEMES:
+    for link in LINKS:
         for count in COUNTS_QUICK if quick else COUNTS:
-            load, pace = _highest(count, scheme)
+            load, pace = _highest(count, link)
             cost = pace.cost
             per_core = cost.steps / cost.cpu_s
             rows.append(
                 (
-                    scheme,
+                    link,
                     f"{count}",
                     f"{load.rate_hz:.0f}" if _carries(load, pace) else "-",
                     f"{count * load.rate_hz:,.0f}",
@@ -130,6 +142,7 @@ def measure(*, quick: bool) -> Table:
                     f"{pace.us:.0f}",
                     f"{1e6 * cost.main_s / cost.steps:.0f}",
                     f"{per_core:,.0f}",
+                    "" if pace.site_us is None else f"{pace.site_us:.0f}",
                 )
             )
     return Table(
@@ -146,9 +159,11 @@ def measure(*, quick: bool) -> Table:
             "hub CPU, us/robot-tick",
             "of that its loop",
             "robot-ticks per CPU second",
+            "site CPU, us/robot-tick",
         ),
         rows,
         (
+            "site: by TLS, with a site's router between all robots and the hub",
             f"rates tried: {', '.join(f'{rate:g}' for rate in RATES_HZ)} Hz, {MEASURED_S:g} s each;",
             "carried: p99 of answers below a period, and 95 % of the steps done;",
             "robots share the machine with the hub: the rate is what both together reach.",
@@ -156,12 +171,12 @@ def measure(*, quick: bool) -> Table:
     )
 
 
-def _highest(count: int, scheme: str) -> tuple[Load, Pace]:
+def _highest(count: int, link: str) -> tuple[Load, Pace]:
     """The highest rate that is carried; or the lowest, if none is. It starts where a core would do it."""
     tried: dict[int, tuple[Load, Pace]] = {}
 
     def attempt(rung: int) -> bool:
-        load = Load(count, RATES_HZ[rung], scheme)
+        load = Load(count, RATES_HZ[rung], link)
         tried[rung] = load, _mission(load)
         return _carries(*tried[rung])
 
@@ -181,23 +196,37 @@ def _carries(load: Load, pace: Pace) -> bool:
 
 
 def _mission(load: Load) -> Pace:
-    """A mission with the hub in one process and the robots in a few."""
-    context = get_context("forkserver")
+    """A mission with the hub in one process, the robots in a few, and perhaps a site in one."""
+    names = _scenario(load).robot_ids
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         place = Path(folder)
-        endpoint = _endpoint(load, place)
-        names = _scenario(load).robot_ids
-        pipes = [_start(stack, context, _be_hub, load, endpoint, place)]
-        for first in range(0, load.count, ROBOTS_PER_PROCESS):
-            some = names[first : first + ROBOTS_PER_PROCESS]
-            pipes.append(_start(stack, context, _be_robots, some, endpoint, place))
-        cost = _told(pipes[0], load)
+        hub, connect = _endpoint(load), _endpoint(load)
+        _issue(load, place)
+        hub_pipe = _start(stack, _be_hub, load, hub, place)
+        site_pipe = None
+        if load.link == "site":
+            site_pipe = _start(stack, _be_site, hub, connect, place)
+        robots = [
+            _start(stack, _be_robots, some, connect if site_pipe else hub, place)
+            for some in batched(names, ROBOTS_PER_PROCESS)
+        ]
+        cost = _told(hub_pipe, load)
         parts = []
-        for pipe in pipes[1:]:
+        for pipe in robots:
             pipe.send(None)  # whoever has lost the last word from the hub ends as well
             parts.append(_told(pipe, load))
-    answers_s = [answer for part, _ in parts for answer in part]
-    return Pace(cost, answers_s, sum(held for _, held in parts))
+        answers_s = [answer for part, _ in parts for answer in part]
+        pace = Pace(cost, answers_s, sum(held for _, held in parts))
+        if site_pipe is not None:
+            site_pipe.send(None)
+            pace = pace._replace(site_cpu_s=_told(site_pipe, load))
+    return pace
+
+
+def batched(names: Sequence[str], size: int) -> Iterator[Sequence[str]]:
+    """In groups of at most so many."""
+    for first in range(0, len(names), size):
+        yield names[first : first + size]
 
 
 def _told(pipe: Connection, load: Load) -> Any:
@@ -206,11 +235,10 @@ def _told(pipe: Connection, load: Load) -> Any:
     return pipe.recv()
 
 
-def _start(
-    stack: ExitStack, context: object, target: Callable[..., None], *arguments: object
-) -> Connection:
-    ours, theirs = context.Pipe()  # type: ignore[attr-defined]
-    process = context.Process(target=target, args=(*arguments, theirs))  # type: ignore[attr-defined]
+def _start(stack: ExitStack, target: Callable[..., None], *arguments: object) -> Connection:
+    context = get_context("forkserver")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=target, args=(*arguments, theirs))
     process.start()
     theirs.close()
     stack.callback(process.join, 5.0)
@@ -218,13 +246,19 @@ def _start(
     return ours
 
 
-SCHEMES = ("tcp",)
+def _endpoint(load: Load) -> str:
+    """A loopback endpoint that nobody uses now."""
+    return bus.free_endpoint("tcp" if load.link == "tcp" else "tls")
 
 
-def _endpoint(load: Load, place: Path) -> str:
-    """Where the hub listens; identities of everybody are in the folder then."""
-    credentials.issue(place, FLEET, _scenario(load).robot_ids)
-    return bus.free_endpoint()
+def _issue(load: Load, place: Path) -> None:
+    """Identities for everybody."""
+    names = _scenario(load).robot_ids
+    if load.link == "tcp":
+        credentials.issue(place, FLEET, names)
+    else:
+        sites = (f"north={','.join(names)}",) if load.link == "site" else ()
+        authority.issue(place, authority.Wanted(FLEET, load.count, sites=sites), authority.today())
 
 
 def _scenario(load: Load) -> Scenario:
@@ -242,7 +276,7 @@ def _scenario(load: Load) -> Scenario:
         "domain": {"min_m": [0.0, 0.0], "max_m": [SIDE_M, SIDE_M]},
         "robots": {"count": load.count},
         "starts": {"random": True},
-        "samples": {"count": 100 * load.count},
+        "samples": {"count": 2000},
         "energy": {"points": 2_000_000, "steps": 2_000_000},
         "radio": {"range_m": range_m},
         "density": density,
@@ -281,9 +315,7 @@ class _Meter:
     def look(self, progress: object) -> None:
         """Whenever observers are told."""
         if getattr(progress, "phase", "") == "running":
-            reading = Cost(
-                self._steps(), time.process_time(), time.thread_time(), time.monotonic()
-            )
+            reading = Cost(self._steps(), time.process_time(), time.thread_time(), time.monotonic())
             if not self._seen or reading.real_s > self._seen[0].real_s + WARM_S:
                 self._seen.append(reading)
 
@@ -292,6 +324,16 @@ class _Meter:
         """Between the first and the last look that count."""
         _, first, *_, last = self._seen
         return Cost(*(b - a for a, b in zip(first, last, strict=True)))
+
+
+def _be_site(connect: str, listen: str, place: Path, pipe: Connection) -> None:
+    bus.init_log()
+    identity = credentials.find(place, "site-north")
+    assert isinstance(identity, credentials.Certificate)
+    with bus.Site(identity, connect, listen, START_S):
+        pipe.recv()
+        pipe.send(time.process_time())
+        os._exit(0)
 
 
 # The robots' processes.
@@ -383,7 +425,7 @@ class _Robot:
         assert self._go is not None
         now_ns = round((time.monotonic_ns() - self._origin_ns) * self._go.speed)
         if now_ns < self._clock.due_ns(self._ordinal):
-            if self._waits and time.monotonic() - self._said_s > AGAIN_S:
+            if self._waits and time.monotonic() - self._again_s > AGAIN_S:
                 self._say()
             return False
         self._skip(now_ns)
@@ -408,4 +450,5 @@ class _Robot:
         return True
 
     def _say(self) -> None:
+        self._again_s = time.monotonic()
         self._line.send(self._report, patiently=False)

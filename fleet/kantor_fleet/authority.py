@@ -50,6 +50,7 @@ _HOSTS = ("localhost", "127.0.0.1", "::1")
 """Names that every router's certificate has, beside its id."""
 _SITE = "site-"
 """What the id of a site's router begins with."""
+_SITE_PATTERN = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
 _ROBOT_PATTERN = re.compile(r"r[1-9][0-9]{0,3}")
 _HOST_PATTERN = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(\.(?!-)[A-Za-z0-9-]{1,63})*")
 
@@ -73,9 +74,10 @@ class Authority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The fields of a router's identity that say whom it lets in."""
         if router == HOST:
             return {"revoked": self.revoked, "members": self.members, "sites": self.sites}
-        names = (HOST, *self.sites[router])
+        names = (HOST, *self.sites.get(router, ()))
         members = {user: self.members[user] for user in names if user in self.members}
-        return {"revoked": self.revoked, "members": members}
+        revoked = tuple(name for name in self.revoked if name.partition(".")[0] in names)
+        return {"revoked": revoked, "members": members}
 
 
 class Wanted(msgspec.Struct, frozen=True):
@@ -159,7 +161,8 @@ def _fresh(before: Authority | None, authority: Authority, wanted: Wanted) -> li
     robots = [f"r{number}" for number in range(1, wanted.robots + 1)]
     supervisor = [SUPERVISOR] if wanted.supervisor else []
     users = (HOST, OBSERVER, *authority.sites, *supervisor, *robots)
-    without = _withdrawn(authority) | set(authority.members)
+    named = {*_placed(wanted), *wanted.renew}
+    without = (_withdrawn(authority) - named) | set(authority.members)
     renamed = [
         user
         for user in authority.hosts
@@ -169,11 +172,7 @@ def _fresh(before: Authority | None, authority: Authority, wanted: Wanted) -> li
     fresh = sorted({*missing, *renamed, *wanted.renew}, key=_order)
     for site, there in authority.sites.items():
         for name in there:
-            if (
-                name not in authority.members
-                and name not in fresh
-                and name not in _withdrawn(authority)
-            ):
+            if name not in {*authority.members, *fresh, *_withdrawn(authority)}:
                 label = f"--site {site.removeprefix(_SITE)}"
                 raise CredentialsError(
                     f"{label}: the register has no {name}; add --robots {name[1:]}"
@@ -195,13 +194,8 @@ def _routers(
     for router in (HOST, *authority.sites):
         path = folder / f"{router}.toml"
         old = made.get(router) or read(path, Certificate)
-        same = (
-            before is not None
-            and router in before.members
-            and (router == HOST or router in before.sites)
-            and before.register(router) == authority.register(router)
-        )
         if old is None or old.name != authority.members[router].name:
+            same = before is not None and before.register(router) == authority.register(router)
             if same and not path.exists():
                 continue  # it has been handed out
             raise CredentialsError(
@@ -279,7 +273,7 @@ def _placed(wanted: Wanted) -> Sites:
     for text in wanted.sites:
         site, _, names = text.partition("=")
         there = tuple(names.split(","))
-        if not FLEET_PATTERN.fullmatch(site) or not all(map(_ROBOT_PATTERN.fullmatch, there)):
+        if not _SITE_PATTERN.fullmatch(site) or not all(map(_ROBOT_PATTERN.fullmatch, there)):
             raise CredentialsError(f"--site {text}: write it as --site north=r1,r2")
         placed[f"{_SITE}{site}"] = there
     everybody = [name for there in placed.values() for name in there]
@@ -355,7 +349,9 @@ def _save(path: Path, content: Authority | Certificate) -> None:
 def _found(fleet: str, now: datetime) -> Authority:
     """A new authority."""
     key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"{fleet}-{secrets.token_hex(4)}")])
+    name = x509.Name(
+        [x509.NameAttribute(NameOID.COMMON_NAME, f"{fleet[:48]}-{secrets.token_hex(4)}")]
+    )
     usage = dict.fromkeys(_USAGES, False) | {"key_cert_sign": True, "crl_sign": True}
     certificate = (
         _unsigned(name, key.public_key(), now, now + timedelta(days=_AUTHORITY_DAYS))

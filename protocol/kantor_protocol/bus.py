@@ -84,7 +84,7 @@ class Host:
         self,
         identity: Identity,
         listen: str,
-        users_file: Path,
+        users_file: Path | None,
         roster: tuple[ParticipantId, ...],
         say: Callable[[str], None] = lambda _line: None,
     ) -> None:
@@ -483,6 +483,7 @@ def _client(connect: str, identity: Identity, patience_s: float) -> zenoh.Sessio
     try:
         session = _open("client", settings.client(identity), connect=connect)
     except zenoh.ZError:
+        await_endpoint(connect, 0.0, identity)  # which may have changed since
         raise BusError(
             f"{connect}: refuses {identity.user}; its credentials are not this world-sim's"
         ) from None

@@ -29,10 +29,17 @@ _USERS = "users.txt"
 _PEM_MAX = 16_384
 """Characters of a certificate or a key; what is longer is none."""
 FLEET_PATTERN = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+NAME_PATTERN = re.compile(r"[a-z0-9-]{1,69}\.[0-9a-f]{16}")
+"""Names of certificates."""
 
 
 class CredentialsError(ValueError):
     """Credentials that are missing or no use; the message is one line with the remedy."""
+
+
+def _check_fleet(fleet: str) -> None:
+    if not FLEET_PATTERN.fullmatch(fleet):
+        raise ValueError(f"{fleet} is no name of a fleet")
 
 
 class Password(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -41,6 +48,10 @@ class Password(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fleet: str
     user: ParticipantId
     password: str
+
+    def __post_init__(self) -> None:
+        """Refuse a fleet that is no name. Raises ValueError."""
+        _check_fleet(self.fleet)
 
 
 class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -72,11 +83,16 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """World-sim's: for each site the robots that stand behind it."""
 
     def __post_init__(self) -> None:
-        """Refuse parts that cannot be what they should be."""
-        if self.until.tzinfo is None or any(
-            member.until.tzinfo is None for member in self.members.values()
+        """Refuse what no authority has made. Raises ValueError."""
+        _check_fleet(self.fleet)
+        for user, name, until in (
+            (self.user, self.name, self.until),
+            *((user, member.name, member.until) for user, member in self.members.items()),
         ):
-            raise ValueError("a time without its zone")
+            if not NAME_PATTERN.fullmatch(name) or name.partition(".")[0] != user:
+                raise ValueError(f"{name} is no name of a certificate of {user}")
+            if until.utcoffset() != timedelta(0):
+                raise ValueError("a time without its zone")
         if any(len(part) > _PEM_MAX for part in (self.authority, self.certificate, self.key)):
             raise ValueError("no PEM")
 
@@ -188,18 +204,26 @@ _ANEW = "delete it and let world-sim, or `kantor keys --renew`, make it anew"
 
 
 def _read(path: Path) -> Identity | None:
-    return read(path, Password) or read(path, Certificate)
+    tree = _tree(path)
+    return _converted(tree, Password) or _converted(tree, Certificate)
 
 
 def read(path: Path, kind: type[T]) -> T | None:
     """A TOML file as a Struct; None if it is none."""
+    return _converted(_tree(path), kind)
+
+
+def _tree(path: Path) -> dict[str, Any]:
     try:
-        return msgspec.convert(tomllib.loads(path.read_text(encoding="utf-8")), kind)
-    except (
-        OSError,
-        ValueError,
-        RecursionError,
-    ):  # not to be read, no text, no TOML, nothing of the kind
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):  # not to be read, no text, no TOML
+        return {}
+
+
+def _converted(tree: dict[str, Any], kind: type[T]) -> T | None:
+    try:
+        return msgspec.convert(tree, kind)
+    except (ValueError, RecursionError):
         return None
 
 

@@ -24,6 +24,7 @@ from fuzz.mutations import (
     pick,
     text_spans,
 )
+from kantor_fleet import authority
 from kantor_fleet.team import play
 from kantor_protocol import credentials
 from kantor_protocol.diary import DiaryFile
@@ -309,8 +310,9 @@ def identities() -> Mutations:
     """Credentials files."""
     with tempfile.TemporaryDirectory() as folder:
         credentials.issue(Path(folder), "kantor", ("r1", "r2"))
-        contents = [path.read_bytes() for path in sorted(Path(folder).glob("*.toml"))]
-    return texts(contents, TOML_TOKENS)
+        authority.issue(Path(folder) / "keys", authority.Wanted("kantor", 2), authority.today())
+        contents = [path.read_bytes() for path in sorted(Path(folder).rglob("*.toml"))]
+    return texts(contents, (*TOML_TOKENS, b"r1.0123456789abcdef", b"2027-01-01T00:00:00+00:00"))
 
 
 def journals() -> Mutations:

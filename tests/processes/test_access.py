@@ -1,18 +1,21 @@
 """The radio cannot be gone around: real Zenoh clients that try, beside a legitimate run."""
 
 import json
-import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
 import msgpack
+import msgspec
 import pytest
 import zenoh
 
+from intruders import plain_client
+from kantor_fleet.authority import Wanted, issue
+from kantor_protocol import credentials, settings
 from kantor_protocol.bus import free_endpoint
+from kantor_protocol.credentials import Certificate, Password
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -20,31 +23,23 @@ if TYPE_CHECKING:
 ROOT = "kantor/v1/kantor"
 
 
-@contextmanager
-def client(endpoint: str, user: str | None, password: str = "") -> Iterator[zenoh.Session]:
-    """A plain Zenoh client, with or without an identity."""
-    config = zenoh.Config()
-    settings = {
-        "mode": "client",
-        "connect/endpoints": [endpoint],
-        "connect/timeout_ms": 1000,
-        "scouting/multicast/enabled": False,
-    }
-    if user is not None:
-        settings["transport/auth/usrpwd"] = {"user": user, "password": password}
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    session = zenoh.open(config)
-    try:
-        yield session
-    finally:
-        session.close()
+def proof_of(folder: Path, user: str) -> settings.Settings:
+    """How a user shows who it is."""
+    return settings.client(credentials.find(folder / "credentials", user))
 
 
-def password_of(folder: Path, user: str) -> str:
-    """What world-sim wrote for a user."""
-    tree = tomllib.loads((folder / "credentials" / f"{user}.toml").read_text())
-    return str(tree["password"])
+def strangers(folder: Path) -> list[settings.Settings]:
+    """What does not get anybody onto the bus."""
+    r2 = credentials.find(folder / "credentials", "r2")
+    if isinstance(r2, Password):
+        guesses = [Password("kantor", "r1", "guess"), Password("kantor", "r7", r2.password)]
+    else:
+        issue(folder / "foreign", Wanted("kantor", 1), datetime.now(UTC))
+        foreign = credentials.find(folder / "foreign", "r1")
+        assert isinstance(foreign, Certificate)
+        guesses = [foreign, msgspec.structs.replace(foreign, authority=r2.authority)]
+    short = {"connect/timeout_ms": 500}
+    return [short, *(settings.client(guess) | short for guess in guesses)]
 
 
 def hear(session: zenoh.Session, *keys: str) -> "SimpleQueue[tuple[str, bytes]]":
@@ -80,7 +75,8 @@ def malformed() -> list[bytes]:
     ]
 
 
-def test_nobody_reads_or_writes_past_the_radio(kantor: "Kantor") -> None:
+@pytest.mark.parametrize("kind", ["tcp", "tls"])
+def test_nobody_reads_or_writes_past_the_radio(kantor: "Kantor", kind: str) -> None:
     """A stranger, and a robot that misbehaves, beside a legitimate run.
 
     Neither reads another robot's traffic, neither can publish as another, what is malformed is counted
@@ -88,7 +84,9 @@ def test_nobody_reads_or_writes_past_the_radio(kantor: "Kantor") -> None:
     """
     alone = kantor("run", "paper-decentralized", "--seed", 3, "--exchange", "in-process")
     assert alone.code == 0
-    endpoint = free_endpoint()
+    endpoint = free_endpoint(kind)
+    if kind == "tls":
+        issue(kantor.folder / "credentials", Wanted("kantor", 2), datetime.now(UTC))
     world = kantor.start(
         "worldsim",
         "paper-decentralized",
@@ -101,18 +99,17 @@ def test_nobody_reads_or_writes_past_the_radio(kantor: "Kantor") -> None:
     )
     assert world.stdout is not None
     assert any(line.startswith("t=") for line in world.stdout)
-    r2 = password_of(kantor.folder, "r2")
+    r2, observer_proof = proof_of(kantor.folder, "r2"), proof_of(kantor.folder, "observer")
 
-    for user, password in ((None, ""), ("r1", "guess"), ("r7", r2)):
-        with pytest.raises(zenoh.ZError), client(endpoint, user, password):
+    for proof in strangers(kantor.folder):
+        with pytest.raises(zenoh.ZError), plain_client(endpoint, proof):
             pass  # pragma: no cover
 
-    observer_password = password_of(kantor.folder, "observer")
     with (
-        client(endpoint, "observer", observer_password) as observer,
-        client(endpoint, "observer", observer_password) as scribe,
-        client(endpoint, "r2", r2) as rogue,
-        client(endpoint, "r2", r2) as eavesdropper,  # apart, since a session hears its own puts
+        plain_client(endpoint, observer_proof) as observer,
+        plain_client(endpoint, observer_proof) as scribe,
+        plain_client(endpoint, r2) as rogue,
+        plain_client(endpoint, r2) as eavesdropper,  # apart, since a session hears its own puts
     ):
         seen = hear(observer, f"{ROOT}/**")
         stolen = hear(
@@ -123,6 +120,7 @@ def test_nobody_reads_or_writes_past_the_radio(kantor: "Kantor") -> None:
             f"{ROOT}/r1/rx",
             f"{ROOT}/r1/tx",
             f"{ROOT}/*/pose",
+            f"{ROOT}/door/**",
         )
         token = rogue.liveliness().declare_token(f"{ROOT}/r1/alive/forged")
         robots = [kantor.start("agent", name, "--connect", endpoint) for name in ("r1", "r2")]
@@ -158,7 +156,7 @@ def test_an_oversized_message_does_not_reach_world_sim(kantor: "Kantor") -> None
     )  # fmt: skip
     assert world.stdout is not None
     assert any(line.startswith("t=") for line in world.stdout)
-    with client(endpoint, "r1", password_of(kantor.folder, "r1")) as rogue:
+    with plain_client(endpoint, proof_of(kantor.folder, "r1")) as rogue:
         rogue.put(
             f"{ROOT}/r1/tx", bytes(8_000_000), congestion_control=zenoh.CongestionControl.BLOCK
         )

@@ -1,0 +1,23 @@
+"""Those who come to the bus with Zenoh alone, and keep to no manners of ours."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import zenoh
+
+from kantor_protocol import settings
+
+
+@contextmanager
+def plain_client(endpoint: str, proof: settings.Settings) -> Iterator[zenoh.Session]:
+    """A plain Zenoh client, with some proof of who it is or with none. It asks nobody whether it may."""
+    config = zenoh.Config()
+    known = settings.everywhere("client", endpoint, None) | {"connect/timeout_ms": 1000}
+    for key, value in (known | proof).items():
+        config.insert_json5(key, json.dumps(value))
+    session = zenoh.open(config)
+    try:
+        yield session
+    finally:
+        session.close()

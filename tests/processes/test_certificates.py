@@ -1,0 +1,326 @@
+"""Whoever does not belong is refused and told why, and so is world-sim; certificates on the real bus."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+import pytest
+import zenoh
+
+from fleets import await_line
+from intruders import plain_client
+from kantor_fleet.authority import Wanted, issue
+from kantor_protocol import credentials, keys, settings
+from kantor_protocol.bus import BusError, Heard, Host, Joined, Left, free_endpoint, line
+from kantor_protocol.credentials import Certificate, Identity
+
+if TYPE_CHECKING:
+    from conftest import Kantor
+
+FLEET, ROSTER = "demo", ("r1", "r2", "r3")
+NOW = datetime.now(UTC)
+PATIENCE_S = 20.0
+BLOCK = zenoh.CongestionControl.BLOCK
+
+
+def make(folder: Path, now: datetime = NOW, **wanted: object) -> None:
+    """What `kantor keys demo` does."""
+    issue(folder, Wanted(FLEET, **wanted), now)  # type: ignore[arg-type]
+
+
+def identity(folder: Path, user: str) -> Certificate:
+    """Whose certificate is in a folder."""
+    found = credentials.find(folder, user)
+    assert isinstance(found, Certificate)
+    return found
+
+
+@contextmanager
+def hosted(who: Certificate, endpoint: str, said: list[str]) -> Iterator[Host]:
+    """World-sim's end of the bus, or what passes itself off as it."""
+    with Host(who, endpoint, None, ROSTER, said.append) as host:
+        yield host
+
+
+def join(endpoint: str, who: Identity) -> None:
+    """Come and go."""
+    with line(endpoint, who, "nonce", PATIENCE_S):
+        pass
+
+
+def refusal(endpoint: str, who: Certificate) -> str:
+    """Why somebody is not let in."""
+    with pytest.raises(BusError) as caught:
+        join(endpoint, who)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The certificates of a fleet of three."""
+    make(tmp_path / "keys", robots=3)
+    return tmp_path / "keys"
+
+
+def test_world_sim_and_whoever_is_refused_both_say_why(kantor: "Kantor") -> None:
+    """No certificate, a foreign authority, an expired one, one that was replaced or revoked, an unknown one."""
+    folder = kantor.folder / "keys"
+    make(folder, robots=1)
+    make(folder, NOW - timedelta(days=3), renew=("r1",), days=1)
+    expired = identity(folder, "r1")
+    make(folder, renew=("r1",))
+    replaced = identity(folder, "r1")
+    make(folder, renew=("r1",))
+    make(folder, robots=4)
+    revoked = identity(folder, "r2")
+    make(folder, revoke=("r2",))
+    make(kantor.folder / "foreign", robots=1)
+    foreign = identity(kantor.folder / "foreign", "r1")
+    ours = identity(folder, "r1")
+    mixed = msgspec.structs.replace(foreign, authority=ours.authority)
+    endpoint = free_endpoint("tls")
+    world = kantor.start(
+        "worldsim",
+        "paper-single",
+        "--listen",
+        endpoint,
+        "--credentials",
+        "keys",
+        "--start-after",
+        99,
+    )
+    await_line(world, "t=")
+
+    with pytest.raises(zenoh.ZError), plain_client(endpoint, anonymous(ours)):
+        pass  # pragma: no cover
+    told = [
+        refusal(endpoint, expired),
+        refusal(endpoint, mixed),
+        refusal(endpoint, foreign),
+        refusal(endpoint, replaced),
+        refusal(endpoint, revoked),
+        refusal(endpoint, identity(folder, "r3")),
+    ]
+    join(endpoint, ours)
+    world.send_signal(signal.SIGINT)
+    out, err = world.communicate(timeout=60)
+
+    assert [text.removeprefix(f"{endpoint}: ") for text in told] == [
+        "refuses r1: its certificate has expired; `kantor keys demo --renew r1` makes a new one",
+        (
+            "refuses r1: its certificate is from another authority; use the file that this fleet's "
+            "`kantor keys` has made"
+        ),
+        (
+            "what answers has a certificate from another authority (unable to get local issuer certificate); "
+            "it is not the world-sim of this identity's fleet demo"
+        ),
+        (
+            "refuses r1: the register names another certificate; use the newest r1.toml, or "
+            "`kantor keys demo --renew r1` makes a new one"
+        ),
+        "refuses r2: its certificate has been revoked; `kantor keys demo --renew r2` makes a new one",
+        "refuses r3: is not in the team; choose another id",
+    ]
+    for reason in (
+        "refused a client: it showed no certificate",
+        "refused a client: its certificate has expired",
+        "refused a client: its certificate is from another authority",
+        "refused a client: it trusts another authority than world-sim's",
+        "refused r1: the register names another certificate",
+        "refused r2: its certificate has been revoked",
+        "refused r3: is not in the team",
+    ):
+        assert 1 <= out.count(reason) <= 2, (reason, out + err)  # at once, and how often at the end
+    assert "handshake" not in out + err
+    assert err.count("\n") <= 1
+
+
+def anonymous(ours: Certificate) -> settings.Settings:
+    """The settings of somebody who trusts the authority and has no certificate."""
+    own = settings.client(ours)
+    authority = own["transport/link/tls"]["root_ca_certificate_base64"]
+    return own | {
+        "connect/timeout_ms": 500,
+        "transport/link/tls": {"root_ca_certificate_base64": authority, "enable_mtls": False},
+    }
+
+
+def test_a_revoked_robot_without_manners_is_not_heard(folder: Path) -> None:
+    """Plain Zenoh with the key of a revoked robot: it may connect, and neither speaks, lives nor listens."""
+    stolen = identity(folder, "r3")
+    make(folder, revoke=("r3",))
+    endpoint, said = free_endpoint("tls"), []
+    with (
+        hosted(identity(folder, "worldsim"), endpoint, said) as host,
+        plain_client(endpoint, settings.client(stolen)) as rogue,
+    ):
+        heard: list[zenoh.Sample] = []
+        rogue.declare_subscriber(f"{keys.everything(FLEET)}", heard.append)
+        rogue.declare_subscriber(keys.rx(FLEET, "r3"), heard.append)
+        token = rogue.liveliness().declare_token(keys.alive(FLEET, "r3", "forged"))
+        for name in ROSTER:
+            rogue.put(keys.tx(FLEET, name), b"forged", congestion_control=BLOCK)
+        with line(endpoint, identity(folder, "r1"), "nonce", PATIENCE_S) as honest:
+            assert host.next(PATIENCE_S) == Joined("r1", "nonce")
+            for name in ROSTER:
+                host.send(name, b"secret", patiently=True)
+            assert honest.next(PATIENCE_S) == b"secret"
+            honest.send(b"true", patiently=True)
+            assert host.next(PATIENCE_S) == Heard("r1", b"true")
+        assert host.next(PATIENCE_S) == Left("r1", "nonce")
+        token.undeclare()
+        assert {sample.payload.to_bytes() for sample in heard} == {b"forged"}  # its own words
+
+    assert said == [
+        "refused r3: its certificate has been revoked; `kantor keys demo --renew r3` makes a new one"
+    ]
+
+
+def test_nobody_talks_to_a_false_world_sim(folder: Path, tmp_path: Path) -> None:
+    """One with a foreign authority, with a robot's certificate, with an expired one, by another name."""
+    make(tmp_path / "foreign", robots=3)
+    r1, said = identity(folder, "r1"), []
+    with hosted(identity(tmp_path / "foreign", "worldsim"), at := free_endpoint("tls"), said):
+        assert "it is not the world-sim of this identity's fleet demo" in refusal(at, r1)
+    with hosted(identity(folder, "r2"), at := free_endpoint("tls"), said):
+        assert "a robot's certificate, not world-sim's; do not trust it" in refusal(at, r1)
+    port = free_endpoint("tls").rpartition(":")[2]
+    with hosted(identity(folder, "worldsim"), f"tls/0.0.0.0:{port}", said):
+        join(f"tls/localhost:{port}", r1)
+        told = refusal(f"tls/127.0.0.2:{port}", r1)
+        assert "has no certificate for the name 127.0.0.2" in told
+        assert "`kantor keys demo --host 127.0.0.2`" in told
+        make(folder, hosts=("127.0.0.2",))
+    with hosted(identity(folder, "worldsim"), f"tls/0.0.0.0:{port}", said):
+        join(f"tls/127.0.0.2:{port}", r1)
+    make(folder, NOW - timedelta(days=3), renew=("worldsim",), days=1)
+    with hosted(identity(folder, "worldsim"), at := free_endpoint("tls"), said):
+        told = refusal(at, r1)
+        assert "world-sim's certificate is expired" in told
+        assert "--renew worldsim" in told
+    assert said == []
+
+
+def test_plain_zenoh_is_not_taken_in_by_a_false_world_sim_either(folder: Path) -> None:
+    """It is TLS that refuses: the bus itself, not only the look that comes before it."""
+    own = settings.client(identity(folder, "r1")) | {"connect/timeout_ms": 500}
+    with (
+        hosted(identity(folder, "r2"), at := free_endpoint("tls"), []),
+        pytest.raises(zenoh.ZError),
+        plain_client(at, own),
+    ):
+        pass  # pragma: no cover
+
+
+def test_a_certificate_counts_until_it_expires(folder: Path) -> None:
+    """A robot that is on the bus when its certificate expires leaves it at that moment."""
+    soon = datetime.now(UTC) - timedelta(days=1) + timedelta(seconds=4)
+    make(folder, soon, renew=("r1",), days=1)
+    r1 = identity(folder, "r1")
+    with (
+        hosted(identity(folder, "worldsim"), endpoint := free_endpoint("tls"), []) as host,
+        line(endpoint, r1, "nonce", PATIENCE_S),
+    ):
+        assert host.next(PATIENCE_S) == Joined("r1", "nonce")
+        assert host.next(PATIENCE_S) == Left("r1", "nonce")
+        assert datetime.now(UTC) >= r1.until
+        assert "its certificate has expired" in refusal(endpoint, r1)
+
+
+def test_both_ends_want_the_same_kind_of_proof(kantor: "Kantor") -> None:
+    """Passwords for tls, certificates for tcp, folders that are of another kind: one line, exit 2."""
+    folder = kantor.folder
+    make(folder / "keys", robots=1)
+    credentials.issue(folder / "passwords", "demo", ("r1",))
+    before = contents(folder)
+
+    def line_of(*arguments: object) -> str:
+        finished = kantor(*arguments)
+        assert finished.code == 2, finished
+        assert finished.err.count("\n") == 1
+        return finished.err.removeprefix("kantor: ")
+
+    host = ("worldsim", "paper-single", "--listen")
+    assert line_of(*host, "tls/127.0.0.1:1", "--credentials", "passwords").startswith(
+        "tls/127.0.0.1:1: worldsim has a password, and tls takes certificates; make them with `kantor keys`"
+    )
+    assert line_of(*host, "tcp/127.0.0.1:1", "--credentials", "keys").startswith(
+        "keys/worldsim.toml: a certificate; listen on tls/HOST:PORT"
+    )
+    assert line_of(*host, "tls/127.0.0.1:1", "--credentials", "nowhere").startswith(
+        "nowhere: no credentials for worldsim"
+    )
+    assert line_of(*host, "tls/127.0.0.1:1", "--credentials", "keys", "--fleet", "other") == (
+        "--fleet other: keys is of fleet demo; leave --fleet out\n"
+    )
+    assert line_of("worldsim", "fleet", "--listen", "tls/127.0.0.1:1", "--credentials", "keys") == (
+        "keys: the register has no r2; `kantor keys demo --robots 5`\n"
+    )
+    assert line_of(
+        "worldsim", "paper-centralized", "--set", "robots.count=1", "starts.random=true",
+        "starts.poses_m=[]", "--listen", "tls/127.0.0.1:1",
+        "--credentials", "keys",
+    ) == "keys: the register has no supervisor; `kantor keys demo --supervisor`\n"  # fmt: skip
+    agent = ("agent", "r1", "--connect")
+    assert line_of(*agent, "tcp/127.0.0.1:1", "--credentials", "keys/r1.toml") == (
+        "tcp/127.0.0.1:1: r1 has a certificate, and tcp takes passwords; use tls/127.0.0.1:1\n"
+    )
+    assert line_of(*agent, "tls/127.0.0.1:1", "--credentials", "passwords/r1.toml").startswith(
+        "tls/127.0.0.1:1: r1 has a password"
+    )
+    assert contents(folder) == before
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    """All the files below a folder."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_who_is_not_of_the_kind_is_told_so(folder: Path) -> None:
+    """A robot with a certificate that meets world-sim without them, and something that does not answer at all."""
+    r1 = identity(folder, "r1")
+    passwords = credentials.issue(folder.parent / "passwords", FLEET, ROSTER)
+    users = credentials.users_file(folder.parent / "passwords")
+    plain = free_endpoint()
+    with Host(passwords["worldsim"], plain, users, ROSTER):
+        assert "does not answer as one with certificates; check --connect" in refusal(
+            plain.replace("tcp", "tls"), r1
+        )
+
+
+def test_world_sim_warns_of_what_expires(kantor: "Kantor") -> None:
+    """A week ahead, a line for each certificate of the team, its own too, and for whoever is revoked."""
+    folder = kantor.folder / "keys"
+    make(folder, robots=3, days=30)
+    make(folder, renew=("worldsim", "r1"), days=7)
+    make(folder, NOW - timedelta(days=3), renew=("r2",), days=1)
+    make(folder, revoke=("r3",))
+    world = kantor.start(
+        "worldsim", "paper-single", "--set", "robots.count=3", "starts.random=true", "starts.poses_m=[]",
+        "--listen", free_endpoint("tls"), "--credentials", "keys",
+    )  # fmt: skip
+    await_line(world, "t=")
+    world.send_signal(signal.SIGINT)
+    _, err = world.communicate(timeout=60)
+
+    warnings = [text for text in err.splitlines() if "warning" in text]
+    assert len(warnings) == 4
+    for text in (
+        "r3 is revoked and will not be let in",
+        "worldsim's certificate expires on",
+        "r1's certificate expires on",
+        "r2's certificate expired on",
+    ):
+        assert sum(text in warning for warning in warnings) == 1
+
+
+def test_a_robot_keeps_its_key_in_a_file_that_others_may_read(folder: Path) -> None:
+    """Secrets that an engine mounts have modes and owners of their own."""
+    (folder / "r1.toml").chmod(0o444)
+    assert identity(folder / "r1.toml", "r1").user == "r1"
