@@ -19,12 +19,15 @@ _PLACES = (
     "numba/cuda/cudadrv/runtime",
     "numpy/distutils",
     "PIL/_avif*",
+    "cffi",
     "pillow.libs/libavif*",
+    "pycparser",
     "pygments/lexers/[a-z]*.py",
     "scipy/io/_fast_matrix_market",
     "zstandard/_cffi*",
 )
-"""No GPU in the image, no compiler, no AVIF, no source to colour; zstandard uses its C backend."""
+"""No GPU in the image, no compiler, no AVIF, no source to colour; zstandard uses its C backend,
+cryptography `_cffi_backend` alone, and numba imports cffi just because it is there."""
 
 
 def lighten(site: Path) -> None:

@@ -269,7 +269,7 @@ class _Participant:
         if (
             self._shown.bit_count() == 1
         ):  # kernels are loaded by the first steps, and now and then by a later one
-            memory.leave_compiler()
+            memory.let_go()
 
 
 class _Wall:
