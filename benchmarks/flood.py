@@ -18,17 +18,16 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from multiprocessing.connection import Connection
-from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 import zenoh
+from lockstep_speed import running
 from tables import Table, show, verdict
 
 from kantor_protocol import bus, credentials, keys
@@ -223,10 +222,10 @@ def _mission(
         flooder = context.Process(
             target=_be_flooder, args=(theirs, endpoint, secrets, flood, rounds, end)
         )
-        with _running([world]):
+        with running([world]):
             _await((secrets / f"{FLOODER}.toml").exists)
             bus.await_endpoint(endpoint, START_S)
-            with _running([*robots, flooder]):
+            with running([*robots, flooder]):
                 uses: list[Use] = []
                 while not tap.poll(0.05):
                     uses.append(_use(world.pid or 0))
@@ -237,19 +236,6 @@ def _mission(
                 ticks = [tick for receive, _ in pipes.values() for tick in receive.recv()]
                 world.join(START_S)
     return ticks, windows, uses
-
-
-@contextmanager
-def _running(processes: list[BaseProcess]) -> Iterator[None]:
-    try:
-        for process in processes:
-            process.start()
-        yield
-    finally:
-        for process in processes:
-            if process.pid is not None:
-                process.kill()
-                process.join()
 
 
 def _await(done: Callable[[], bool]) -> None:

@@ -12,11 +12,11 @@ import queue
 import statistics
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from multiprocessing.context import ForkServerProcess
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import NamedTuple
 
@@ -134,14 +134,14 @@ def _barrier(count: int, seconds: float) -> Pace:
     receive, send = context.Pipe(duplex=False)
     hub = context.Process(target=_be_hub, args=(endpoint, count, seconds, send))
     clients = [context.Process(target=_be_client, args=(endpoint, i)) for i in range(count)]
-    with _running([hub, *clients]):
+    with running([hub, *clients]):
         if not receive.poll(START_S + 2.0 * seconds):
             raise RuntimeError(f"{count} clients: the barrier did not end")
         return Pace(*json.loads(receive.recv_bytes()))
 
 
 @contextmanager
-def _running(processes: list[ForkServerProcess]) -> Iterator[None]:
+def running(processes: Sequence[BaseProcess]) -> Iterator[None]:
     """Start processes; on leaving, none of them is left."""
     try:
         for process in processes:

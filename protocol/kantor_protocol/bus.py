@@ -1,8 +1,8 @@
 """The bus: the only file that knows Zenoh.
 
 World-sim is the router; every other process is a client of it, with an identity of its own: a password on
-`tcp/HOST:PORT`, a certificate on `tls/HOST:PORT`, where both sides prove who they are. Access control makes world-sim the only way from one participant to another: a participant may put on its own
-keys and read its own `rx`, nothing else. The traps that the settings below avoid are in
+`tcp/HOST:PORT`, a certificate on `tls/HOST:PORT`, where both sides prove who they are. Access control makes world-sim the
+only way from one participant to another: a participant may put on its own keys and read its own `rx`, nothing else. The traps that the settings below avoid are in
 protocol/README.md.
 
 A callback only enqueues; all work is done by whoever calls `next`. No queue grows without bound: what a
@@ -77,7 +77,38 @@ class Flooded(NamedTuple):
 Event = Joined | Left | Heard | Flooded
 
 
-class Host:
+class _Router:
+    """A router's session, which tells what happens on the bus."""
+
+    _session: zenoh.Session
+    _held: list[Any]
+
+    def __init__(self) -> None:
+        """No session yet."""
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._door: _Door | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def next(self, timeout_s: float) -> Event | None:
+        """The next event, or None after the timeout."""
+        try:
+            return self._events.get(timeout=max(0.0, timeout_s))
+        except queue.Empty:
+            return None
+
+    def close(self) -> None:
+        """Leave the bus."""
+        if self._door is not None:
+            self._door.close()
+        _close(self._session, self._held)
+
+
+class Host(_Router):
     """World-sim's end of the bus: the router, with access control."""
 
     def __init__(
@@ -94,11 +125,11 @@ class Host:
         from a thread. Raises BusError if the endpoint cannot be had, CredentialsError if it is not of the
         identity's kind.
         """
+        super().__init__()
         check_endpoint(listen, identity)
         fleet = identity.fleet
         known = settings.hub(identity, roster, users_file)
         self._fleet = fleet
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._listening = threading.Lock()
         self._buckets = {name: Bucket(Quota.of(0.0)) for name in roster}
         try:
@@ -109,7 +140,6 @@ class Host:
         self._drop = zenoh.CongestionControl.DROP
         self._rx = {name: keys.rx(fleet, name) for name in roster}
         self._progress = keys.progress(fleet)
-        self._door = None
         if isinstance(identity, Certificate):
             wanted = (*roster, *identity.sites, OBSERVER)
             self._door = _Door(self._session, identity, wanted, say)
@@ -119,19 +149,6 @@ class Host:
                 keys.alive(fleet), self._on_token, history=True
             ),
         ]
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    def next(self, timeout_s: float) -> Event | None:
-        """The next event, or None after the timeout."""
-        try:
-            return self._events.get(timeout=max(0.0, timeout_s))
-        except queue.Empty:
-            return None
 
     def send(self, name: ParticipantId, payload: bytes, *, patiently: bool) -> None:
         """Put on a participant's `rx`. patiently: wait for a full queue, up to 0.2 s, rather than drop."""
@@ -153,12 +170,6 @@ class Host:
     def publish_progress(self, payload: bytes) -> None:
         """Tell observers how the mission goes."""
         self._session.put(self._progress, payload, congestion_control=self._drop)
-
-    def close(self) -> None:
-        """Leave the bus."""
-        if self._door is not None:
-            self._door.close()
-        _close(self._session, self._held)
 
     def _on_message(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
@@ -228,7 +239,7 @@ class _Door:
             self._refusals.tell(f"refused {name.partition('.')[0]}: {objection}")
 
 
-class Site:
+class Site(_Router):
     """A router of a place: its robots connect to it, and it connects to world-sim's.
 
     What each robot may do is enforced here, what all of them may do at world-sim. It connects again by itself;
@@ -244,13 +255,13 @@ class Site:
         say: Callable[[str], None] = lambda _line: None,
     ) -> None:
         """Wait for world-sim up to `patience_s`, then listen. say: see Host. Raises BusError, CredentialsError."""
+        super().__init__()
         check_endpoint(listen, identity)
         fleet = identity.fleet
         self.members = tuple(name for name in identity.members if name != WORLD_SIM)
         """Its robots."""
         _check_free(listen)
         _close(_client(connect, identity, patience_s), [])  # which is told why, if it is not let in
-        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         own = settings.site(identity, self.members)
         try:
             self._session = _open("router", own, connect=connect, listen=listen)
@@ -263,28 +274,10 @@ class Site:
             ),
         ]
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    def next(self, timeout_s: float) -> Event | None:
-        """Who has come or gone, or None after the timeout."""
-        try:
-            return self._events.get(timeout=max(0.0, timeout_s))
-        except queue.Empty:
-            return None
-
     @property
     def connected(self) -> bool:
         """Whether world-sim is there."""
         return bool(self._session.info.routers_zid())
-
-    def close(self) -> None:
-        """Leave the bus."""
-        self._door.close()
-        _close(self._session, self._held)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
