@@ -101,14 +101,18 @@ class Dispatch:
         self._on_events = planner.replan_on == "events"
         self._whole_team = planner.replan_whose == "team"
         self._gap = planner.replan_gap
-        self._revision = -1
+        self._asked: dict[int, int] = {}
+        """For each robot in contact the revision of the chart when a target for it was last asked for."""
 
     def decide(self, group: Sequence[Member], absent: Sequence[int], tick: int) -> dict[int, Task]:
         """New tasks by robot, for those who get one now. group: everybody in contact, by place."""
+        # Whoever was out of contact has no target any more: it gets one though the chart is as it was.
+        known = self._asked
+        self._asked = {m.robot: known[m.robot] for m in group if m.robot in known}
         members, others = self._chosen(group, tick)
         if not members:
             return {}
-        self._revision = self._terrain.chart.revision
+        self._asked |= dict.fromkeys((m.robot for m in members), self._terrain.chart.revision)
         situation = Situation(
             self._terrain, self._frontiers(group), members, others, tuple(absent), tick
         )
@@ -135,7 +139,7 @@ class Dispatch:
     def _needs(self, member: Member) -> bool:
         chart, target = self._terrain.chart, member.task.target
         if target == NOWHERE:
-            return self._revision != chart.revision
+            return self._asked.get(member.robot) != chart.revision
         if member.arrived or chart.void[target]:
             return True
         return self._on_events and not chart.is_frontier(target)

@@ -135,6 +135,15 @@ def test_arrivals_alone_count_if_asked_for(monkeypatch: pytest.MonkeyPatch) -> N
     assert set(world.decide(robot(0, 21, arrived=True))) == {0}
 
 
+def test_who_was_out_of_contact_gets_a_target_though_nothing_is_new(world: World) -> None:
+    """Its old one was forgotten meanwhile; it may have none to explore by, and would wait for ever."""
+    assert set(world.decide(robot(0), robot(1), tick=10)) == {0, 1}
+    assert world.decide(robot(0), robot(1), tick=20) == {}, "asked in vain is asked once"
+
+    assert world.decide(robot(0, 21), tick=30) == {}
+    assert set(world.decide(robot(0, 21), robot(1), tick=40)) == {0, 1}
+
+
 def test_where_somebody_has_looked_around_nobody_is_sent(world: World) -> None:
     """It would be the nearest frontier of whoever stands on it, for ever."""
     world.decide(robot(0, 21, arrived=True))
