@@ -4,11 +4,10 @@
 #   sudo docker/base.sh [--force]
 #
 # It has Debian's Python 3.11 and gets the name that the Dockerfile asks for (BASE names another). An image of that
-# name that is not a stand-in is left alone, unless forced. MIRROR names another Debian mirror.
+# name that is not a stand-in is left alone, unless forced. MIRROR names another Debian mirror than debootstrap's own.
 set -euo pipefail
 
 base=${BASE:-python:3.11-slim-bookworm}
-mirror=${MIRROR:-http://deb.debian.org/debian}
 mark=kantor.stand-in
 
 if [ "${1:-}" != --force ] && docker image inspect "$base" >/dev/null 2>&1; then
@@ -24,7 +23,7 @@ command -v debootstrap >/dev/null || { echo "base.sh: needs debootstrap; apt-get
 
 root=$(mktemp -d)
 trap 'rm -rf --one-file-system "$root"' EXIT
-debootstrap --variant=minbase --include=python3,python3-venv,ca-certificates bookworm "$root" "$mirror" >"$root.log" 2>&1 ||
+debootstrap --variant=minbase --include=python3,python3-venv,ca-certificates bookworm "$root" ${MIRROR:+"$MIRROR"} >"$root.log" 2>&1 ||
     { tail -5 "$root.log" >&2; echo "base.sh: debootstrap failed; see $root.log" >&2; exit 1; }
 rm "$root.log"
 tar -C "$root" --numeric-owner \

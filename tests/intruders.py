@@ -10,10 +10,12 @@ from kantor_protocol import settings
 
 
 @contextmanager
-def plain_client(endpoint: str, proof: settings.Settings) -> Iterator[zenoh.Session]:
-    """A plain Zenoh client, with some proof of who it is or with none. It asks nobody whether it may."""
+def plain_session(
+    endpoint: str, proof: settings.Settings, mode: str = "client", listen: str | None = None
+) -> Iterator[zenoh.Session]:
+    """Plain Zenoh without rules, with some proof of who it is or with none. It asks nobody whether it may."""
     config = zenoh.Config()
-    known = settings.everywhere("client", endpoint, None) | {"connect/timeout_ms": 1000}
+    known = settings.everywhere(mode, endpoint, listen) | {"connect/timeout_ms": 1000}
     for key, value in (known | proof).items():
         config.insert_json5(key, json.dumps(value))
     session = zenoh.open(config)

@@ -59,13 +59,19 @@ def host_by_hand(
 
 def resume_by_hand(folder: Path, listen: str, secrets: Path, fleet: str | None) -> Exit:
     """World-sim in this terminal, for a run that was cut short. Raises BusError, OSError."""
-    from kantor_worldsim.plan import Plan  # noqa: PLC0415
-    from kantor_worldsim.recording import Past, Recording, ResumeError  # noqa: PLC0415
+    from kantor_worldsim.recording import Past, ResumeError  # noqa: PLC0415
 
     try:
         past = Past.of(folder)
     except ResumeError as error:
         fail(Exit.USAGE, str(error))
+    return _go_on(folder, past, listen, secrets, fleet)
+
+
+def _go_on(folder: Path, past: "Past", listen: str, secrets: Path, fleet: str | None) -> Exit:
+    from kantor_worldsim.plan import Plan  # noqa: PLC0415
+    from kantor_worldsim.recording import Recording  # noqa: PLC0415
+
     terms, opening = past.terms, past.opening
     scenario, seed, exchange = opening.scenario, opening.seed, terms.exchange
     _check_faults(scenario, exchange)
@@ -90,7 +96,7 @@ def go_on_by_hand(state: Path, listen: str, secrets: Path, fleet: str | None) ->
     if folder is None:
         return None
     try:
-        Past.of(folder)
+        past = Past.of(folder)
     except OverError as over:
         result = read_result(folder)
         code = Exit.PROCESS_FAILED if result is None else verdict(result)
@@ -102,7 +108,7 @@ def go_on_by_hand(state: Path, listen: str, secrets: Path, fleet: str | None) ->
         return code or None
     except ResumeError:  # nothing has happened in it
         return None
-    return resume_by_hand(folder, listen, secrets, fleet)
+    return _go_on(folder, past, listen, secrets, fleet)
 
 
 def _check_faults(scenario: Scenario, exchange: str) -> None:

@@ -266,9 +266,8 @@ class _Participant:
         if outputs.weights:
             self._line.publish_weights(outputs.weights)
         self._shown += 1
-        if (
-            self._shown.bit_count() == 1
-        ):  # kernels are loaded by the first steps, and now and then by a later one
+        # Kernels are loaded by the first steps, and now and then by a later one.
+        if self._shown.bit_count() == 1:
             memory.let_go()
 
 

@@ -11,7 +11,7 @@ import msgspec
 import pytest
 import zenoh
 
-from intruders import plain_client
+from intruders import plain_session
 from kantor_fleet.authority import Wanted, issue
 from kantor_protocol import credentials, settings
 from kantor_protocol.bus import free_endpoint
@@ -102,14 +102,14 @@ def test_nobody_reads_or_writes_past_the_radio(kantor: "Kantor", kind: str) -> N
     r2, observer_proof = proof_of(kantor.folder, "r2"), proof_of(kantor.folder, "observer")
 
     for proof in strangers(kantor.folder):
-        with pytest.raises(zenoh.ZError), plain_client(endpoint, proof):
+        with pytest.raises(zenoh.ZError), plain_session(endpoint, proof):
             pass  # pragma: no cover
 
     with (
-        plain_client(endpoint, observer_proof) as observer,
-        plain_client(endpoint, observer_proof) as scribe,
-        plain_client(endpoint, r2) as rogue,
-        plain_client(endpoint, r2) as eavesdropper,  # apart, since a session hears its own puts
+        plain_session(endpoint, observer_proof) as observer,
+        plain_session(endpoint, observer_proof) as scribe,
+        plain_session(endpoint, r2) as rogue,
+        plain_session(endpoint, r2) as eavesdropper,  # apart, since a session hears its own puts
     ):
         seen = hear(observer, f"{ROOT}/**")
         stolen = hear(
@@ -156,7 +156,7 @@ def test_an_oversized_message_does_not_reach_world_sim(kantor: "Kantor") -> None
     )  # fmt: skip
     assert world.stdout is not None
     assert any(line.startswith("t=") for line in world.stdout)
-    with plain_client(endpoint, proof_of(kantor.folder, "r1")) as rogue:
+    with plain_session(endpoint, proof_of(kantor.folder, "r1")) as rogue:
         rogue.put(
             f"{ROOT}/r1/tx", bytes(8_000_000), congestion_control=zenoh.CongestionControl.BLOCK
         )

@@ -12,7 +12,7 @@ import pytest
 import zenoh
 
 from fleets import await_line
-from intruders import plain_client
+from intruders import plain_session
 from kantor_fleet.authority import Wanted, issue
 from kantor_protocol import credentials, keys, settings
 from kantor_protocol.bus import BusError, Heard, Host, Joined, Left, free_endpoint, line
@@ -96,7 +96,7 @@ def test_world_sim_and_whoever_is_refused_both_say_why(kantor: "Kantor") -> None
     )
     await_line(world, "t=")
 
-    with pytest.raises(zenoh.ZError), plain_client(endpoint, anonymous(ours)):
+    with pytest.raises(zenoh.ZError), plain_session(endpoint, anonymous(ours)):
         pass  # pragma: no cover
     told = [
         refusal(endpoint, expired),
@@ -158,7 +158,7 @@ def test_a_revoked_robot_without_manners_is_not_heard(folder: Path) -> None:
     endpoint, said = free_endpoint("tls"), []
     with (
         hosted(identity(folder, "worldsim"), endpoint, said) as host,
-        plain_client(endpoint, settings.client(stolen)) as rogue,
+        plain_session(endpoint, settings.client(stolen)) as rogue,
     ):
         heard: list[zenoh.Sample] = []
         rogue.declare_subscriber(f"{keys.everything(FLEET)}", heard.append)
@@ -238,7 +238,7 @@ def test_plain_zenoh_is_not_taken_in_by_a_false_world_sim_either(folder: Path) -
     with (
         hosted(identity(folder, "r2"), at := free_endpoint("tls"), []),
         pytest.raises(zenoh.ZError),
-        plain_client(at, own),
+        plain_session(at, own),
     ):
         pass  # pragma: no cover
 

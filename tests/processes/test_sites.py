@@ -2,12 +2,10 @@
 certificates.
 """
 
-import json
 import os
 import queue
 import signal
 import subprocess
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -24,7 +22,10 @@ from fleets import (
     records_of,
     result_of,
 )
+from intruders import plain_session
+from kantor_protocol import settings
 from kantor_protocol.bus import free_endpoint
+from kantor_protocol.credentials import Certificate, read
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -78,36 +79,10 @@ class Place:
         self, user: str, mode: str, connect: str, listen: str | None = None
     ) -> Iterator[zenoh.Session]:
         """Whoever has somebody's file, and plain Zenoh without any rules of its own."""
-        identity = tomllib.loads((self.kantor.folder / "keys" / f"{user}.toml").read_text())
-        paths = {}
-        for field in ("authority", "certificate", "key"):
-            path = self.kantor.folder / f"stolen-{user}-{field}.pem"
-            path.write_text(identity[field])
-            paths[field] = str(path)
-        config = zenoh.Config()
-        settings = {
-            "mode": mode,
-            "connect/endpoints": [connect],
-            "connect/timeout_ms": 3000,
-            "listen/endpoints": [listen] if listen else [],
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": False,
-            "transport/link/tls": {
-                "root_ca_certificate": paths["authority"],
-                "enable_mtls": True,
-                "connect_private_key": paths["key"],
-                "connect_certificate": paths["certificate"],
-                "listen_private_key": paths["key"],
-                "listen_certificate": paths["certificate"],
-            },
-        }
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
-        session = zenoh.open(config)
-        try:
+        identity = read(self.kantor.folder / "keys" / f"{user}.toml", Certificate)
+        assert identity is not None
+        with plain_session(connect, settings.client(identity), mode, listen) as session:
             yield session
-        finally:
-            session.close()
 
 
 @pytest.fixture

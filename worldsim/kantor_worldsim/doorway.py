@@ -220,7 +220,7 @@ class Doorway:
         due = [name for name, told_s in self._briefed_s.items() if now_s - told_s > AGAIN_S]
         for name in due:
             nonce = self._admission.player(name)
-            if nonce is None or name in self.ready:
+            if nonce is None:
                 del self._briefed_s[name]
             else:
                 self._brief(Joined(name, nonce))
@@ -284,6 +284,7 @@ class Doorway:
 
     def _arrive(self, name: ParticipantId, nonce: str) -> None:
         self.ready[name] = nonce
+        self._briefed_s.pop(name, None)
         self._met.add(nonce)
         self.visits[name] += 1
         self._doubtful.discard(name)

@@ -38,8 +38,9 @@ class Lockstep:
         asked: dict[ParticipantId, tuple[int, float]] = {}
         give_up = time.monotonic() + BARRIER_S
         while time.monotonic() < give_up:
+            now_s = time.monotonic()
             for name in inputs:
-                visit, now_s = doorway.visits[name], time.monotonic()
+                visit = doorway.visits[name]
                 before, asked_s = asked.get(name, (-1, 0.0))
                 due = before != visit or now_s - asked_s > AGAIN_S
                 if name in doorway.ready and name not in outputs and due:
