@@ -145,8 +145,7 @@ def _host(
             folder, recording = record()
             view.note(f"world-sim of fleet {identity.fleet} at {listen}, credentials in {secrets}")
             for name in scenario.roster:
-                verb = name if name == "supervisor" else f"agent {name}"
-                view.note(f"  kantor {verb} --connect {listen} --credentials {secrets}")
+                view.note(f"  {_joining(name, listen, secrets)}")
             run(host, plan, recording, interrupts, view.show, past, say=view.note)
     with Interrupts(patient=True):  # what comes when the mission is over changes nothing
         conclude(folder)
@@ -154,6 +153,14 @@ def _host(
     if result is not None and result.ended == "done":
         return verdict(result)
     return interrupts.code or (verdict(result) if result is not None else Exit.PROCESS_FAILED)
+
+
+def _joining(name: ParticipantId, listen: str, secrets: Path) -> str:
+    """The command with which a participant joins; a host that listens everywhere has a name that only it knows."""
+    verb = name if name == SUPERVISOR else f"agent {name}"
+    endpoint = listen.replace("/0.0.0.0:", "/HOST:").replace("/[::]:", "/HOST:")
+    own = secrets if secrets.is_dir() else secrets.with_name(f"{name}.toml")
+    return f"kantor {verb} --connect {endpoint} --credentials {own}"
 
 
 def _host_identity(listen: str, place: Path, fleet: str | None, scenario: Scenario) -> Identity:

@@ -151,6 +151,20 @@ def anonymous(ours: Certificate) -> settings.Settings:
     }
 
 
+@pytest.mark.parametrize("place", ["keys", "keys/worldsim.toml"])
+def test_the_command_that_world_sim_says_is_the_one_to_type(kantor: "Kantor", place: str) -> None:
+    """Whether it was given a folder or its own file, and whatever addresses it listens on."""
+    make(kantor.folder / "keys", robots=1)
+    port = free_endpoint("tls").rpartition(":")[2]
+    listen = ("--listen", f"tls/0.0.0.0:{port}", "--credentials", place)
+    world = kantor.start("worldsim", "paper-single", *listen)
+    said = await_line(world, "  kantor agent r1").replace("/HOST:", "/localhost:")
+
+    robot = kantor.start(*said.split()[1:])
+
+    await_line(robot, "r1: mission paper-single")
+
+
 def test_a_revoked_robot_without_manners_is_not_heard(folder: Path) -> None:
     """Plain Zenoh with the key of a revoked robot: it may connect, and neither speaks, lives nor listens."""
     stolen = identity(folder, "r3")
