@@ -94,3 +94,5 @@ def test_nobody_gets_in_who_does_not_belong(fleet_of: MakeFleet, tmp_path: Path)
     assert fleet.inspect("r1")["RestartCount"] == fleet.inspect("r2")["RestartCount"] == 0
     log = fleet.log("worldsim")
     assert "leave" not in log
+    assert "refused a client: it showed no certificate" in log
+    assert "refused a client: it trusts another authority than world-sim's" in log
