@@ -156,11 +156,12 @@ def _host(
 
 
 def _joining(name: ParticipantId, listen: str, secrets: Path) -> str:
-    """The command with which a participant joins; a host that listens everywhere has a name that only it knows."""
+    """The command with which a participant joins, where it is: a host may listen at any address that it has there."""
     verb = name if name == SUPERVISOR else f"agent {name}"
     endpoint = listen.replace("/0.0.0.0:", "/HOST:").replace("/[::]:", "/HOST:")
     own = secrets if secrets.is_dir() else secrets.with_name(f"{name}.toml")
-    return f"kantor {verb} --connect {endpoint} --credentials {own}"
+    file = own if own.exists() else own.name  # it is with the robot
+    return f"kantor {verb} --connect {endpoint} --credentials {file}"
 
 
 def _host_identity(listen: str, place: Path, fleet: str | None, scenario: Scenario) -> Identity:
