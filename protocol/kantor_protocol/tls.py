@@ -58,10 +58,14 @@ def _shake_hands(raw: socket.socket, host: str, context: ssl.SSLContext) -> None
     with context.wrap_socket(raw, server_hostname=host) as secured:
         # In TLS 1.3 the server looks at our certificate after our handshake is over. Once it has taken note
         # that we say no more, it has either sent its alert or closes.
-        raw_end = socket.socket(fileno=os.dup(secured.fileno()))
-        with raw_end:
-            raw_end.shutdown(socket.SHUT_WR)
-        secured.recv(1)
+        try:
+            with socket.socket(fileno=os.dup(secured.fileno())) as raw_end:
+                raw_end.shutdown(socket.SHUT_WR)
+            secured.recv(1)
+        except (ssl.SSLError, TimeoutError):
+            raise
+        except OSError:
+            return  # it has hung up without a reason; whoever joins is told one
 
 
 def _distrust(error: ssl.SSLCertVerificationError, host: str, identity: Certificate) -> str:
