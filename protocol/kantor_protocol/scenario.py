@@ -424,9 +424,12 @@ def rooted(scenario: Scenario, folder: Path) -> Scenario:
         if name is None or Path(name).is_absolute():
             return name
         try:
-            return str(Path(name).resolve() if Path(name).exists() else (folder / name).resolve())
+            Path(name).stat()  # unlike `exists`, it tells of a name that no file can have
+        except (FileNotFoundError, NotADirectoryError):
+            return str((folder / name).resolve())
         except (OSError, ValueError) as error:
             raise ScenarioError(f"{name}: cannot be the name of a file: {error}") from None
+        return str(Path(name).resolve())
 
     return msgspec.structs.replace(
         scenario,
