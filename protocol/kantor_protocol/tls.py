@@ -10,7 +10,7 @@ import socket
 import ssl
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from kantor_protocol.credentials import Certificate, CredentialsError
 
@@ -58,14 +58,11 @@ def _shake_hands(raw: socket.socket, host: str, context: ssl.SSLContext) -> None
     with context.wrap_socket(raw, server_hostname=host) as secured:
         # In TLS 1.3 the server looks at our certificate after our handshake is over. Once it has taken note
         # that we say no more, it has either sent its alert or closes.
-        try:
-            with socket.socket(fileno=os.dup(secured.fileno())) as raw_end:
-                raw_end.shutdown(socket.SHUT_WR)
+        raw_end = socket.socket(fileno=os.dup(secured.fileno()))
+        with raw_end, suppress(OSError):  # it may have hung up already
+            raw_end.shutdown(socket.SHUT_WR)
+        with suppress(ConnectionError):  # without an alert: whoever joins is told why
             secured.recv(1)
-        except (ssl.SSLError, TimeoutError):
-            raise
-        except OSError:
-            return  # it has hung up without a reason; whoever joins is told one
 
 
 def _distrust(error: ssl.SSLCertVerificationError, host: str, identity: Certificate) -> str:

@@ -1,7 +1,11 @@
 """Whoever does not belong is refused and told why, and so is world-sim; certificates on the real bus."""
 
 import signal
+import socket
+import ssl
+import struct
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -14,7 +18,7 @@ import zenoh
 from fleets import await_line
 from intruders import plain_session
 from kantor_fleet.authority import Wanted, issue
-from kantor_protocol import credentials, keys, settings
+from kantor_protocol import credentials, keys, settings, tls
 from kantor_protocol.bus import BusError, Heard, Host, Joined, Left, free_endpoint, line
 from kantor_protocol.credentials import Certificate, Identity
 
@@ -270,6 +274,34 @@ def test_a_certificate_counts_until_it_expires(folder: Path) -> None:
         assert host.next(PATIENCE_S) == Left("r1", "nonce")
         assert datetime.now(UTC) >= r1.until
         assert "its certificate has expired" in refusal(endpoint, r1)
+
+
+def test_who_hangs_up_without_a_reason_has_not_objected(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its handshake was sound, so it is a world-sim: the bus says what is wrong, if anything is."""
+    who, chain = identity(folder, "worldsim"), tmp_path / "chain.pem"
+    chain.write_text(who.certificate + who.key)
+    theirs = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    theirs.load_cert_chain(chain)
+    ours = tls.context(identity(folder, "r1"))
+
+    def reset(listener: socket.socket) -> None:
+        with theirs.wrap_socket(listener.accept()[0], server_side=True) as accepted:
+            accepted.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+
+    class Slow:
+        """Whose handshake is over when the other end has gone."""
+
+        def wrap_socket(self, raw: socket.socket, server_hostname: str) -> ssl.SSLSocket:
+            secured = ours.wrap_socket(raw, server_hostname=server_hostname)
+            gone.result(PATIENCE_S)
+            return secured
+
+    monkeypatch.setattr(tls, "context", lambda _identity: Slow())
+    with socket.create_server(("127.0.0.1", 0)) as listener, ThreadPoolExecutor(1) as pool:
+        gone = pool.submit(reset, listener)
+        assert tls.objection(*listener.getsockname(), identity(folder, "r1")) == ""
 
 
 def test_both_ends_want_the_same_kind_of_proof(kantor: "Kantor") -> None:

@@ -1,8 +1,7 @@
 """The referees: silent on a good record, and each rule noticed when it alone is broken."""
 
-import inspect
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise, product
 from typing import Any
 
@@ -24,6 +23,7 @@ from kantor_protocol.weights import WeightsMessage, WeightsSubscriber
 from kantor_worldsim.channel import DROPPED, Verdict
 from kantor_worldsim.checkers import Checker, check
 from kantor_worldsim.records import Act, Batch, Ending, Incident, Opening, Record
+from referees import listed, rules
 from replicas import read_logs
 from strategies import SEEDS, examples
 
@@ -46,11 +46,6 @@ RADIOS = {
 }
 DEAF = ("radio.range_m=0", "supervisor.range_m=0")
 """Nobody hears anybody, so that nothing but the broken rule is touched."""
-
-
-def rules(records: Iterable[Record]) -> set[str]:
-    """The rules that a record breaks."""
-    return {complaint.partition(":")[0] for complaint in check(records).complaints}
 
 
 # Ways to change a record.
@@ -1073,11 +1068,8 @@ def test_broken_rule_is_named(played: Play, name: str) -> None:
 
 def test_every_rule_can_be_broken() -> None:
     """No rule of the checker is without a record that breaks it."""
-    listed = (inspect.getdoc(Checker) or "").partition("-----\n")[2].splitlines()
-    names = {line.split()[0] for line in listed if line[:1].isalpha()}
-
     broken_by_rows = {"bound"}  # see test_exact.py
-    assert names == {name.partition("-")[0] for name in BROKEN} | broken_by_rows
+    assert listed(Checker) == {name.partition("-")[0] for name in BROKEN} | broken_by_rows
 
 
 def test_complaint_says_when_who_and_what(played: Play) -> None:

@@ -1,8 +1,7 @@
 """The referees of mapping runs: silent on a good record, and each rule noticed when it alone is broken."""
 
-import inspect
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import msgspec
@@ -21,6 +20,7 @@ from kantor_worldsim.checkers import Checker, check
 from kantor_worldsim.map_checker import MapRules
 from kantor_worldsim.records import Act, Batch, Incident, Opening, Record
 from mapping import ROOMS, explored, on_map, site_of
+from referees import listed, rules
 from replicas import read_logs
 
 Records = Sequence[Record]
@@ -38,11 +38,6 @@ RADIOS = {
     "centralized": ("coordination=centralized",),
 }
 PLANNERS = ("frontier", "burgard", "market", "kmeans", "hungarian")
-
-
-def rules(records: Iterable[Record]) -> set[str]:
-    """The rules that a record breaks."""
-    return {complaint.partition(":")[0] for complaint in check(records).complaints}
 
 
 # Ways to change a record.
@@ -337,10 +332,7 @@ def test_broken_rule_is_named(name: str) -> None:
 
 def test_every_rule_can_be_broken() -> None:
     """No rule is without a record that breaks it."""
-    listed = (inspect.getdoc(MapRules) or "").partition("-----\n")[2].splitlines()
-    names = {line.split()[0] for line in listed if line[:1].isalpha()}
-
-    assert names == {name.partition("-")[0] for name in BROKEN}
+    assert listed(MapRules) == {name.partition("-")[0] for name in BROKEN}
 
 
 def test_frontier_may_be_called_none_from_beside_it() -> None:
