@@ -12,15 +12,18 @@ from typing import NamedTuple
 
 from tables import Table, verdict
 
-from kantor_fleet.catalog import find
-from kantor_fleet.preload import warm_up
-from kantor_fleet.team import team
-from kantor_protocol.scenario import Scenario, from_tree, to_tree
-from kantor_worldsim.loop import in_process, simulate
-from kantor_worldsim.metrics import Result
-from kantor_worldsim.recording import Recording
-from kantor_worldsim.stage import Stage
-from kantor_worldsim.world import Site
+from kantor_fleet.execution.in_process_team import team
+from kantor_fleet.processes.preload import warm_up
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.scenario.dump import to_tree
+from kantor_protocol.scenario.load import from_tree
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.engine.event_loop import simulate
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.observers.metrics.result import Result
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.world.world import WorldSetup
 
 TARGET_FEW, TARGET_CROWD = 20_000, 12_000
 """Robot-steps in a CPU second, recorded: five robots, a hundred."""
@@ -58,7 +61,7 @@ def measure(*, quick: bool) -> Table:
     rows = []
     met = True
     for setting in _settings(quick=quick):
-        site = Site.of(setting.scenario, 0)
+        site = WorldSetup.of(setting.scenario, 0)
         bare = [_run(setting, site, recorded=False) for _ in range(repeats)]
         recorded = [_run(setting, site, recorded=True) for _ in range(repeats)]
         fast = statistics.median(cost.steps_per_s for cost in bare)
@@ -144,11 +147,11 @@ def _crowd(ticks: int) -> Scenario:
     return from_tree(tree, "crowd")
 
 
-def _run(setting: Setting, site: Site, *, recorded: bool) -> Cost:
+def _run(setting: Setting, site: WorldSetup, *, recorded: bool) -> Cost:
     """One run, without setting up its robots."""
     scenario = setting.scenario
     recording = Recording(scenario, 0, "in-process") if recorded else None
-    stage = Stage(scenario, 0, site, [recording.take] if recording else [])
+    stage = Simulation(scenario, 0, site, [recording.take] if recording else [])
     exchange = in_process(team(scenario, 0, site))
     start_s = time.process_time()
     simulate(stage, exchange, 0, lambda: False)

@@ -30,16 +30,20 @@ import zenoh
 from lockstep_speed import running
 from tables import Table, show, verdict
 
-from kantor_protocol import bus, credentials, keys
-from kantor_protocol.machine import Outputs, Pose
-from kantor_protocol.messages import (
+from kantor_protocol.base.machine import Outputs, Pose
+from kantor_protocol.transport import client, credentials
+from kantor_protocol.transport.client import ParticipantSession, participant_session
+from kantor_protocol.transport.endpoint import await_endpoint, free_endpoint
+from kantor_protocol.transport.zenoh_log import init_log
+from kantor_protocol.wire import keys
+from kantor_protocol.wire.messages import (
     VERSION,
     Mission,
     Ready,
     Report,
+    StepRequest,
     Stop,
     ToParticipant,
-    Turn,
     decode_to_participant,
     encode,
 )
@@ -100,7 +104,7 @@ class Use(NamedTuple):
     rss_mib: float
 
 
-class Timed(bus.Line):
+class Timed(ParticipantSession):
     """A robot's line that times its steps."""
 
     ticks: list[tuple[float, float]]
@@ -123,7 +127,7 @@ class Timed(bus.Line):
         payload = super().next(timeout_s)
         if payload is not None and self._said_s:
             message: ToParticipant = decode_to_participant(payload)
-            if isinstance(message, Turn) and message.inputs.observation.step >= self._step:
+            if isinstance(message, StepRequest) and message.inputs.observation.step >= self._step:
                 self.ticks.append((self._said_s, time.monotonic() - self._said_s))
                 self._said_s = 0.0
         return payload
@@ -211,7 +215,7 @@ def _mission(
     with tempfile.TemporaryDirectory(prefix="kantor-flood-") as name:
         folder = Path(name)
         secrets = folder / "credentials"
-        endpoint = bus.free_endpoint()
+        endpoint = free_endpoint()
         world = context.Process(target=_be_world, args=(ours, endpoint, secrets, folder / "runs"))
         pipes = {who: context.Pipe(duplex=False) for who in HONEST}
         robots = [
@@ -224,7 +228,7 @@ def _mission(
         )
         with running([world]):
             _await((secrets / f"{FLOODER}.toml").exists)
-            bus.await_endpoint(endpoint, START_S)
+            await_endpoint(endpoint, START_S)
             with running([*robots, flooder]):
                 uses: list[Use] = []
                 while not tap.poll(0.05):
@@ -254,14 +258,14 @@ def _use(pid: int) -> Use:
 
 
 def _be_world(cores: list[int], listen: str, secrets: Path, out: Path) -> None:
-    from kantor_fleet.by_hand import host_by_hand  # noqa: PLC0415  the others need none of it
-    from kantor_fleet.catalog import find  # noqa: PLC0415
+    from kantor_fleet.processes.standalone import host_standalone  # noqa: PLC0415  the others need none of it
+    from kantor_fleet.scenarios.catalog import find  # noqa: PLC0415
 
     os.sched_setaffinity(0, cores)
     scenario = find("fleet", ("limit_s=100000", "energy.points=50000", "energy.steps=50000"))
     out.mkdir()
     sys.stdout = open(os.devnull, "w")  # noqa: SIM115, PTH123
-    host_by_hand(scenario, 0, "wall", SPEED, listen, secrets, FLEET, None, out, None)
+    host_standalone(scenario, 0, "wall", SPEED, listen, secrets, FLEET, None, out, None)
 
 
 def _be_robot(
@@ -270,8 +274,8 @@ def _be_robot(
     from kantor_agent.process import run  # noqa: PLC0415
 
     os.sched_setaffinity(0, cores)
-    bus.Line = Timed  # type: ignore[misc]
-    bus.init_log()
+    client.ParticipantSession = Timed  # type: ignore[misc]
+    init_log()
     run(connect, credentials.find(secrets, who), START_S, lambda _: None, folder / "state")
     out.send(Timed.ticks)
 
@@ -280,12 +284,12 @@ def _be_flooder(
     cores: list[int], connect: str, secrets: Path, flood: Flood, rounds: int, out: Connection
 ) -> None:
     os.sched_setaffinity(0, cores)
-    bus.init_log()
+    init_log()
     identity = credentials.find(secrets, FLOODER)
-    with bus.line(connect, identity, "flood", START_S) as line:
+    with participant_session(connect, identity, "flood", START_S) as line:
         mission = _await_message(line, Mission)
         line.send(encode(Ready(VERSION, "flood")), patiently=True)
-        _await_message(line, Turn, Ready(VERSION, "flood"))
+        _await_message(line, StepRequest, Ready(VERSION, "flood"))
         time.sleep(2.0)
         assert isinstance(mission, Mission)
         old = encode(Report(VERSION, "flood", Outputs(0, Pose(0.0, 0.0))))
@@ -315,7 +319,7 @@ def _be_flooder(
 class Tokens:
     """Comes and goes."""
 
-    def __init__(self, line: bus.Line, key: str) -> None:
+    def __init__(self, line: ParticipantSession, key: str) -> None:
         self._liveliness = line._session.liveliness()
         self._key = key
         self._held: list[Any] = []
@@ -328,18 +332,18 @@ class Tokens:
             self._held.append(self._liveliness.declare_token(self._key))
 
 
-def _await_message(line: bus.Line, kind: type, _said: object = None) -> object:
+def _await_message(line: ParticipantSession, kind: type, _said: object = None) -> object:
     give_up = time.monotonic() + START_S
     while time.monotonic() < give_up:
         message = _next(line)
-        if kind is Turn and message is not None:
+        if kind is StepRequest and message is not None:
             return message
         if isinstance(message, kind):
             return message
     raise RuntimeError(f"no {kind.__name__} came")
 
 
-def _next(line: bus.Line) -> ToParticipant | None:
+def _next(line: ParticipantSession) -> ToParticipant | None:
     payload = line.next(1.0)
     return None if payload is None else decode_to_participant(payload)
 

@@ -24,33 +24,39 @@ from typing import Any, NamedTuple
 
 from tables import Table
 
-from kantor_agent.core import Agent
-from kantor_fleet import authority
-from kantor_fleet.catalog import find
-from kantor_fleet.local import _LIGHT_RUNTIME
-from kantor_fleet.preload import warm_up
-from kantor_protocol import bus, credentials
-from kantor_protocol.clock import clocks
-from kantor_protocol.life import Life, Memory
-from kantor_protocol.machine import Body, Envelope, Inputs, Pose
-from kantor_protocol.messages import (
+from kantor_agent.robots.density import DensityRobot
+from kantor_fleet.processes.local import _LIGHT_RUNTIME
+from kantor_fleet.processes.preload import warm_up
+from kantor_fleet.scenarios.catalog import find
+from kantor_fleet.security import authority
+from kantor_protocol.base.machine import Body, Envelope, Inputs, Pose
+from kantor_protocol.node.recovery import InMemoryLog, RecoverableNode
+from kantor_protocol.node.runner import RETRY_S
+from kantor_protocol.scenario.clocks import step_clocks
+from kantor_protocol.scenario.dump import to_tree
+from kantor_protocol.scenario.load import from_tree
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.transport import credentials
+from kantor_protocol.transport.client import ParticipantSession, participant_session
+from kantor_protocol.transport.endpoint import free_endpoint
+from kantor_protocol.transport.router import HubRouter, SiteRouter
+from kantor_protocol.transport.zenoh_log import init_log
+from kantor_protocol.wire.messages import (
     VERSION,
-    Go,
     Mission,
     PoseMessage,
     Ready,
     Report,
+    StartClock,
+    StepRequest,
     Stop,
-    Turn,
     decode_to_participant,
     encode,
 )
-from kantor_protocol.process import AGAIN_S
-from kantor_protocol.scenario import Scenario, from_tree, to_tree
-from kantor_worldsim.plan import Plan
-from kantor_worldsim.process import run
-from kantor_worldsim.recording import Recording
-from kantor_worldsim.world import Site
+from kantor_worldsim.exchange.config import MissionConfig
+from kantor_worldsim.exchange.main import run
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.world.world import WorldSetup
 
 COUNTS, COUNTS_QUICK = (10, 50, 100, 200), (10, 50)
 LINKS = ("tcp", "tls", "site")
@@ -126,7 +132,7 @@ class Pace(NamedTuple):
 def measure(*, quick: bool) -> Table:
     """For each number of robots the highest rate that is carried, and what a robot-tick costs there."""
     warm_up()
-    get_context("forkserver").set_forkserver_preload(["kantor_fleet.preloaded"])
+    get_context("forkserver").set_forkserver_preload(["kantor_fleet.processes.preloaded"])
     rows = []
     for link in LINKS:
         for count in COUNTS_QUICK if quick else COUNTS:
@@ -254,7 +260,7 @@ def _start(stack: ExitStack, target: Callable[..., None], *arguments: object) ->
 
 def _endpoint(load: Load) -> str:
     """A loopback endpoint that nobody uses now."""
-    return bus.free_endpoint("tcp" if load.link == "tcp" else "tls")
+    return free_endpoint("tcp" if load.link == "tcp" else "tls")
 
 
 def _issue(load: Load, place: Path) -> None:
@@ -297,14 +303,14 @@ def _scenario(load: Load) -> Scenario:
 
 
 def _be_hub(load: Load, endpoint: str, place: Path, pipe: Connection) -> None:
-    bus.init_log()
+    init_log()
     scenario, folder = _scenario(load), place / "run"
     folder.mkdir()
-    plan = Plan(scenario, 0, Site.of(scenario, 0), "wall", load.rate_hz * PERIOD_S)
+    plan = MissionConfig(scenario, 0, WorldSetup.of(scenario, 0), "wall", load.rate_hz * PERIOD_S)
     recording = Recording(scenario, 0, "wall", folder, speed=plan.speed)
     meter = _Meter(lambda: recording.metrics.steps)
     users, host = credentials.users_file(place), credentials.find(place, credentials.HOST)
-    with bus.Host(host, endpoint, users, scenario.roster) as router:
+    with HubRouter(host, endpoint, users, scenario.roster) as router:
         result = run(router, plan, recording, lambda: False, meter.look)
         if result.violations:
             raise RuntimeError(f"{load}: {result.complaints[0]}")
@@ -334,10 +340,10 @@ class _Meter:
 
 
 def _be_site(connect: str, listen: str, place: Path, pipe: Connection) -> None:
-    bus.init_log()
+    init_log()
     identity = credentials.find(place, "site-north")
     assert isinstance(identity, credentials.Certificate)
-    with bus.Site(identity, connect, listen, START_S):
+    with SiteRouter(identity, connect, listen, START_S):
         pipe.recv()
         pipe.send(time.process_time())
         os._exit(0)
@@ -348,7 +354,7 @@ def _be_site(connect: str, listen: str, place: Path, pipe: Connection) -> None:
 
 def _be_robots(names: Sequence[str], endpoint: str, place: Path, pipe: Connection) -> None:
     os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
-    bus.init_log()
+    init_log()
     with ExitStack() as stack:
         robots = [stack.enter_context(_robot(name, endpoint, place)) for name in names]
         gc.freeze()
@@ -363,17 +369,17 @@ def _be_robots(names: Sequence[str], endpoint: str, place: Path, pipe: Connectio
 @contextmanager
 def _robot(name: str, endpoint: str, place: Path) -> "Iterator[_Robot]":
     nonce = f"{os.getpid()}-{threading.get_native_id()}"
-    with bus.line(endpoint, credentials.find(place, name), nonce, START_S) as line:
+    with participant_session(endpoint, credentials.find(place, name), nonce, START_S) as line:
         yield _Robot(line, name)
 
 
 class _Robot:
     """A participant on the wall in a loop that it shares; without a diary on disk."""
 
-    def __init__(self, line: bus.Line, name: str) -> None:
+    def __init__(self, line: ParticipantSession, name: str) -> None:
         self._line, self._name = line, name
-        self._life: Life | None = None
-        self._go: Go | None = None
+        self._life: RecoverableNode | None = None
+        self._go: StartClock | None = None
         self._inbox: list[Envelope] = []
         self._said_s = 0.0
         self._waits = False
@@ -394,9 +400,9 @@ class _Robot:
     def _take(self, message: object) -> None:
         if isinstance(message, Mission):
             self._prepare(message)
-        elif isinstance(message, Go):
+        elif isinstance(message, StartClock):
             self._start(message)
-        elif isinstance(message, Turn) and self._life is not None:
+        elif isinstance(message, StepRequest) and self._life is not None:
             self._inbox += message.inputs.inbox
             self._observation = message.inputs.observation
             if self._waits and self._observation.step == self._life.step_count:
@@ -410,14 +416,14 @@ class _Robot:
         pose = Pose(*mission.starts.open("<f8", 2)[i].tolist())
         samples_m = mission.samples.open("<f8", 2)
 
-        def build(body: Body) -> Agent:
-            return Agent(self._name, scenario, mission.seed, body, samples_m)
+        def build(body: Body) -> DensityRobot:
+            return DensityRobot(self._name, scenario, mission.seed, body, samples_m)
 
-        self._life = Life(build, Memory(), mission.body or Body(pose))
-        self._clock = clocks(scenario, mission.seed)[self._name]
+        self._life = RecoverableNode(build, InMemoryLog(), mission.body or Body(pose))
+        self._clock = step_clocks(scenario, mission.seed)[self._name]
         self._line.send(encode(Ready(VERSION, self._line.nonce)), patiently=True)
 
-    def _start(self, go: Go) -> None:
+    def _start(self, go: StartClock) -> None:
         assert go.observation is not None
         self._go, self._observation = go, go.observation
         self._origin_ns = time.monotonic_ns() - round(go.now_ns / go.speed)
@@ -428,11 +434,11 @@ class _Robot:
         while self._clock.due_ns(self._ordinal) <= now_ns:
             self._ordinal += 1
 
-    def _step(self, life: Life) -> bool:
+    def _step(self, life: RecoverableNode) -> bool:
         assert self._go is not None
         now_ns = round((time.monotonic_ns() - self._origin_ns) * self._go.speed)
         if now_ns < self._clock.due_ns(self._ordinal):
-            if self._waits and time.monotonic() - self._again_s > AGAIN_S:
+            if self._waits and time.monotonic() - self._again_s > RETRY_S:
                 self._say()
             return False
         self._skip(now_ns)

@@ -23,11 +23,11 @@ from typing import NamedTuple
 import zenoh
 from tables import Table
 
-from kantor_fleet.catalog import find
-from kantor_fleet.local import _LIGHT_RUNTIME, Order, local_fleet, watch_progress
-from kantor_fleet.preload import warm_up
-from kantor_protocol.bus import free_endpoint
-from kantor_protocol.scenario import Scenario
+from kantor_fleet.processes.local import _LIGHT_RUNTIME, FleetConfig, local_fleet, watch_progress
+from kantor_fleet.processes.preload import warm_up
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.transport.endpoint import free_endpoint
 
 COUNTS = (5, 20, 100)
 COUNTS_QUICK = (5, 20)
@@ -50,7 +50,7 @@ def measure(*, quick: bool) -> Table:
     """Ticks and rounds a second; the median of the repetitions, taken in turn."""
     warm_up()
     # The fork server starts with the first child, which is not kantor's here.
-    get_context("forkserver").set_forkserver_preload(["kantor_fleet.preloaded"])
+    get_context("forkserver").set_forkserver_preload(["kantor_fleet.processes.preloaded"])
     seconds, repeats = (3.0, 1) if quick else (6.0, 3)
     rows = []
     for count in COUNTS_QUICK if quick else COUNTS:
@@ -111,7 +111,7 @@ def _mission(count: int, seconds: float) -> Pace:
     scenario = _scenario(count)
     marks: list[tuple[float, int]] = []
     with tempfile.TemporaryDirectory(prefix="kantor-speed-") as folder:
-        order = Order(scenario, 0, "lockstep", 1.0, Path(folder))
+        order = FleetConfig(scenario, 0, "lockstep", 1.0, Path(folder))
         with local_fleet(order) as fleet:
             give_up = time.monotonic() + MISSION_S
             for progress in watch_progress(fleet):

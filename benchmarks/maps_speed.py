@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 from tables import Table, verdict
 
-from kantor_fleet.catalog import find
-from kantor_fleet.preload import warm_up
-from kantor_fleet.team import play
-from kantor_protocol.scenario import MAP_PLANNERS
-from kantor_worldsim.recording import Recording
-from kantor_worldsim.world import Site
+from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.processes.preload import warm_up
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.scenario.schema import MAP_PLANNERS
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.world.world import WorldSetup
 
 BYTES_MAX = 60.0
 """Of maps, per robot and tick on average, at 0.2 m."""
@@ -87,7 +87,7 @@ def measure(*, quick: bool) -> Table:
 
 def _run(name: str, overrides: tuple[str, ...], seed: int) -> Cost:
     scenario = find(name, overrides)
-    site = Site.of(scenario, seed)
+    site = WorldSetup.of(scenario, seed)
     recording = Recording(scenario, seed, "in-process")
     start_s = time.process_time()
     play(scenario, seed, site, [recording.take])

@@ -18,17 +18,17 @@ import numpy as np
 import numpy.typing as npt
 from tables import Table, verdict
 
-from kantor_agent.belief import Belief
-from kantor_agent.planners import PLANNERS
+from kantor_agent.belief.belief import Belief
+from kantor_agent.planners.registry import PLANNERS
 from kantor_agent.vehicles import VEHICLES
-from kantor_fleet.catalog import find
-from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import Pose
-from kantor_protocol.radio import replica_of
-from kantor_protocol.scenario import Scenario
-from kantor_protocol.walk import Walk
-from kantor_protocol.weights import Units
-from kantor_worldsim.density import samples_of, starts_of
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.base.counter_rng import Purpose
+from kantor_protocol.base.machine import Pose
+from kantor_protocol.base.random_walk import RandomWalk
+from kantor_protocol.replication.gossip import build_replica
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.weights import Units
+from kantor_worldsim.world.density import samples_of, starts_of
 
 SIZES = (2_000, 20_000, 200_000, 1_000_000)
 SIZES_QUICK = (2_000, 200_000)
@@ -90,8 +90,8 @@ class Mission:
         """samples_m: (N, 2) world frame."""
         count = samples_m.shape[0]
         self.units = Units.of(scenario.energy.points, count)
-        self.replica = replica_of("r1", scenario, self.units, count)
-        walk = Walk(samples_m, 0.0, scenario.period_ns, 0, Purpose.SAMPLE_WALK)
+        self.replica = build_replica("r1", scenario, self.units, count)
+        walk = RandomWalk(samples_m, 0.0, scenario.period_ns, 0, Purpose.SAMPLE_WALK)
         self.belief = Belief(walk, self.units, self.replica)
         self.planner = PLANNERS[scenario.planner.name](scenario)
         self.pose = Pose(*starts_of(scenario, 0)[0].tolist())

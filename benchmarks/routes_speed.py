@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from tables import Table, verdict
 
-from kantor_agent.routes import Routes, length_cost, smoothed_cost
+from kantor_agent.mapping.routes import Routes, length_cost, smoothed_cost
 
 SIZES = ((100, 135), (200, 270), (1000, 1000))
 WALLS = 0.2

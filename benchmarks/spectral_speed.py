@@ -12,11 +12,11 @@ from typing import NamedTuple
 from planner_speed import Mission
 from tables import Table, verdict
 
-from kantor_fleet.catalog import find
-from kantor_protocol.machine import Pose
-from kantor_protocol.registers import Registers
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.density import samples_of
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.base.machine import Pose
+from kantor_protocol.replication.registers import Registers
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.world.density import samples_of
 
 MODES = (10, 15, 20)
 MODES_QUICK = (15,)

@@ -6,12 +6,13 @@ exactly repeatable; over the bus the bytes are the same.
 
 from tables import Table, verdict
 
-from kantor_fleet.catalog import find
-from kantor_fleet.team import team
-from kantor_worldsim.loop import in_process, simulate
-from kantor_worldsim.recording import Recording
-from kantor_worldsim.stage import Stage
-from kantor_worldsim.world import Site
+from kantor_fleet.execution.in_process_team import team
+from kantor_fleet.scenarios.catalog import find
+from kantor_worldsim.engine.event_loop import simulate
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.world.world import WorldSetup
 
 SCENARIOS = (
     "paper-single",
@@ -31,9 +32,9 @@ def measure(*, quick: bool) -> Table:
     rows, met = [], True
     for name in SCENARIOS[1:4] if quick else SCENARIOS:
         scenario = find(name)
-        site = Site.of(scenario, 0)
+        site = WorldSetup.of(scenario, 0)
         recording = Recording(scenario, 0, "in-process")
-        stage = Stage(scenario, 0, site, [recording.take])
+        stage = Simulation(scenario, 0, site, [recording.take])
         simulate(stage, in_process(team(scenario, 0, site)), 0, lambda: False)
         wire = recording.finish().bytes_per_robot_tick
         whole = 8 * site.samples_m.shape[0]

@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from kantor_agent.planners import PLANNERS
-from kantor_agent.planners.allocators import ALLOCATORS
-from kantor_fleet.catalog import find, path_of
-from kantor_fleet.team import play
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.metrics import Result
-from kantor_worldsim.recording import Recording
-from kantor_worldsim.world import Site
+from kantor_agent.planners.map_registry import ALLOCATORS
+from kantor_agent.planners.registry import PLANNERS
+from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.scenarios.catalog import find, path_of
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.observers.metrics.result import Result
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.world.world import WorldSetup
 
 README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
 
@@ -30,7 +30,7 @@ def example(name: str) -> Any:
 def played(scenario: Scenario) -> Result:
     """A mission in process, with every referee."""
     recording = Recording(scenario, 0, "in-process")
-    play(scenario, 0, Site.of(scenario, 0), [recording.take])
+    play(scenario, 0, WorldSetup.of(scenario, 0), [recording.take])
     return recording.finish()
 
 

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from kantor_agent.core import Agent
-from kantor_protocol.credentials import Identity
-from kantor_protocol.machine import Body, StateMachine
-from kantor_protocol.messages import Mission
-from kantor_protocol.process import participate
+from kantor_agent.robots.density import DensityRobot
+from kantor_protocol.base.machine import Body, StateMachine
+from kantor_protocol.node.runner import participate
+from kantor_protocol.transport.credentials import Identity
+from kantor_protocol.wire.messages import Mission
 
 
 def run(
@@ -21,9 +21,9 @@ def run(
     def build(mission: Mission, body: Body) -> StateMachine:
         me, scenario, seed = identity.user, mission.scenario, mission.seed
         if mission.frame is not None:
-            from kantor_agent.mapper import Mapper  # noqa: PLC0415  only where there is a map
+            from kantor_agent.robots.mapping import MappingRobot  # noqa: PLC0415  only where there is a map
 
-            return Mapper(me, scenario, seed, body, mission.frame)
-        return Agent(me, scenario, seed, body, mission.samples.open("<f8", 2))
+            return MappingRobot(me, scenario, seed, body, mission.frame)
+        return DensityRobot(me, scenario, seed, body, mission.samples.open("<f8", 2))
 
     return participate(connect, identity, build, patience_s, say, state)

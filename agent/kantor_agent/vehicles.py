@@ -8,8 +8,8 @@ import math
 from collections.abc import Callable
 from typing import Protocol
 
-from kantor_protocol.machine import Pose
-from kantor_protocol.scenario import Vehicle as Parameters
+from kantor_protocol.base.machine import Pose
+from kantor_protocol.scenario.schema import VehicleOptions as Parameters
 
 LATER_NS = 1 << 62
 """A last step later than any: since then no time has passed, as on a clock that was set back."""

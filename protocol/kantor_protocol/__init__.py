@@ -1,1 +1,6 @@
-"""What every kantor process shares: the state machine, the messages, replication, the bus."""
+"""What every kantor process shares: the state machine, scenarios, messages, replication and the bus.
+
+Nothing here knows a planner, the world or a checker. Start with `base/machine.py` (the contract of a participant),
+then `wire/messages.py` and `replication/gossip.py`. Layers, lowest first: base, scenario, wire, then replication
+and transport side by side, and node on top.
+"""

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from kantor_protocol.credentials import Identity
-from kantor_protocol.machine import Body, StateMachine
-from kantor_protocol.messages import Mission
-from kantor_protocol.process import participate
-from kantor_supervisor.core import Supervisor
+from kantor_protocol.base.machine import Body, StateMachine
+from kantor_protocol.node.runner import participate
+from kantor_protocol.transport.credentials import Identity
+from kantor_protocol.wire.messages import Mission
+from kantor_supervisor.density import DensitySupervisor
 
 
 def run(
@@ -21,9 +21,9 @@ def run(
     def build(mission: Mission, body: Body) -> StateMachine:
         me, scenario = identity.user, mission.scenario
         if mission.frame is not None:
-            from kantor_supervisor.allocation import Allocation  # noqa: PLC0415  only on a map
+            from kantor_supervisor.mapping import MappingSupervisor  # noqa: PLC0415  only on a map
 
-            return Allocation(me, scenario, mission.seed, body, mission.frame)
-        return Supervisor(me, scenario, body, mission.samples.shape[0])
+            return MappingSupervisor(me, scenario, mission.seed, body, mission.frame)
+        return DensitySupervisor(me, scenario, body, mission.samples.shape[0])
 
     return participate(connect, identity, build, patience_s, say, state)

@@ -8,14 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from kantor_agent.belief import Belief
-from kantor_protocol.keyed import Purpose
-from kantor_protocol.packing import Pairs
-from kantor_protocol.replica import Replica
-from kantor_protocol.walk import Walk
-from kantor_protocol.weights import Units
-from replicas import entries
-from strategies import Points, crowds, examples, scattered
+from kantor_agent.belief.belief import Belief
+from kantor_protocol.base.counter_rng import Purpose
+from kantor_protocol.base.random_walk import RandomWalk
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.replication.replica import Replica
+from kantor_protocol.wire.weights import Units
+from support.replicas import entries
+from support.strategies import Points, crowds, examples, scattered
 
 Plan = list[tuple[int, int]]
 """(sample, units), nearest first."""
@@ -32,7 +32,7 @@ def belief_over(
 ) -> Belief:
     """A robot's belief before anybody has spent anything."""
     units = Units.of(points, samples_m.shape[0])
-    walk = Walk(samples_m, diffusion_m, 1, 1, Purpose.SAMPLE_WALK)
+    walk = RandomWalk(samples_m, diffusion_m, 1, 1, Purpose.SAMPLE_WALK)
     replica = Replica(me, origins, samples_m.shape[0], units, ledger=ledger, claims=False)
     return Belief(walk, units, replica)
 
@@ -248,7 +248,7 @@ def test_nearest_samples_are_those_with_weight() -> None:
 
 def test_search_follows_samples_that_walk() -> None:
     """Eq. 14: weight is spent where samples are now, not where they were."""
-    walk = Walk(scattered(50), 30.0, 1, 1, Purpose.SAMPLE_WALK)
+    walk = RandomWalk(scattered(50), 30.0, 1, 1, Purpose.SAMPLE_WALK)
     walk.advance(5)
     order = np.argsort(np.hypot(*(walk.xy_m - [50.0, 50.0]).T))
     belief = belief_over(scattered(50), 50, diffusion_m=30.0)

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from floors import Floor, crowded, drawn, robot
 from kantor_agent.planners.burgard import Burgard, coverage, discount, in_sight
-from kantor_agent.planners.team import Situation, Task
-from kantor_protocol.evidence import RANGE_BINS
-from kantor_protocol.grid import NOWHERE, OCCUPIED
-from strategies import examples
+from kantor_agent.planners.map_base import Situation, Task
+from kantor_protocol.base.grid import NOWHERE, OCCUPIED
+from kantor_protocol.replication.occupancy_log import RANGE_BINS
+from support.floors import Floor, crowded, drawn, robot
+from support.strategies import examples
 
 CORRIDOR = ["  ........  "]
 """Frontiers are 2 and 9, and the sensor reaches 3 cells."""

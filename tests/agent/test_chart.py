@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent.chart import Chart
-from kantor_protocol.evidence import RANGE_BINS, entries, void
-from kantor_protocol.grid import FREE, OCCUPIED, UNKNOWN, Frame
-from kantor_protocol.replica import Replica
-from strategies import examples
+from kantor_agent.mapping.fused_map import FusedMap
+from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.replication.occupancy_log import RANGE_BINS, dead_frontier, entries
+from kantor_protocol.replication.replica import Replica
+from support.strategies import examples
 
 FRAME = Frame(0.5, (0.0, 0.0), 4, 5)
 ORIGINS = 3
@@ -20,7 +20,7 @@ def replica(me: int = 0) -> Replica:
     return Replica(me, ORIGINS, entries(FRAME), None, ledger=True, claims=False)
 
 
-def chart_of(*logs: list[int]) -> Chart:
+def chart_of(*logs: list[int]) -> FusedMap:
     """What a participant makes of these logs; the first is its own."""
     held = replica()
     held.append(np.array(logs[0], dtype=np.int64))
@@ -29,7 +29,7 @@ def chart_of(*logs: list[int]) -> Chart:
         other.append(np.array(log, dtype=np.int64))
         other.registers.end_step()
         assert held.learn(origin, *_said(other))
-    chart = Chart(FRAME, ORIGINS)
+    chart = FusedMap(FRAME, ORIGINS)
     chart.fold(held)
     return chart
 
@@ -76,8 +76,8 @@ def test_layers_are_summed_and_doubt_is_a_wall() -> None:
 )
 def test_folding_bit_by_bit_is_folding_at_once(logs: list[list[int]], cuts: list[int]) -> None:
     """A chart is a function of the logs, not of when they came; the reference sums plain signs."""
-    whole, held = Chart(FRAME, ORIGINS), replica()
-    bits = Chart(FRAME, ORIGINS)
+    whole, held = FusedMap(FRAME, ORIGINS), replica()
+    bits = FusedMap(FRAME, ORIGINS)
     for origin, log in enumerate(logs):
         store = held.store
         held.reserve(len(log))
@@ -113,7 +113,7 @@ def test_frontiers_are_free_cells_beside_the_unknown() -> None:
 
 def test_what_was_found_void_is_no_frontier() -> None:
     """One robot stood there in vain: nobody need go again."""
-    assert chart_of(free(0, 1), [void(FRAME, 1)]).frontiers.tolist() == [0]
+    assert chart_of(free(0, 1), [dead_frontier(FRAME, 1)]).frontiers.tolist() == [0]
 
 
 def test_measured_ranges_are_counted() -> None:

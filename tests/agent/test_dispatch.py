@@ -7,25 +7,26 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent import dispatch
-from kantor_agent.chart import Chart
-from kantor_agent.dispatch import (
-    Dispatch,
-    Patience,
+from kantor_agent.coordination import assignment
+from kantor_agent.coordination.assignment import (
+    Assignment,
+    ProgressMonitor,
     member_of,
     order_in,
     orders_of,
     register_of,
-    roll_call,
+    visible_team,
 )
-from kantor_agent.planners.team import Member, Situation, Task
-from kantor_agent.terrain import Terrain
-from kantor_protocol.evidence import entries
-from kantor_protocol.grid import NOWHERE, Frame
-from kantor_protocol.registers import Registers
-from kantor_protocol.replica import Replica
-from kantor_protocol.scenario import Scenario, parse
-from strategies import examples
+from kantor_agent.mapping.cost_map import CostMap
+from kantor_agent.mapping.fused_map import FusedMap
+from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_protocol.base.grid import NOWHERE, Frame
+from kantor_protocol.replication.occupancy_log import entries
+from kantor_protocol.replication.registers import Registers
+from kantor_protocol.replication.replica import Replica
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import Scenario
+from support.strategies import examples
 
 FRAME = Frame(1.0, (0.0, 0.0), 5, 9)
 MISSION = """
@@ -64,11 +65,11 @@ class World:
         self, monkeypatch: pytest.MonkeyPatch, *overrides: str, me: int | None = None
     ) -> None:
         self.asked = Asked()
-        monkeypatch.setitem(dispatch.ALLOCATORS, "frontier", lambda *_: self.asked)
+        monkeypatch.setitem(assignment.ALLOCATORS, "frontier", lambda *_: self.asked)
         scenario = mission(*overrides)
-        self.chart = Chart(FRAME, 3)
+        self.chart = FusedMap(FRAME, 3)
         self.log = Replica(0, 3, entries(FRAME), None, ledger=True, claims=False)
-        self.dispatch = Dispatch(scenario, Terrain(scenario, self.chart), 0, me)
+        self.dispatch = Assignment(scenario, CostMap(scenario, self.chart), 0, me)
 
     def see(self, *cells: int) -> None:
         """Cells are free."""
@@ -229,10 +230,10 @@ def test_who_is_silent_leaves_the_group_and_then_memory() -> None:
     held.write(register_of(robot(0, 3), resting=False))
     other.write(register_of(robot(1, 5), resting=False))
     held.learn(1, other.compose(), 2)
-    patience = Patience(contact_steps=2, remember_steps=5)
+    patience = ProgressMonitor(contact_steps=2, remember_steps=5)
     seen = []
     for _ in range(8):
-        group, absent = roll_call(held, 2, FRAME, 0, patience)
+        group, absent = visible_team(held, 2, FRAME, 0, patience)
         seen.append(([m.robot for m in group], absent))
         held.end_step()
 
@@ -243,5 +244,5 @@ def test_patience_is_counted_in_own_steps() -> None:
     """A supervisor that steps twice a period waits twice as many steps."""
     scenario = mission("planner.remember_s=3", "clock.period_s=0.5")
 
-    assert Patience.of(scenario, scenario.period_ns) == (8, 6)
-    assert Patience.of(scenario, scenario.period_ns // 2) == (16, 12)
+    assert ProgressMonitor.of(scenario, scenario.period_ns) == (8, 6)
+    assert ProgressMonitor.of(scenario, scenario.period_ns // 2) == (16, 12)

@@ -5,8 +5,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent.field import Grid, build, grid_over, nearest, remove, remove_empty
-from strategies import METRES, Points, crowds, examples, scattered
+from kantor_agent.belief.sample_index import (
+    SampleIndex,
+    build,
+    index_over,
+    nearest,
+    remove,
+    remove_empty,
+)
+from support.strategies import METRES, Points, crowds, examples, scattered
 
 Answer = list[tuple[float, int]]
 """(squared distance, sample), nearest first."""
@@ -27,7 +34,7 @@ def scan(xy_m: Points, alive: set[int], x: float, y: float, skip: list[int], k: 
     return sorted(answer)[:k]
 
 
-def ask(grid: Grid, x: float, y: float, skip: list[int], k: int) -> Answer:
+def ask(grid: SampleIndex, x: float, y: float, skip: list[int], k: int) -> Answer:
     """What the grid answers."""
     best, near = np.zeros(k), np.zeros(k, dtype=np.int64)
     count = nearest(grid, x, y, np.array(skip, dtype=np.int64), best, near)
@@ -43,7 +50,7 @@ def weights_of(count: int, dead: set[int]) -> np.ndarray:
     return weights
 
 
-def members(grid: Grid) -> list[list[set[int]]]:
+def members(grid: SampleIndex) -> list[list[set[int]]]:
     """Of every cell: the samples with weight, and all."""
     leaves = grid.alive[-(grid.first.shape[0] - 1) :]
     cells = []
@@ -55,7 +62,7 @@ def members(grid: Grid) -> list[list[set[int]]]:
     return cells
 
 
-def check_pyramid(grid: Grid, alive: set[int]) -> None:
+def check_pyramid(grid: SampleIndex, alive: set[int]) -> None:
     """Counts add up from the cells to the root, and every sample is where the index says."""
     level_start = 0
     for level in range(grid.levels - 1):
@@ -84,7 +91,7 @@ def test_nearest_equals_a_full_scan(data: st.DataObject, xy_m: Points, k: int) -
     count = xy_m.shape[0]
     some = st.sets(st.integers(0, count - 1), max_size=count)
     dead, skip = data.draw(some), sorted(data.draw(some | st.just(set())))
-    grid = grid_over(xy_m, weights_of(count, dead))
+    grid = index_over(xy_m, weights_of(count, dead))
     at = data.draw(st.integers(0, count - 1))
     x, y = data.draw(
         st.tuples(METRES, METRES)
@@ -101,7 +108,7 @@ def test_nearest_equals_a_full_scan(data: st.DataObject, xy_m: Points, k: int) -
 def test_nearest_equals_a_full_scan_until_nothing_is_left(count: int) -> None:
     """While samples are used up one by one from anywhere, every answer stays exact."""
     xy_m = scattered(count)
-    grid = grid_over(xy_m, weights_of(count, set()))
+    grid = index_over(xy_m, weights_of(count, set()))
     alive = set(range(count))
     places_m = scattered(60, seed=2, extent_m=140.0) - 20.0
     for i in range(count):
@@ -122,7 +129,7 @@ def test_nearest_equals_a_full_scan_until_nothing_is_left(count: int) -> None:
 def test_sample_is_removed_once(xy_m: Points, order: list[int]) -> None:
     """Taking out what is out already changes nothing; the counts stay consistent."""
     count = xy_m.shape[0]
-    grid = grid_over(xy_m, weights_of(count, set()))
+    grid = index_over(xy_m, weights_of(count, set()))
     gone: set[int] = set()
     for number in order:
         j = number % count
@@ -143,7 +150,7 @@ def test_only_emptied_samples_among_the_lowered_are_removed(
     """A sample whose weight fell but not to 0 stays in the search."""
     count = xy_m.shape[0]
     dead, lowered = ({j % count for j in some} for some in (dead, lowered))
-    grid = grid_over(xy_m, weights_of(count, set()))
+    grid = index_over(xy_m, weights_of(count, set()))
     remove_empty(grid, weights_of(count, dead), np.array(sorted(lowered), dtype=np.int64))
 
     check_pyramid(grid, set(range(count)) - (dead & lowered))
@@ -166,10 +173,10 @@ def test_grid_built_again_after_a_move_equals_a_new_one(
     dead = {j % count for j in data.draw(st.sets(st.integers(0, 59)))}
     weights = weights_of(count, dead)
     xy_m = xy_m.copy()
-    grid = grid_over(xy_m, weights_of(count, set()))
+    grid = index_over(xy_m, weights_of(count, set()))
     xy_m += [steps_m[j % len(steps_m)] for j in range(count)]
     build(grid, weights)
-    fresh = grid_over(xy_m.copy(), weights)
+    fresh = index_over(xy_m.copy(), weights)
     x, y = data.draw(st.tuples(METRES, METRES))
 
     assert ask(grid, x, y, [], k) == ask(fresh, x, y, [], k)
@@ -182,7 +189,7 @@ def test_samples_may_walk_far_out_of_the_first_frame(stride_m: float) -> None:
     """The grid keeps its frame; samples beyond it belong to the cells at its border."""
     count = 300
     xy_m = scattered(count)
-    grid = grid_over(xy_m, weights_of(count, set()))
+    grid = index_over(xy_m, weights_of(count, set()))
     steps_m = 2.0 * scattered(count, seed=2, extent_m=stride_m) - stride_m
     for walked in range(4):
         xy_m += np.roll(steps_m, walked, axis=0)
@@ -198,7 +205,7 @@ def test_samples_may_walk_far_out_of_the_first_frame(stride_m: float) -> None:
 def test_from_far_off_equally_far_samples_come_by_index(far_m: float) -> None:
     """Where distances round to the same number, the lower index is nearer, in whatever cell."""
     xy_m = scattered(200)
-    grid = grid_over(xy_m, weights_of(200, set()))
+    grid = index_over(xy_m, weights_of(200, set()))
     for x, y in ((far_m, 0.0), (-far_m, far_m), (50.0, -far_m), (far_m, far_m)):
         expected = scan(xy_m, set(range(200)), x, y, [], 7)
 
@@ -208,7 +215,7 @@ def test_from_far_off_equally_far_samples_come_by_index(far_m: float) -> None:
 def test_ties_go_to_the_lower_index() -> None:
     """Four samples at the same distance, two of them in the same place."""
     xy_m = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, 1.0], [5.0, 5.0]])
-    grid = grid_over(xy_m, weights_of(5, set()))
+    grid = index_over(xy_m, weights_of(5, set()))
 
     assert ask(grid, 0.0, 0.0, [], 3) == [(1.0, 0), (1.0, 1), (1.0, 2)]
     assert ask(grid, 0.0, 0.0, [1], 3) == [(1.0, 0), (1.0, 2), (1.0, 3)]
@@ -224,7 +231,7 @@ def test_search_from_anywhere_comes_to_an_end(xy_m: Points, x: float, y: float) 
     """Total: a query from the end of the number line, where squares overflow, finds samples once
     each or none.
     """
-    grid = grid_over(xy_m, weights_of(xy_m.shape[0], set()))
+    grid = index_over(xy_m, weights_of(xy_m.shape[0], set()))
     near = np.zeros(4, dtype=np.int64)
     count = nearest(grid, x, y, np.zeros(0, dtype=np.int64), np.zeros(4), near)
     found = near[:count].tolist()

@@ -5,12 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from floors import Floor, crowded, drawn, robot
-from kantor_agent.dispatch import Dispatch
+from kantor_agent.coordination.assignment import Assignment
 from kantor_agent.planners.frontier import Frontier
-from kantor_agent.planners.team import Member, Situation
-from kantor_protocol.grid import NOWHERE
-from strategies import examples
+from kantor_agent.planners.map_base import Member, Situation
+from kantor_protocol.base.grid import NOWHERE
+from support.floors import Floor, crowded, drawn, robot
+from support.strategies import examples
 
 CORRIDOR = [" ....... "]
 """Frontiers are 1 and 7."""
@@ -94,7 +94,7 @@ def test_a_robot_asks_for_itself_alone() -> None:
 def test_an_inaccessible_frontier_is_left_for_another(replan_on: str) -> None:
     """It is void as soon as a robot has made no progress for a while: nobody heads for it any more."""
     floor = drawn(CORRIDOR, "planner=frontier", f"planner.replan_on={replan_on}")
-    dispatch = Dispatch(floor.scenario, floor.terrain, 0, None)
+    dispatch = Assignment(floor.scenario, floor.terrain, 0, None)
     stuck = robot(0, 2, 1)
     assert dispatch.decide([stuck], (), 10) == {}
     floor.chart.void[1] = True
@@ -109,7 +109,7 @@ def test_an_inaccessible_frontier_is_left_for_another(replan_on: str) -> None:
 def test_a_robot_has_been_everywhere_before_it_returns() -> None:
     """Four frontiers that stay what they are, and a robot that arrives at one after the other."""
     floor = drawn(["## ##", "##.##", " ... ", "##.##", "## ##"], "planner=frontier")
-    dispatch = Dispatch(floor.scenario, floor.terrain, 0, 0)
+    dispatch = Assignment(floor.scenario, floor.terrain, 0, 0)
     member, visits = robot(0, 12), []
     for tick in range(10, 60, 10):
         task = dispatch.decide([member], (), tick)[0]

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from floors import Floor, crowded, drawn, robot
 from kantor_agent.planners.hungarian import Hungarian, _cheapest, spread_out
-from kantor_agent.planners.team import Situation
-from kantor_protocol.grid import NOWHERE
-from strategies import SEEDS, examples
+from kantor_agent.planners.map_base import Situation
+from kantor_protocol.base.grid import NOWHERE
+from support.floors import Floor, crowded, drawn, robot
+from support.strategies import SEEDS, examples
 
 CORRIDOR = ["  ........  "]
 """Frontiers are 2 and 9, and the sensor reaches 3 cells."""

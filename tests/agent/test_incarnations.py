@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent.core import Agent
-from kantor_agent.mapper import Mapper
-from kantor_fleet.team import participant, play, team
-from kantor_protocol.machine import (
+from kantor_agent.robots.density import DensityRobot
+from kantor_agent.robots.mapping import MappingRobot
+from kantor_fleet.execution.in_process_team import participant, play, team
+from kantor_protocol.base.machine import (
     EVERYBODY,
     SUPERVISOR,
     Body,
@@ -25,17 +25,17 @@ from kantor_protocol.machine import (
     State,
     StateMachine,
 )
-from kantor_protocol.messages import News, decode_news, encode_news
-from kantor_protocol.modes import rectangle_of, visit_at
-from kantor_protocol.packing import Pairs
-from kantor_protocol.replica import Replica
-from kantor_protocol.scenario import MAP_PLANNERS, Scenario
-from kantor_protocol.weights import Units, WeightsSubscriber
-from kantor_supervisor.core import Supervisor
-from kantor_worldsim.records import Batch, Ending, Record
-from kantor_worldsim.world import Site
-from mapping import on_map, site_of
-from strategies import MINIMUM, cast, examples, mission, scattered, starts
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.replication.cosine_basis import rectangle_of, visit_at
+from kantor_protocol.replication.replica import Replica
+from kantor_protocol.scenario.schema import MAP_PLANNERS, Scenario
+from kantor_protocol.wire.messages import GossipMessage, decode_gossip, encode_gossip
+from kantor_protocol.wire.weights import Units, WeightsSubscriber
+from kantor_supervisor.density import DensitySupervisor
+from kantor_worldsim.record.records import Batch, Ending, Record
+from kantor_worldsim.world.world import WorldSetup
+from support.missions import on_map, site_of
+from support.strategies import MINIMUM, cast, examples, mission, scattered, starts
 
 N = 12
 SAMPLES_M = scattered(N)
@@ -76,9 +76,9 @@ class Rehearsal:
         self.bodies[name], self._inboxes[name] = body, []
         self.births[name].append(len(self.told[name]))
         if name == SUPERVISOR:
-            self.machines[name] = Supervisor(name, self.scenario, body, N)
+            self.machines[name] = DensitySupervisor(name, self.scenario, body, N)
         else:
-            self.machines[name] = Agent(name, self.scenario, self._seed, body, SAMPLES_M)
+            self.machines[name] = DensityRobot(name, self.scenario, self._seed, body, SAMPLES_M)
 
     def round(
         self,
@@ -111,9 +111,9 @@ class Rehearsal:
     def replica(self, name: ParticipantId) -> Replica:
         """What a participant holds."""
         machine = self.machines[name]
-        if isinstance(machine, Agent):
+        if isinstance(machine, DensityRobot):
             return machine._belief.replica
-        assert isinstance(machine, Supervisor)
+        assert isinstance(machine, DensitySupervisor)
         return machine._replica
 
     def consumed(self) -> Counter[int]:
@@ -177,7 +177,7 @@ def check_life(played: Rehearsal, name: ParticipantId) -> None:
     for epoch, (born, died) in enumerate(zip(births, [*births[1:], len(told)], strict=True)):
         left = [UNITS.sample] * N
         for i in range(born, died):
-            assert decode_news(told[i].outbox[0].body).epoch == epoch
+            assert decode_gossip(told[i].outbox[0].body).epoch == epoch
             for sample, weight in pairs(told[i].lowered):
                 assert weight < left[sample]
                 left[sample] = weight
@@ -267,8 +267,8 @@ def test_boast_about_its_own_log_moves_nobody() -> None:
     played = Rehearsal(mission())
     for _ in range(4):
         played.round()
-    news = News(1, 9, 0.0, 0.0, bytes([99, 0, 0, 99, 0, 0]), b"", b"")
-    boast = Envelope("r2", 9, EVERYBODY, encode_news(news))
+    news = GossipMessage(1, 9, 0.0, 0.0, bytes([99, 0, 0, 99, 0, 0]), b"", b"")
+    boast = Envelope("r2", 9, EVERYBODY, encode_gossip(news))
     machine, body = played.machines["r1"], played.bodies["r1"]
     outputs = machine.step(Inputs(10**9, Observation(body.step, body.pose), (boast,)))
 
@@ -303,14 +303,14 @@ def test_wrong_clock_breaks_no_rule(*, name: str, skews: list[int]) -> None:
 def test_samples_walk_a_bounded_way_at_once_and_never_back() -> None:
     """An hour on the clock is no hour of work; whoever was away is right again soon."""
     scenario = mission("samples.diffusion_m=4.0", "energy.points=30000", "energy.steps=30000")
-    robot = Agent("r1", scenario, 1, Body(Pose(10.0, 10.0)), SAMPLES_M)
+    robot = DensityRobot("r1", scenario, 1, Body(Pose(10.0, 10.0)), SAMPLES_M)
     walked = []
     for step, now_s in enumerate((0.1, 3600.0, 0.3, 0.4, 30.0, 30.1, 30.2, 30.3, 30.4, 30.5, 30.6)):
         robot.step(Inputs(round(now_s * 1e9), Observation(step, Pose(10.0, 10.0))))
         walked.append(robot._belief.walked)
 
     assert walked == [1, 33, 33, 33, 65, 97, 129, 161, 193, 225, 257]
-    late = Agent("r1", scenario, 1, Body(Pose(10.0, 10.0)), SAMPLES_M)
+    late = DensityRobot("r1", scenario, 1, Body(Pose(10.0, 10.0)), SAMPLES_M)
     for step in range(12):
         late.step(Inputs(30_000_000_000 + step, Observation(step, Pose(10.0, 10.0))))
     assert late._belief.walked == 300
@@ -326,7 +326,7 @@ class Troubled:
         self,
         name: ParticipantId,
         scenario: Scenario,
-        site: Site,
+        site: WorldSetup,
         *,
         deaths: tuple[int, ...] = (),
         silent: tuple[int, int] = (0, 0),
@@ -390,7 +390,7 @@ def test_map_is_explored_whoever_is_born_again(planner: str, coordination: str) 
 
     assert isinstance(records[-1], Ending)
     assert records[-1].reason == "done"
-    assert isinstance(robot, Mapper)
+    assert isinstance(robot, MappingRobot)
     assert robot._chart._layers.shape[0] == 3 * len(scenario.roster)
     assert int((robot._chart.cells != 0).sum()) > 120
 

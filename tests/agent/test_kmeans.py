@@ -11,18 +11,19 @@ from hypothesis import strategies as st
 from scipy.ndimage import label
 from scipy.optimize import linear_sum_assignment
 
-from kantor_agent.chart import Chart
+from kantor_agent.mapping.cost_map import CostMap
+from kantor_agent.mapping.fused_map import FusedMap
 from kantor_agent.planners import kmeans
 from kantor_agent.planners.kmeans import NO_REGION, PARTS, ROUNDS, KMeans, Regions, blocked, choose
-from kantor_agent.planners.team import Member, Situation, Task
-from kantor_agent.terrain import Terrain
-from kantor_fleet.team import play, team
-from kantor_protocol.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
-from kantor_protocol.keyed import Purpose, uniform
-from kantor_protocol.scenario import Scenario, parse
-from kantor_worldsim.starts import observable
-from kantor_worldsim.world import Site, ground_of
-from strategies import examples
+from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_fleet.execution.in_process_team import play, team
+from kantor_protocol.base.counter_rng import Purpose, uniform
+from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.world.starts import observable
+from kantor_worldsim.world.world import WorldSetup, ground_of
+from support.strategies import examples
 
 MISSION = """
 name = "regions"
@@ -42,12 +43,12 @@ def mission(*overrides: str) -> Scenario:
     return parse(MISSION, "regions", overrides)
 
 
-def terrain_of(kinds: np.ndarray, range_m: float = 3.0) -> Terrain:
+def terrain_of(kinds: np.ndarray, range_m: float = 3.0) -> CostMap:
     """A chart of these kinds, (rows, columns), for a sensor that sees so far; cells of a metre."""
-    chart = Chart(Frame(1.0, (0.0, 0.0), *kinds.shape), 1)
+    chart = FusedMap(Frame(1.0, (0.0, 0.0), *kinds.shape), 1)
     chart.cells[:] = kinds.ravel()
     chart.revision += 1
-    return Terrain(mission(f"sensor.range_m={range_m}"), chart)
+    return CostMap(mission(f"sensor.range_m={range_m}"), chart)
 
 
 def scene(*rows: str, memos: tuple[tuple[int, ...], ...] = ()) -> Situation:
@@ -680,7 +681,7 @@ def test_four_robots_explore_all_there_is_to_see(layout: str, coordination: str)
         f"coordination={coordination}",
         "sensor.range_m=8.0",
     )
-    site = Site.of(scenario, 3)
+    site = WorldSetup.of(scenario, 3)
     machines = team(scenario, 3, site)
     assert play(scenario, 3, site, (), machines=machines) == "done"
     ground, _ = ground_of(scenario)

@@ -6,20 +6,29 @@ from typing import Any
 import numpy as np
 import pytest
 
-from grounds import drawn
-from kantor_agent import dispatch
-from kantor_agent.mapper import Mapper
-from kantor_agent.planners.team import Member, Task
-from kantor_fleet.team import play, team
-from kantor_protocol.evidence import entries
-from kantor_protocol.grid import FREE, UNKNOWN
-from kantor_protocol.machine import SUPERVISOR, Body, Inputs, Observation, Pose, State, StateMachine
-from kantor_protocol.scenario import MAP_PLANNERS, Scenario, parse
-from kantor_supervisor.allocation import Allocation
-from kantor_worldsim.maps import Ground
-from kantor_worldsim.records import Batch, Ending, Record
-from kantor_worldsim.starts import observable, starts_on
-from kantor_worldsim.world import Site
+from kantor_agent.coordination import assignment
+from kantor_agent.planners.map_base import Member, Task
+from kantor_agent.robots.mapping import MappingRobot
+from kantor_fleet.execution.in_process_team import play, team
+from kantor_protocol.base.grid import FREE, UNKNOWN
+from kantor_protocol.base.machine import (
+    SUPERVISOR,
+    Body,
+    Inputs,
+    Observation,
+    Pose,
+    State,
+    StateMachine,
+)
+from kantor_protocol.replication.occupancy_log import entries
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import MAP_PLANNERS, Scenario
+from kantor_supervisor.mapping import MappingSupervisor
+from kantor_worldsim.record.records import Batch, Ending, Record
+from kantor_worldsim.world.maps import Ground
+from kantor_worldsim.world.starts import observable, starts_on
+from kantor_worldsim.world.world import WorldSetup
+from support.grounds import drawn
 
 ROOMS = drawn(
     "####################",
@@ -73,7 +82,7 @@ class Played:
             count=scenario.robots.count,
             seed=seed,
         )
-        site = Site(np.zeros((0, 2)), np.zeros((0, 2)), starts_m, ground)
+        site = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), starts_m, ground)
         self.machines: dict[str, Any] = dict(team(scenario, seed, site))
         self.records: list[Record] = []
         machines: dict[str, StateMachine] = dict(self.machines)
@@ -127,16 +136,16 @@ def test_every_planner_explores_it_all_and_rests(planner: str, coordination: str
 def test_who_knows_the_same_comes_to_the_same_assignment(monkeypatch: pytest.MonkeyPatch) -> None:
     """In contact with everybody and without loss, all robots decide the same at the same time."""
     decided: dict[int, list[dict[int, Task]]] = {}
-    decide = dispatch.Dispatch.decide
+    decide = assignment.Assignment.decide
 
     def noted(
-        self: dispatch.Dispatch, group: list[Member], absent: list[int], tick: int
+        self: assignment.Assignment, group: list[Member], absent: list[int], tick: int
     ) -> dict[int, Task]:
         tasks = decide(self, group, absent, tick)
         decided.setdefault(tick, []).append(tasks)
         return tasks
 
-    monkeypatch.setattr(dispatch.Dispatch, "decide", noted)
+    monkeypatch.setattr(assignment.Assignment, "decide", noted)
     for planner in ("burgard", "kmeans", "hungarian"):
         decided.clear()
         Played(mission(f"planner={planner}")).assert_explored()
@@ -267,7 +276,7 @@ def test_rest_is_final() -> None:
 def test_a_late_word_moves_nobody() -> None:
     """An observation of an older step is no news, neither of the place nor of the walls."""
     scenario = mission("robots.count=1")
-    robot = Mapper("r1", scenario, 0, Body(Pose(2.5, 2.5)), ROOMS.frame)
+    robot = MappingRobot("r1", scenario, 0, Body(Pose(2.5, 2.5)), ROOMS.frame)
     scan = np.full(scenario.sensor.beams, 65535, dtype="<u2").tobytes()
     robot.step(Inputs(1, Observation(0, Pose(2.5, 2.5), (), scan)))
     held = robot._replica.store.length[0]
@@ -281,7 +290,7 @@ def test_a_late_word_moves_nobody() -> None:
 def test_a_supervisor_is_light_on_what_it_does_not_know() -> None:
     """Before anybody has spoken it has nobody to send anywhere."""
     scenario = mission("coordination=centralized")
-    supervisor = Allocation(SUPERVISOR, scenario, 0, Body(Pose(0.0, 0.0)), ROOMS.frame)
+    supervisor = MappingSupervisor(SUPERVISOR, scenario, 0, Body(Pose(0.0, 0.0)), ROOMS.frame)
     outputs = supervisor.step(Inputs(1, Observation(0, Pose(0.0, 0.0))))
 
     assert outputs.state is State.EXPLORING

@@ -9,33 +9,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent.chart import Chart
-from kantor_agent.planners.market import (
-    NOBODY,
-    Costs,
-    Market,
-    Memo,
-    _Holding,
-    _Rules,
+from kantor_agent.mapping.cost_map import CostMap
+from kantor_agent.mapping.fused_map import FusedMap
+from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_agent.planners.market.costs import NOBODY, Costs, price_of, separate
+from kantor_agent.planners.market.goals import (
     clear_disc,
     greedy_goals,
-    packed,
-    price_of,
     quadtree_goals,
     random_goals,
-    separate,
-    unpacked,
 )
-from kantor_agent.planners.team import Member, Situation, Task
-from kantor_agent.terrain import Terrain
-from kantor_fleet.team import play
-from kantor_protocol.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
-from kantor_protocol.keyed import Purpose, uniform
-from kantor_protocol.registers import NUMBER_MAX
-from kantor_protocol.scenario import Scenario, parse
-from kantor_worldsim.records import Batch, Record
-from kantor_worldsim.world import Site
-from strategies import examples
+from kantor_agent.planners.market.memo import Memo, packed, unpacked
+from kantor_agent.planners.market.planner import Market
+from kantor_agent.planners.market.rules import MarketRules
+from kantor_agent.planners.market.trader import _Holding
+from kantor_fleet.execution.in_process_team import play
+from kantor_protocol.base.counter_rng import Purpose, uniform
+from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.replication.registers import NUMBER_MAX
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.record.records import Batch, Record
+from kantor_worldsim.world.world import WorldSetup
+from support.strategies import examples
 
 MISSION = """
 name = "market"
@@ -54,12 +50,12 @@ def mission(*overrides: str) -> Scenario:
     return parse(MISSION, "market", overrides)
 
 
-def terrain_of(*rows: str, range_m: float = 4.0) -> Terrain:
+def terrain_of(*rows: str, range_m: float = 4.0) -> CostMap:
     """A chart as it is drawn, row 0 first: `?` unknown, `.` free, `#` wall."""
-    chart = Chart(Frame(1.0, (0.0, 0.0), len(rows), len(rows[0])), 4)
+    chart = FusedMap(Frame(1.0, (0.0, 0.0), len(rows), len(rows[0])), 4)
     chart.cells[:] = [KINDS[kind] for row in rows for kind in row]
     chart.revision = 1
-    return Terrain(mission(f"sensor.range_m={range_m}"), chart)
+    return CostMap(mission(f"sensor.range_m={range_m}"), chart)
 
 
 CORRIDOR = "????............????"
@@ -75,7 +71,7 @@ def member(robot: int, cell: int, task: Task = IDLE) -> Member:
 
 
 def situation(
-    terrain: Terrain, members: Sequence[Member], others: Sequence[Member] = (), tick: int = 10
+    terrain: CostMap, members: Sequence[Member], others: Sequence[Member] = (), tick: int = 10
 ) -> Situation:
     """What is known."""
     return Situation(terrain, terrain.chart.frontiers, tuple(members), tuple(others), (), tick)
@@ -165,7 +161,7 @@ def test_proposed_goals_are_unknown_reachable_apart_and_not_too_many(rule: str, 
     here = int(np.flatnonzero(terrain.chart.cells == FREE)[0])
     held = [int(cell) for cell in np.flatnonzero(terrain.chart.cells == UNKNOWN)[::50]]
     field = terrain.optimistic(here)
-    rules = _Rules(mission(f"planner.goals={rule}"), seed)
+    rules = MarketRules(mission(f"planner.goals={rule}"), seed)
 
     goals = rules.propose(terrain, field, 0, 7, held)
 
@@ -198,7 +194,7 @@ def test_cleared_disc_is_the_cells_nearer_than_its_radius(
 PLACES = st.lists(st.integers(0, 399), min_size=1, max_size=7, unique=True)
 
 
-def scattered_walls(seed: int) -> Terrain:
+def scattered_walls(seed: int) -> CostMap:
     """20 x 20 cells, a quarter of them walls, half of them unknown."""
     rng = np.random.default_rng(seed)
     return terrain_of(*["".join(rng.choice(list("??.#"), 20)) for _ in range(20)])
@@ -289,7 +285,7 @@ def test_distances_between_goals_are_a_metric_and_no_way_is_shorter(
 def test_robot_drives_to_the_frontier_on_the_way_to_its_goal() -> None:
     """The nearest frontier is at the left end, the goal at the right."""
     terrain = terrain_of(CORRIDOR)
-    rules = _Rules(mission(), 0)
+    rules = MarketRules(mission(), 0)
     asked = situation(terrain, [member(0, 6)])
 
     assert rules.heading(asked, asked.members[0], 17) == 15
@@ -307,7 +303,7 @@ def test_way_to_a_goal_leads_round_what_is_known_to_be_a_wall() -> None:
         "....##??",
         "??....??",
     )
-    rules = _Rules(mission(), 0)
+    rules = MarketRules(mission(), 0)
     asked = situation(terrain, [member(0, 8 * 2)])
 
     assert rules.heading(asked, asked.members[0], 8 * 5 + 7) == 8 * 6 + 5
@@ -316,7 +312,7 @@ def test_way_to_a_goal_leads_round_what_is_known_to_be_a_wall() -> None:
 def test_without_a_way_to_any_frontier_there_is_no_target() -> None:
     """A goal changes nothing about it."""
     terrain = terrain_of("..#...??")
-    rules = _Rules(mission(), 0)
+    rules = MarketRules(mission(), 0)
     asked = situation(terrain, [member(0, 0)])
 
     assert rules.heading(asked, asked.members[0], 7) == NOWHERE
@@ -469,7 +465,7 @@ def test_any_register_is_some_memo(numbers: list[int]) -> None:
 def test_longest_memo_fits_into_a_register(robots: int) -> None:
     """A full tour, everybody's offers answered, an offer of its own."""
     scenario = mission(f"robots.count={robots}")
-    tour = tuple((cell, robots - 1) for cell in range(_Rules(scenario, 0).capacity))
+    tour = tuple((cell, robots - 1) for cell in range(MarketRules(scenario, 0).capacity))
     memo = Memo(9, 7, 5, 3, (1,) * robots, (1,) * robots, tour)
 
     assert len(tour) >= 28
@@ -516,7 +512,7 @@ def nobody(_speaker: int, _listener: int, _step: int) -> Sequence[int]:
 class Net:
     """Robots that hear of one another's registers: late, twice or not at all, the newest wins."""
 
-    def __init__(self, terrain: Terrain, cells: Sequence[int], *overrides: str) -> None:
+    def __init__(self, terrain: CostMap, cells: Sequence[int], *overrides: str) -> None:
         self.robots = len(cells)
         scenario = mission(f"robots.count={self.robots}", *overrides)
         self.terrains = [terrain] * self.robots
@@ -885,12 +881,12 @@ def faulty(seed: int, robots: int) -> Hears:
     return hears
 
 
-def fresh(terrain: Terrain) -> Terrain:
+def fresh(terrain: CostMap) -> CostMap:
     """A chart of its own."""
-    chart = Chart(terrain.frame, 4)
+    chart = FusedMap(terrain.frame, 4)
     chart.cells[:] = terrain.chart.cells
     chart.revision = 1
-    return Terrain(mission(), chart)
+    return CostMap(mission(), chart)
 
 
 def strolling(net: Net, rng: np.random.Generator) -> None:
@@ -1012,7 +1008,7 @@ def targets_of(scenario: Scenario, seed: int) -> tuple[str, dict[str, list[tuple
             if goal and targets[act.name][-1:] != [goal]:
                 targets[act.name].append(goal)
 
-    return play(scenario, seed, Site.of(scenario, seed), [note]), targets
+    return play(scenario, seed, WorldSetup.of(scenario, seed), [note]), targets
 
 
 @pytest.mark.parametrize("rule", ["random", "greedy", "quadtree"])

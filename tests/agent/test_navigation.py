@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from floors import Floor, crowded, drawn
-from kantor_agent.navigation import Navigator
-from kantor_protocol.grid import FREE, OCCUPIED, UNKNOWN
-from kantor_protocol.machine import Pose
-from strategies import examples
+from kantor_agent.mapping.navigation import Navigator
+from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN
+from kantor_protocol.base.machine import Pose
+from support.floors import Floor, crowded, drawn
+from support.strategies import examples
 
 
 def drive(floor: Floor, start: int, target: int, stride_m: float) -> list[tuple[Pose, float]]:

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent.core import Agent
-from kantor_protocol.machine import (
+from kantor_agent.robots.density import DensityRobot
+from kantor_protocol.base.machine import (
     EVERYBODY,
     SUPERVISOR,
     Body,
@@ -20,11 +20,17 @@ from kantor_protocol.machine import (
     Pose,
     State,
 )
-from kantor_protocol.messages import News, check_outputs, decode_inputs, decode_news, encode
-from kantor_protocol.packing import Pairs
-from kantor_protocol.scenario import Scenario
-from kantor_protocol.weights import Units, WeightsSubscriber
-from strategies import (
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import (
+    GossipMessage,
+    check_outputs,
+    decode_gossip,
+    decode_inputs,
+    encode,
+)
+from kantor_protocol.wire.weights import Units, WeightsSubscriber
+from support.strategies import (
     MINIMUM,
     Transcript,
     cast,
@@ -52,10 +58,10 @@ MISSIONS = {
 EVERY_MISSION = pytest.mark.parametrize("name", list(MISSIONS))
 
 
-def robot(scenario: Scenario, name: str = "r1") -> Agent:
+def robot(scenario: Scenario, name: str = "r1") -> DensityRobot:
     """A robot at its start."""
     start_m = scenario.starts.poses_m[scenario.robot_ids.index(name)]
-    return Agent(name, scenario, 1, Body(Pose(*start_m)), SAMPLES_M)
+    return DensityRobot(name, scenario, 1, Body(Pose(*start_m)), SAMPLES_M)
 
 
 def transcripts(name: str, rounds: int = 40) -> dict[str, Transcript]:
@@ -184,7 +190,7 @@ def test_step_is_numbered_and_sound(name: str) -> None:
     for robot_id, transcript in transcripts(name).items():
         for step, (_, outputs) in enumerate(transcript, 1):
             check_outputs(outputs)
-            news = decode_news(outputs.outbox[0].body)
+            news = decode_gossip(outputs.outbox[0].body)
 
             assert (outputs.step, outputs.refused, len(outputs.outbox)) == (step, 0, 1)
             assert outputs.outbox[0] == Envelope(
@@ -212,7 +218,7 @@ def test_robot_plans_then_moves_then_spends() -> None:
     """Algorithm 1: the goal is chosen from where the robot was, the point ships from where it is."""
     far_m = np.array([[10.0, 10.0], [10.0, 95.0]])
     scenario = mission("robots.count=1", "starts.poses_m=[[10.0, 60.0]]", "energy.points=2")
-    machine = Agent("r1", scenario, 1, Body(Pose(10.0, 60.0)), far_m)
+    machine = DensityRobot("r1", scenario, 1, Body(Pose(10.0, 60.0)), far_m)
     outputs = machine.step(Inputs(scenario.period_ns, Observation(0, Pose(10.0, 60.0))))
 
     assert outputs.goal == (10.0, 95.0)
@@ -262,13 +268,13 @@ def test_accepted_pose_moves_the_robot() -> None:
 NOISE = (
     Envelope("r2", 1, "", b""),
     Envelope("r2", 2, "", b"\xff" * 50),
-    Envelope("r9", 1, "", encode(News(1, 1, 0.0, 0.0, bytes(6), b"", b""))),
-    Envelope("r1", 1, "", encode(News(1, 1, 0.0, 0.0, bytes(6), b"", b""))),
-    Envelope("r2", 3, "", encode(News(2, 1, 0.0, 0.0, bytes(6), b"", b""))),
-    Envelope("r2", 4, "", encode(News(1, 1, float("nan"), 0.0, bytes(6), b"", b""))),
-    Envelope("r2", 5, "", encode(News(1, 1, 0.0, 0.0, bytes(5), b"", b""))),
-    Envelope("r2", 6, "", encode(News(1, 1, 0.0, 0.0, bytes(6), b"\x01\x00\x01", b""))),
-    Envelope("r2", 7, "", encode(News(1, 1, 0.0, 0.0, bytes(6), b"", b"\x05"))),
+    Envelope("r9", 1, "", encode(GossipMessage(1, 1, 0.0, 0.0, bytes(6), b"", b""))),
+    Envelope("r1", 1, "", encode(GossipMessage(1, 1, 0.0, 0.0, bytes(6), b"", b""))),
+    Envelope("r2", 3, "", encode(GossipMessage(2, 1, 0.0, 0.0, bytes(6), b"", b""))),
+    Envelope("r2", 4, "", encode(GossipMessage(1, 1, float("nan"), 0.0, bytes(6), b"", b""))),
+    Envelope("r2", 5, "", encode(GossipMessage(1, 1, 0.0, 0.0, bytes(5), b"", b""))),
+    Envelope("r2", 6, "", encode(GossipMessage(1, 1, 0.0, 0.0, bytes(6), b"\x01\x00\x01", b""))),
+    Envelope("r2", 7, "", encode(GossipMessage(1, 1, 0.0, 0.0, bytes(6), b"", b"\x05"))),
     Envelope("r2", 8, "", bytes(300_000)),
 )
 
@@ -295,7 +301,7 @@ def test_malformed_envelopes_are_counted_and_change_nothing(name: str) -> None:
     bodies=st.lists(
         st.binary(max_size=60)
         | st.builds(
-            lambda have, logs, claims: encode(News(1, 1, 0.0, 0.0, have, logs, claims)),
+            lambda have, logs, claims: encode(GossipMessage(1, 1, 0.0, 0.0, have, logs, claims)),
             st.binary(max_size=8),
             st.binary(max_size=20),
             st.binary(max_size=12),
@@ -352,7 +358,7 @@ def test_robot_does_not_depend_on_how_it_was_built(name: str) -> None:
     scenario = MISSIONS[name]
     by_columns = np.asfortranarray(SAMPLES_M)
     by_columns.flags.writeable = False
-    machine = Agent("r1", scenario, 1, Body(Pose(*scenario.starts.poses_m[0])), by_columns)
+    machine = DensityRobot("r1", scenario, 1, Body(Pose(*scenario.starts.poses_m[0])), by_columns)
     inputs = [one for one, _ in transcripts(name)["r1"]]
 
     assert [encode(machine.step(one)) for one in inputs] == replay(scenario, "r1", inputs)

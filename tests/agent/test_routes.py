@@ -11,10 +11,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from kantor_agent import routes
-from kantor_agent.routes import COST_MIN, Routes, length_cost, smoothed_cost
-from kantor_protocol.grid import CELLS_MAX
-from strategies import SEEDS, examples
+from kantor_agent.mapping import routes
+from kantor_agent.mapping.routes import COST_MIN, Routes, length_cost, smoothed_cost
+from kantor_protocol.base.grid import CELLS_MAX
+from support.strategies import SEEDS, examples
 
 Values = npt.NDArray[np.float64]
 

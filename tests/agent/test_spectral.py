@@ -9,19 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent.belief import Belief
-from kantor_agent.core import Agent
-from kantor_agent.planners import PLANNERS, Goal
+from kantor_agent.belief.belief import Belief
+from kantor_agent.planners.base import Goal
+from kantor_agent.planners.registry import PLANNERS
 from kantor_agent.planners.spectral import mean_over_mixture, way_out
-from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import Body, Inputs, Observation, Pose
-from kantor_protocol.messages import decode_news, encode_news
-from kantor_protocol.modes import VISIT, rectangle_of, visit_at
-from kantor_protocol.radio import replica_of
-from kantor_protocol.scenario import Scenario
-from kantor_protocol.walk import Walk
-from kantor_protocol.weights import Units
-from strategies import Points, cast, examples, mission, rehearse, scattered
+from kantor_agent.robots.density import DensityRobot
+from kantor_protocol.base.counter_rng import Purpose
+from kantor_protocol.base.machine import Body, Inputs, Observation, Pose
+from kantor_protocol.base.random_walk import RandomWalk
+from kantor_protocol.replication.cosine_basis import VISIT, rectangle_of, visit_at
+from kantor_protocol.replication.gossip import build_replica
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import decode_gossip, encode_gossip
+from kantor_protocol.wire.weights import Units
+from support.strategies import Points, cast, examples, mission, rehearse, scattered
 
 Floats = npt.NDArray[np.float64]
 
@@ -40,9 +41,9 @@ MODES = [1, 2, 3, 10, 15, 20, 64]
 def belief_of(scenario: Scenario, samples_m: Points, name: str = "r1") -> Belief:
     """What a robot believes at time 0."""
     units = Units.of(scenario.energy.points, samples_m.shape[0])
-    replica = replica_of(name, scenario, units, samples_m.shape[0])
+    replica = build_replica(name, scenario, units, samples_m.shape[0])
     diffusion_m = scenario.samples.diffusion_m
-    walk = Walk(samples_m, diffusion_m, scenario.period_ns, 1, Purpose.SAMPLE_WALK)
+    walk = RandomWalk(samples_m, diffusion_m, scenario.period_ns, 1, Purpose.SAMPLE_WALK)
     return Belief(walk, units, replica)
 
 
@@ -275,7 +276,7 @@ def test_goal_does_not_depend_on_the_vehicle(vehicle: str) -> None:
     moving = (f"vehicle={vehicle}", "vehicle.speed_m_s=20.0", "energy.points=60")
     scenario = mission(*WIDE, *moving)
     reference = mission(*WIDE)
-    machine = Agent("r1", scenario, 1, Body(Pose(10.0, 10.0)), scattered(12))
+    machine = DensityRobot("r1", scenario, 1, Body(Pose(10.0, 10.0)), scattered(12))
     planner, belief = PLANNERS["spectral"](reference), belief_of(reference, scattered(12))
     place = Pose(10.0, 10.0)
     for step in range(10):
@@ -325,8 +326,8 @@ def test_hostile_registers_change_nothing() -> None:
     scenario = mission("planner=spectral", "planner.modes=2")
     machines = cast(scenario, scattered(12))
     said = rehearse(machines, scenario, 2)["r2"][-1][1].outbox[0]
-    news, boast = decode_news(said.body), bytes([0, 9, 0, 1, 9, 2, 9, 9, 9])
-    lie = encode_news(msgspec.structs.replace(news, registers=boast))
+    news, boast = decode_gossip(said.body), bytes([0, 9, 0, 1, 9, 2, 9, 9, 9])
+    lie = encode_gossip(msgspec.structs.replace(news, registers=boast))
     machine, look = machines["r1"], Observation(2, Pose(10.0, 10.0))
     before = machine._belief.registers.values[1:].tolist()  # type: ignore[attr-defined]
     outputs = machine.step(

@@ -17,15 +17,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kantor_agent.core import Agent
-from kantor_protocol.machine import Body, Envelope, Inputs, Observation, Outputs, Pose
-from kantor_protocol.messages import News, decode_news
-from kantor_protocol.modes import VISIT
-from kantor_protocol.packing import Pairs
-from kantor_protocol.registers import read_register
-from kantor_protocol.replica import read_have
-from kantor_protocol.scenario import Scenario, parse
-from replicas import read_logs
+from kantor_agent.robots.density import DensityRobot
+from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Outputs, Pose
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.replication.cosine_basis import VISIT
+from kantor_protocol.replication.registers import read_register
+from kantor_protocol.replication.replica import read_have
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import GossipMessage, decode_gossip
+from support.replicas import read_logs
 
 FOLDER = Path(__file__).parent / "transcripts"
 BASE = """
@@ -45,7 +46,7 @@ class Stage:
     def __init__(self) -> None:
         self.scenario: Scenario
         self.points = np.zeros((0, 2))
-        self.robots: dict[str, Agent] = {}
+        self.robots: dict[str, DensityRobot] = {}
         self.now_ns: dict[str, int] = {}
         self.observed: dict[str, Observation] = {}
         self.inbox: dict[str, list[Envelope]] = {}
@@ -68,7 +69,9 @@ class Stage:
         """> samples"""
         self.points = np.array([[float(v) for v in point.split(",")] for point in points])
         for name in self.scenario.robot_ids:
-            self.robots[name] = Agent(name, self.scenario, 0, Body(Pose(0.0, 0.0)), self.points)
+            self.robots[name] = DensityRobot(
+                name, self.scenario, 0, Body(Pose(0.0, 0.0)), self.points
+            )
             self.now_ns[name], self.inbox[name], self.sent[name] = 0, [], []
             self.observed[name] = Observation(0, Pose(0.0, 0.0))
 
@@ -118,7 +121,7 @@ class Stage:
         return " ".join(f"{j}:{u}" for j, u in zip(*map(np.ndarray.tolist, pairs), strict=True))
 
     def _says(self, envelope: Envelope) -> str:
-        news = decode_news(envelope.body)
+        news = decode_gossip(envelope.body)
         logs = read_logs(news.logs)
         have = read_have(news.have, len(self.scenario.roster))
         assert logs is not None
@@ -127,7 +130,7 @@ class Stage:
         to = envelope.target or "everybody"
         return f"to {to}: {claims}has {have}, tells {entries or 'nothing'}{self._registers(news)}"
 
-    def _registers(self, news: News) -> str:
+    def _registers(self, news: GossipMessage) -> str:
         """Visits by origin, for those that the message has: the first number counts them."""
         width, told = self.scenario.register_width, []
         for place, name in enumerate(self.scenario.roster if width else ()):

@@ -9,15 +9,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent.belief import Belief
-from kantor_agent.planners import PLANNERS
+from kantor_agent.belief.belief import Belief
+from kantor_agent.planners.registry import PLANNERS
 from kantor_agent.planners.transport import Transport, first_of_best_order
-from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import Pose
-from kantor_protocol.replica import Replica
-from kantor_protocol.walk import Walk
-from kantor_protocol.weights import Units
-from strategies import Points, crowds, examples, mission, scattered
+from kantor_protocol.base.counter_rng import Purpose
+from kantor_protocol.base.machine import Pose
+from kantor_protocol.base.random_walk import RandomWalk
+from kantor_protocol.replication.replica import Replica
+from kantor_protocol.wire.weights import Units
+from support.strategies import Points, crowds, examples, mission, scattered
 
 Place = tuple[float, float]
 PLACES_M = st.tuples(st.floats(-50.0, 150.0), st.floats(-50.0, 150.0))
@@ -71,7 +71,7 @@ def belief_over(
     units = Units(whole=5 * samples_m.shape[0], sample=5, point=5)
     replica = Replica(me, origins, samples_m.shape[0], units, ledger=True, claims=claims)
     replica.weights[:] = weights
-    return Belief(Walk(samples_m, 0.0, 1, 1, Purpose.SAMPLE_WALK), units, replica)
+    return Belief(RandomWalk(samples_m, 0.0, 1, 1, Purpose.SAMPLE_WALK), units, replica)
 
 
 def ranked(samples_m: Points, weights: list[int], x: float, y: float) -> list[int]:

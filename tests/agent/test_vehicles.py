@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_agent.vehicles import VEHICLES, Vehicle
-from kantor_protocol.machine import Pose
-from kantor_protocol.scenario import Vehicle as Parameters
-from strategies import ANGLES, FINITE, METRES, examples
+from kantor_protocol.base.machine import Pose
+from kantor_protocol.scenario.schema import VehicleOptions as Parameters
+from support.strategies import ANGLES, FINITE, METRES, examples
 
 NAMES = pytest.mark.parametrize("name", list(VEHICLES))
 DT_S = 0.1

@@ -18,31 +18,35 @@ import msgspec
 import numpy as np
 import pytest
 
+from kantor_protocol.replication.replica_kernels import ReplicaArrays
+from kantor_worldsim.exchange.in_process import InProcessExchange
+
 if __name__ == "__main__":
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
-from kantor_agent import core as agent_core
-from kantor_agent.belief import Belief
-from kantor_agent.core import Agent
+from kantor_agent.belief.belief import Belief
+from kantor_agent.robots import density as agent_core
+from kantor_agent.robots.density import DensityRobot
 from kantor_fleet.campaign.draw import draw
 from kantor_fleet.campaign.mission import Trial, attempt
-from kantor_fleet.experiment import Case
-from kantor_protocol import life, replica
-from kantor_protocol.faults import FullDisk, Hostile, Impostor, Kill, Late, Partition, Pause
-from kantor_protocol.life import Life, Memory, Mortal, Pages
-from kantor_protocol.machine import EVERYBODY, WORLD_SIM, Body
-from kantor_protocol.messages import decode_inputs
-from kantor_protocol.radio import Radio
-from kantor_protocol.registers import Registers
-from kantor_protocol.replica import Replica
-from kantor_protocol.scenario import Scenario
-from kantor_protocol.weights import WeightsPublisher
-from kantor_worldsim import loop, outages
-from kantor_worldsim.channel import Channel
-from kantor_worldsim.outages import Outages
-from kantor_worldsim.stage import Stage
-from kantor_worldsim.world import World
-from replicas import read_logs
+from kantor_fleet.execution.experiment import Case
+from kantor_protocol.base.machine import EVERYBODY, WORLD_SIM, Body
+from kantor_protocol.node import recovery
+from kantor_protocol.node.recovery import InMemoryLog, KillableNode, RecoverableNode, WalContents
+from kantor_protocol.replication.gossip import Gossip
+from kantor_protocol.replication.registers import Registers
+from kantor_protocol.replication.replica import Replica
+from kantor_protocol.scenario.faults.links import Hostile, Partition
+from kantor_protocol.scenario.faults.processes import FullDisk, Impostor, Kill, Late, Pause
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import decode_inputs
+from kantor_protocol.wire.weights import WeightsPublisher
+from kantor_worldsim.engine import process_faults
+from kantor_worldsim.engine.process_faults import ProcessFaults
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.radio.channel import Channel
+from kantor_worldsim.world.world import World
+from support.replicas import read_logs
 
 LIMIT = 200
 """Missions within which every mutant must be caught."""
@@ -156,7 +160,7 @@ def _wrap(patch: Patch, owner: Any, name: str, make: Callable[[Any], Any]) -> No
     patch.setattr(owner, name, make(getattr(owner, name)))
 
 
-def _set(store: replica.Store, index: int, value: int) -> None:
+def _set(store: ReplicaArrays, index: int, value: int) -> None:
     """What `replica._lower` does, whatever the value."""
     before = int(store.weights[index])
     store.counters[2] += int(value > 0) - int(before > 0)
@@ -348,7 +352,7 @@ def supervisors_range_ignored(patch: Patch) -> None:
 @mutant("a partition stops one direction only", _has(Partition))
 def partition_leaks_one_way(patch: Patch) -> None:
     def make(init: Any) -> Any:
-        def made(self: Stage, *arguments: Any, **named: Any) -> None:
+        def made(self: Simulation, *arguments: Any, **named: Any) -> None:
             init(self, *arguments, **named)
             if self._faults is not None:
                 places = np.arange(self._faults.table.severed.shape[1])
@@ -356,7 +360,7 @@ def partition_leaks_one_way(patch: Patch) -> None:
 
         return made
 
-    _wrap(patch, Stage, "__init__", make)
+    _wrap(patch, Simulation, "__init__", make)
 
 
 @mutant("now and then somebody gets what was for another")
@@ -420,27 +424,27 @@ def letters_to_the_dead_arrive(patch: Patch) -> None:
 @mutant("world-sim forgets what was under way when it starts again", _of(Kill, WORLD_SIM))
 def world_sim_forgets_what_was_under_way(patch: Patch) -> None:
     def make(rebuilt: Any) -> Any:
-        def forgetful(self: Stage) -> Stage:
-            stage: Stage = rebuilt(self)
+        def forgetful(self: Simulation) -> Simulation:
+            stage: Simulation = rebuilt(self)
             stage.channel.clear()
             return stage
 
         return forgetful
 
-    _wrap(patch, Stage, "rebuilt", make)
+    _wrap(patch, Simulation, "rebuilt", make)
 
 
 @mutant("a hostile message is taken for a sound one", _has(Hostile))
 def hostile_message_taken_in(patch: Patch) -> None:
     def make(hear: Any) -> Any:
-        def heard(self: Radio, *arguments: Any) -> None:
+        def heard(self: Gossip, *arguments: Any) -> None:
             before = self.refused
             hear(self, *arguments)
             self.refused = before
 
         return heard
 
-    _wrap(patch, Radio, "hear", make)
+    _wrap(patch, Gossip, "hear", make)
 
 
 @mutant("sound messages are refused now and then")
@@ -448,43 +452,43 @@ def sound_message_refused(patch: Patch) -> None:
     due = _now_and_then(100)
 
     def make(hear: Any) -> Any:
-        def heard(self: Radio, inbox: Any, learn: Any) -> None:
+        def heard(self: Gossip, inbox: Any, learn: Any) -> None:
             hear(self, inbox, lambda *parts: not due() and learn(*parts))
 
         return heard
 
-    _wrap(patch, Radio, "hear", make)
+    _wrap(patch, Gossip, "hear", make)
 
 
 @mutant("a new incarnation counts its messages from 1 again", _has(Kill, disk=("torn", "lost")))
 def sequences_used_again(patch: Patch) -> None:
     def make(say: Any) -> Any:
-        def said(self: Radio, *arguments: Any) -> Any:
+        def said(self: Gossip, *arguments: Any) -> Any:
             envelope = say(self, *arguments)
             self._said = getattr(self, "_said", 0) + 1
             return msgspec.structs.replace(envelope, sequence=self._said)
 
         return said
 
-    _wrap(patch, Radio, "say", make)
+    _wrap(patch, Gossip, "say", make)
 
 
 @mutant("a robot that has lost its supervisor talks to it for ever", _supervised)
 def supervisor_never_given_up(patch: Patch) -> None:
     def make(say: Any) -> Any:
-        def said(self: Radio, *arguments: Any) -> Any:
+        def said(self: Gossip, *arguments: Any) -> Any:
             self._unheard_steps = 0
             return say(self, *arguments)
 
         return said
 
-    _wrap(patch, Radio, "say", make)
+    _wrap(patch, Gossip, "say", make)
 
 
 @mutant("a robot that has given its supervisor up never returns to it", _supervised)
 def supervisor_never_heard_again(patch: Patch) -> None:
     def make(say: Any) -> Any:
-        def said(self: Radio, *arguments: Any) -> Any:
+        def said(self: Gossip, *arguments: Any) -> Any:
             if getattr(self, "_lonely", False):
                 self._unheard_steps = 1000
             envelope = say(self, *arguments)
@@ -493,7 +497,7 @@ def supervisor_never_heard_again(patch: Patch) -> None:
 
         return said
 
-    _wrap(patch, Radio, "say", make)
+    _wrap(patch, Gossip, "say", make)
 
 
 # Energy, motion and goals.
@@ -513,25 +517,25 @@ def overspending_by_one_unit(patch: Patch) -> None:
 @mutant("a robot takes one step more than its budget", _density)
 def one_step_more_than_the_budget(patch: Patch) -> None:
     def make(init: Any) -> Any:
-        def made(self: Agent, *arguments: Any) -> None:
+        def made(self: DensityRobot, *arguments: Any) -> None:
             init(self, *arguments)
             self._budget += 1
 
         return made
 
-    _wrap(patch, Agent, "__init__", make)
+    _wrap(patch, DensityRobot, "__init__", make)
 
 
 @mutant("a new incarnation begins with a full battery", _has(Kill, disk=("torn", "lost")))
 def energy_gauge_forgotten(patch: Patch) -> None:
     def make(init: Any) -> Any:
-        def made(self: Agent, *arguments: Any) -> None:
+        def made(self: DensityRobot, *arguments: Any) -> None:
             init(self, *arguments)
             self._energy_spent = 0
 
         return made
 
-    _wrap(patch, Agent, "__init__", make)
+    _wrap(patch, DensityRobot, "__init__", make)
 
 
 @mutant("the world counts a point twice now and then", _density)
@@ -560,7 +564,7 @@ def speed_limit_one_percent_too_high(patch: Patch) -> None:
         return lambda self, dt_s: explore(self, 1.01 * dt_s)
 
     _wrap(patch, World, "__init__", make)
-    _wrap(patch, Agent, "_explore", faster)
+    _wrap(patch, DensityRobot, "_explore", faster)
 
 
 @mutant(
@@ -568,14 +572,14 @@ def speed_limit_one_percent_too_high(patch: Patch) -> None:
 )
 def a_new_incarnation_leaps(patch: Patch) -> None:
     def make(init: Any) -> Any:
-        def made(self: Agent, *arguments: Any) -> None:
+        def made(self: DensityRobot, *arguments: Any) -> None:
             init(self, *arguments)
             if self._step:
                 self._now_ns, self._period_ns = 0, 10 * self._period_ns
 
         return made
 
-    _wrap(patch, Agent, "__init__", make)
+    _wrap(patch, DensityRobot, "__init__", make)
 
 
 @mutant("a weight rises now and then", _density)
@@ -610,7 +614,7 @@ def published_vector_differs(patch: Patch) -> None:
 @mutant("a robot keeps to a goal that has no weight left", lambda s: s.planner.name == "transport")
 def goal_without_weight(patch: Patch) -> None:
     def make(explore: Any) -> Any:
-        def explored(self: Agent, dt_s: float) -> bytes:
+        def explored(self: DensityRobot, dt_s: float) -> bytes:
             before = self._goal
             packed: bytes = explore(self, dt_s)
             self._goal = before or self._goal
@@ -618,7 +622,7 @@ def goal_without_weight(patch: Patch) -> None:
 
         return explored
 
-    _wrap(patch, agent_core.Agent, "_explore", make)
+    _wrap(patch, agent_core.DensityRobot, "_explore", make)
 
 
 @mutant("a register is not the sum over its places", _spectral)
@@ -639,28 +643,28 @@ def register_off_by_one(patch: Patch) -> None:
 
 @mutant("a step is noted after it was told, and the diary is trusted", _has(Kill))
 def late_write(patch: Patch) -> None:
-    def kill(self: Mortal) -> None:
+    def kill(self: KillableNode) -> None:
         self._life = None
         del self._diary._inputs[-1:]
 
-    patch.setattr(Mortal, "kill", kill)
-    patch.setattr(life, "_covers", lambda pages, body: pages.birth.epoch == body.epoch)
+    patch.setattr(KillableNode, "kill", kill)
+    patch.setattr(recovery, "_covers", lambda pages, body: pages.birth.epoch == body.epoch)
 
 
 @mutant("a torn diary is taken for whole", _has(Kill, disk=("torn",)))
 def torn_diary_taken_for_whole(patch: Patch) -> None:
-    patch.setattr(life, "_covers", lambda pages, body: pages.birth.epoch == body.epoch)
+    patch.setattr(recovery, "_covers", lambda pages, body: pages.birth.epoch == body.epoch)
 
 
 @mutant("who starts again knows nothing, not even that it has lived", _has(Kill))
 def amnesia(patch: Patch) -> None:
-    def start(self: Mortal, body: Body, disk: str) -> tuple[int, int]:
-        self._diary = Memory()
+    def start(self: KillableNode, body: Body, disk: str) -> tuple[int, int]:
+        self._diary = InMemoryLog()
         newborn = Body(body.pose, 0, 0, body.epoch)
-        self._life = Life(self._build, self._diary, newborn)
+        self._life = RecoverableNode(self._build, self._diary, newborn)
         return body.epoch, body.step
 
-    patch.setattr(Mortal, "start", start)
+    patch.setattr(KillableNode, "start", start)
 
 
 @mutant(
@@ -668,43 +672,43 @@ def amnesia(patch: Patch) -> None:
     _has(Kill, disk=("torn", "lost")),
 )
 def old_incarnation_used_again(patch: Patch) -> None:
-    patch.setattr(life, "_reborn", lambda body: body)
+    patch.setattr(recovery, "_reborn", lambda body: body)
 
 
 @mutant("every start is a new incarnation, though the diary is whole", _has(Kill, disk=("kept",)))
 def needless_incarnation(patch: Patch) -> None:
-    def read(self: Memory) -> Pages | None:
+    def read(self: InMemoryLog) -> WalContents | None:
         return None
 
-    patch.setattr(Memory, "read", read)
+    patch.setattr(InMemoryLog, "read", read)
 
 
 @mutant("asked again, a robot does its step once more", _has(Kill, mid_step=(True,)))
 def answering_a_turn_twice(patch: Patch) -> None:
-    def take(self: Life, page: bytes) -> Any:
+    def take(self: RecoverableNode, page: bytes) -> Any:
         self._diary.note(page)
         return self._live(decode_inputs(page))
 
-    patch.setattr(Life, "take", take)
+    patch.setattr(RecoverableNode, "take", take)
 
 
 @mutant("a step is not counted now and then", _density)
 def lost_step_count(patch: Patch) -> None:
     def make(step: Any) -> Any:
-        def stepped(self: Agent, inputs: Any) -> Any:
+        def stepped(self: DensityRobot, inputs: Any) -> Any:
             self._step -= self._step % 40 == 39
             return step(self, inputs)
 
         return stepped
 
-    _wrap(patch, Agent, "step", make)
+    _wrap(patch, DensityRobot, "step", make)
 
 
 def _ignoring(patch: Patch, kind: type) -> None:
     """Whoever runs the mission lets those act whom such a fault stops."""
 
     def make(init: Any) -> Any:
-        def made(self: Outages, *arguments: Any, **named: Any) -> None:
+        def made(self: ProcessFaults, *arguments: Any, **named: Any) -> None:
             init(self, *arguments, **named)
             self._stops = {
                 name: [window for window in windows if not isinstance(window.fault, kind)]
@@ -713,13 +717,13 @@ def _ignoring(patch: Patch, kind: type) -> None:
 
         return made
 
-    _wrap(patch, Outages, "__init__", make)
+    _wrap(patch, ProcessFaults, "__init__", make)
 
 
 @mutant("the dead go on acting", _has(Kill))
 def dead_robot_still_acts(patch: Patch) -> None:
     _ignoring(patch, Kill)
-    patch.setattr(Mortal, "kill", lambda _: None)
+    patch.setattr(KillableNode, "kill", lambda _: None)
 
 
 @mutant("who is paused goes on acting", _has(Pause))
@@ -739,7 +743,7 @@ def late_joiner_comes_early(patch: Patch) -> None:
 
 @mutant("an impostor is let in", _has(Impostor))
 def impostor_let_in(patch: Patch) -> None:
-    patch.setattr(loop._InProcess, "pretend", lambda _self, _name: True)
+    patch.setattr(InProcessExchange, "pretend", lambda _self, _name: True)
 
 
 @mutant(
@@ -748,12 +752,12 @@ def impostor_let_in(patch: Patch) -> None:
 )
 def clock_skew_leaks_into_physics(patch: Patch) -> None:
     def make(act: Any) -> Any:
-        def acted(self: Stage, step: Any) -> Any:
+        def acted(self: Simulation, step: Any) -> Any:
             return act(self, msgspec.structs.replace(step, skew_ns=0))
 
         return acted
 
-    _wrap(patch, Stage, "_act", make)
+    _wrap(patch, Simulation, "_act", make)
 
 
 @mutant(
@@ -761,7 +765,7 @@ def clock_skew_leaks_into_physics(patch: Patch) -> None:
     lambda s: any(f.__struct_config__.tag == "clock" for f in s.faults),
 )
 def clock_stays_right(patch: Patch) -> None:
-    patch.setattr(outages.Outages, "skew_ns", lambda *_: 0)
+    patch.setattr(process_faults.ProcessFaults, "skew_ns", lambda *_: 0)
 
 
 def write(hunted: list[tuple[Mutant, Catch | None]], path: Path = TABLE) -> None:

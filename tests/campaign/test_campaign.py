@@ -10,18 +10,18 @@ import pytest
 from campaign.mutants import MUTANTS
 from kantor_fleet.campaign import run as campaigns
 from kantor_fleet.campaign.draw import draw
+from kantor_fleet.campaign.fault_coverage import CLASSES
 from kantor_fleet.campaign.mission import Trial, attempt
-from kantor_fleet.campaign.run import Order, campaign, numbered, replay
+from kantor_fleet.campaign.rare_events import RARE_EVENTS
+from kantor_fleet.campaign.run import CampaignConfig, campaign, numbered, replay
 from kantor_fleet.campaign.shrink import shrink
-from kantor_fleet.campaign.sightings import SIGHTS
-from kantor_fleet.campaign.struck import CLASSES
 from kantor_fleet.campaign.totals import ENOUGH, Totals
-from kantor_fleet.exits import Exit
-from kantor_fleet.experiment import Case
-from kantor_fleet.pools import Pool
-from kantor_protocol.scenario import load
-from kantor_worldsim.journal import read
-from kantor_worldsim.recording import JOURNAL
+from kantor_fleet.cli.exits import Exit
+from kantor_fleet.execution.experiment import Case
+from kantor_fleet.execution.pools import Pool
+from kantor_protocol.scenario.load import load
+from kantor_worldsim.record.journal import read
+from kantor_worldsim.record.run_folder import JOURNAL
 
 FRESH = 120
 """Seeds that nobody has run before: those of today."""
@@ -51,7 +51,7 @@ def test_fresh_seeds_hold(part: int) -> None:
 def test_a_campaign_goes_on_where_it_was_stopped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    first = campaign(Order(numbered("4"), tmp_path), here)
+    first = campaign(CampaignConfig(numbered("4"), tmp_path), here)
     assert first is Exit.DONE
     again: list[int] = []
 
@@ -60,12 +60,12 @@ def test_a_campaign_goes_on_where_it_was_stopped(
             again.append(case.seed)
             yield case, attempt(case)
 
-    assert campaign(Order(numbered("2:6"), tmp_path), noting) is Exit.DONE
+    assert campaign(CampaignConfig(numbered("2:6"), tmp_path), noting) is Exit.DONE
     assert again == [4, 5]
     told = capsys.readouterr().out
     assert "2 missions are known" in told
     assert re.search(r"\d+ robot-steps per CPU second", told)
-    assert all(name in told for name in (*CLASSES, *SIGHTS))
+    assert all(name in told for name in (*CLASSES, *RARE_EVENTS))
 
 
 def test_a_violation_ends_it_with_all_that_is_needed(
@@ -73,7 +73,7 @@ def test_a_violation_ends_it_with_all_that_is_needed(
 ) -> None:
     BUGS["range-plus-five-percent"].plant(monkeypatch)
     monkeypatch.setattr(campaigns, "_SHRINK_S", 5.0)
-    assert campaign(Order(range(1000), tmp_path), here) is Exit.NOT_MET
+    assert campaign(CampaignConfig(range(1000), tmp_path), here) is Exit.NOT_MET
     told = capsys.readouterr().out
     found = re.search(r"VIOLATION  seed (\d+)", told)
     assert found
@@ -85,7 +85,7 @@ def test_a_violation_ends_it_with_all_that_is_needed(
     assert len(smallest.faults) <= len(draw(seed).faults)
     assert attempt(Case(smallest, seed)).rule == "range"
     # What is known to be broken is not run again.
-    assert campaign(Order(range(1000), tmp_path), here) is Exit.NOT_MET
+    assert campaign(CampaignConfig(range(1000), tmp_path), here) is Exit.NOT_MET
     assert replay(seed, tmp_path) is Exit.NOT_MET
     assert "VIOLATION  range:" in capsys.readouterr().out
 
@@ -120,8 +120,8 @@ def test_a_crash_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_was_never_reached_fails_a_long_campaign(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    every = {"struck": dict.fromkeys(CLASSES, 1), "seen": dict.fromkeys(SIGHTS, 1)}
-    lacking = {**every, "seen": dict.fromkeys(SIGHTS[1:], 1)}
+    every = {"struck": dict.fromkeys(CLASSES, 1), "seen": dict.fromkeys(RARE_EVENTS, 1)}
+    lacking = {**every, "seen": dict.fromkeys(RARE_EVENTS[1:], 1)}
 
     def invented(tallies: dict[str, dict[str, int]]) -> Exit:
         folder = tmp_path / str(len(tallies["seen"]))
@@ -130,13 +130,13 @@ def test_what_was_never_reached_fails_a_long_campaign(
             for case in cases:
                 yield case, Trial(sort="claims", **tallies)
 
-        return campaign(Order(range(ENOUGH), folder), made)
+        return campaign(CampaignConfig(range(ENOUGH), folder), made)
 
     assert invented(every) is Exit.DONE
     assert invented(lacking) is Exit.NOT_MET
-    assert f"never reached: {SIGHTS[0]}" in capsys.readouterr().out
+    assert f"never reached: {RARE_EVENTS[0]}" in capsys.readouterr().out
 
 
 def test_time_that_is_up_begins_nothing(tmp_path: Path) -> None:
-    assert campaign(Order(range(1000), tmp_path, minutes=1e-9), here) is Exit.DONE
-    assert Totals().missing == (*CLASSES, *SIGHTS)
+    assert campaign(CampaignConfig(range(1000), tmp_path, minutes=1e-9), here) is Exit.DONE
+    assert Totals().missing == (*CLASSES, *RARE_EVENTS)

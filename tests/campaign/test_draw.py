@@ -5,11 +5,13 @@ from itertools import chain
 
 from hypothesis import given
 
-from kantor_fleet.campaign.dice import Dice
 from kantor_fleet.campaign.draw import SORTS, draw, sort_of
-from kantor_protocol.faults import KINDS, Kill, kind_of
-from kantor_protocol.scenario import from_tree, parse, to_toml, to_tree
-from strategies import SEEDS, examples
+from kantor_fleet.campaign.keyed_draws import KeyedDraws
+from kantor_protocol.scenario.dump import to_toml, to_tree
+from kantor_protocol.scenario.faults.processes import Kill
+from kantor_protocol.scenario.faults.schedule import KINDS, kind_of
+from kantor_protocol.scenario.load import from_tree, parse
+from support.strategies import SEEDS, examples
 
 MANY = 2000
 
@@ -51,7 +53,7 @@ def test_the_same_seed_is_the_same_scenario() -> None:
 @given(seed=SEEDS)
 @examples(100)
 def test_dice_stay_within_bounds(seed: int) -> None:
-    dice = Dice(seed, 7)
+    dice = KeyedDraws(seed, 7)
     assert 2.0 <= dice.between(2.0, 3.0) <= 3.0
     assert 0.1 <= dice.scale(0.1, 10.0) <= 10.0
     assert dice.whole(3, 5) in {3, 4, 5}

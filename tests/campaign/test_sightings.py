@@ -3,9 +3,9 @@
 import pytest
 
 from kantor_fleet.campaign.mission import attempt
-from kantor_fleet.campaign.sightings import SIGHTS
-from kantor_fleet.experiment import Case
-from strategies import mission
+from kantor_fleet.campaign.rare_events import RARE_EVENTS
+from kantor_fleet.execution.experiment import Case
+from support.strategies import mission
 
 TEAM = ("energy.points=240", "samples.count=60")
 CENTRALIZED = ("coordination=centralized",)
@@ -82,10 +82,10 @@ _MAY_HAPPEN_ANYWHERE = {
 
 
 def test_all_have_a_place() -> None:
-    assert set(WHERE) == set(SIGHTS)
+    assert set(WHERE) == set(RARE_EVENTS)
 
 
-@pytest.mark.parametrize("name", SIGHTS)
+@pytest.mark.parametrize("name", RARE_EVENTS)
 def test_is_seen_where_it_happens(name: str) -> None:
     assert any(seen(*WHERE[name], seed=seed).get(name) for seed in range(1, 6))
 

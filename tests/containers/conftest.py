@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from containers.engine import BASE, IMAGE, Fleet, NoEngineError, an_engine, call
-from kantor_fleet.compose import Order
+from kantor_fleet.processes.compose import ComposeConfig
 
 
 @pytest.fixture(scope="session")
@@ -38,7 +38,7 @@ def fleet_of(image: str, tmp_path: Path) -> Iterator[MakeFleet]:
     """Makes fleets that are gone afterwards."""
     fleets: list[Fleet] = []
 
-    def make(order: Order, **settings: Any) -> Fleet:
+    def make(order: ComposeConfig, **settings: Any) -> Fleet:
         fleets.append(Fleet(tmp_path / f"fleet{len(fleets)}", order, **settings))
         return fleets[-1]
 

@@ -13,8 +13,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from kantor_fleet.authority import Wanted, issue, today
-from kantor_fleet.compose import Order, prepare, text
+from kantor_fleet.processes.compose import ComposeConfig, prepare, text
+from kantor_fleet.security.authority import Wanted, issue, today
 
 ROOT = Path(__file__).parents[2]
 IMAGE = "kantor-test"
@@ -109,7 +109,7 @@ def compose_command(*, or_none: bool = False) -> list[str]:
 class Fleet:
     """A compose project of a test's own."""
 
-    def __init__(self, folder: Path, order: Order, **settings: str) -> None:
+    def __init__(self, folder: Path, order: ComposeConfig, **settings: str) -> None:
         self.folder = folder
         self.project = re.sub(r"[^a-z0-9]", "", f"kantor{folder.name}{os.getpid()}".lower())
         folder.mkdir(parents=True, exist_ok=True)

@@ -3,8 +3,9 @@
 import msgspec
 import pytest
 
-from kantor_fleet.chaos import Deed, deeds_of
-from kantor_protocol.faults import Chaos, Fault
+from kantor_fleet.processes.chaos import ContainerCommand, commands_of
+from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.schedule import Chaos
 
 
 def faults(*entries: dict[str, object]) -> tuple[Fault, ...]:
@@ -13,7 +14,7 @@ def faults(*entries: dict[str, object]) -> tuple[Fault, ...]:
 
 def test_deeds_come_in_order_and_ends_before_beginnings() -> None:
     """A pause that follows a cut at the same moment."""
-    deeds = deeds_of(
+    deeds = commands_of(
         faults(
             {"kind": "pause", "who": ["r1"], "from_s": 9, "until_s": 12},
             {"kind": "partition", "shape": "isolate", "robots": ["r1"], "from_s": 3, "until_s": 9},
@@ -31,7 +32,7 @@ def test_deeds_come_in_order_and_ends_before_beginnings() -> None:
         (10, "r2", "kill"),
         (12, "r1", "unpause"),
     ]
-    assert deeds[0] == Deed(3.0, ends=False, what="cut", who="r1", fault=1)
+    assert deeds[0] == ContainerCommand(3.0, ends=False, what="cut", who="r1", fault=1)
 
 
 @pytest.mark.parametrize(
@@ -48,7 +49,7 @@ def test_what_no_engine_can_do_is_refused(
 ) -> None:
     """In one line that says what it can."""
     with pytest.raises(SystemExit) as refused:
-        deeds_of(faults(entry))
+        commands_of(faults(entry))
 
     assert refused.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
-from kantor_fleet.compose import Order, text
+from kantor_fleet.processes.compose import ComposeConfig, text
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 
 
-def read(order: Order) -> dict[str, Any]:
+def read(order: ComposeConfig) -> dict[str, Any]:
     tree = yaml.safe_load(text(order))
     assert isinstance(tree, dict)
     return tree
@@ -31,8 +31,10 @@ def test_the_file_of_the_repository_is_what_the_command_writes(kantor: "Kantor")
     assert "KANTOR_USER=" in (kantor.folder / ".env").read_text()
 
 
-@pytest.mark.parametrize("order", [Order(5), Order(8, isolated=True), Order(3, supervisor=True)])
-def test_everybody_gets_an_identity_and_nobody_a_privilege(order: Order) -> None:
+@pytest.mark.parametrize(
+    "order", [ComposeConfig(5), ComposeConfig(8, isolated=True), ComposeConfig(3, supervisor=True)]
+)
+def test_everybody_gets_an_identity_and_nobody_a_privilege(order: ComposeConfig) -> None:
     """A secret of its own, a read-only root, no capability, limits."""
     tree = read(order)
     people = {f"r{i}" for i in range(1, order.robots + 1)} | (
@@ -52,7 +54,7 @@ def test_everybody_gets_an_identity_and_nobody_a_privilege(order: Order) -> None
 
 def test_isolated_robots_share_no_network() -> None:
     """Each has one with world-sim, which is in all."""
-    services = read(Order(8, isolated=True))["services"]
+    services = read(ComposeConfig(8, isolated=True))["services"]
     networks = [tuple(services[f"r{i}"]["networks"]) for i in range(1, 9)]
 
     assert len(set(networks)) == 8
@@ -61,7 +63,7 @@ def test_isolated_robots_share_no_network() -> None:
 
 def test_a_hub_elsewhere_leaves_the_robots_alone_in_the_file() -> None:
     """They connect to it, and are healthy by its port."""
-    tree = read(Order(2, hub="tls/hub.example.org:17447"))
+    tree = read(ComposeConfig(2, hub="tls/hub.example.org:17447"))
 
     assert set(tree["services"]) == {"r1", "r2"} == set(tree["secrets"])
     for service in tree["services"].values():

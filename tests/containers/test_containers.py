@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from containers.engine import BASE, IMAGE, Fleet, call, resident_mb
-from fleets import incidents_of, result_of
-from kantor_fleet.catalog import find
-from kantor_fleet.compose import Order
-from kantor_fleet.team import play
-from kantor_fleet.verify import verdicts
-from kantor_worldsim.recording import Recording
-from kantor_worldsim.world import Site
+from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.execution.verify import verdicts
+from kantor_fleet.processes.compose import ComposeConfig
+from kantor_fleet.scenarios.catalog import find
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.world.world import WorldSetup
+from support.fleets import incidents_of, result_of
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 pytestmark = [pytest.mark.xdist_group("containers"), pytest.mark.timeout(600)]
 
 MakeFleet = Callable[..., Fleet]
-FIVE = Order(5, supervisor=True)
+FIVE = ComposeConfig(5, supervisor=True)
 NEAR = "radio.range_m=300 energy.points=2500"
 TINY = "starts.random=true samples.count=400 targets.count=60 energy.points=800 radio.range_m=500"
 
@@ -35,7 +35,7 @@ def rate_in_process(*overrides: str) -> float:
     """Detection of the same mission in one process."""
     scenario = find("fleet", overrides)
     recording = Recording(scenario, 0, "in-process")
-    play(scenario, 0, Site.of(scenario, 0), [recording.take])
+    play(scenario, 0, WorldSetup.of(scenario, 0), [recording.take])
     rate = recording.finish().detection_rate
     assert rate is not None
     return rate
@@ -153,7 +153,7 @@ CONNECT = "import socket, sys; socket.create_connection((sys.argv[1], 9999), tim
 
 def test_isolated_robots_cannot_reach_each_other(fleet_of: MakeFleet) -> None:
     """Not by name, not by address; world-sim reaches both, and the mission is completed."""
-    fleet = fleet_of(Order(2, isolated=True), speed="4", set=TINY)
+    fleet = fleet_of(ComposeConfig(2, isolated=True), speed="4", set=TINY)
     fleet.compose("up", "--detach")
     fleet.await_log("worldsim", "explored")
     networks = fleet.inspect("r2")["NetworkSettings"]["Networks"]

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from containers.engine import IMAGE, Fleet, keys
-from kantor_fleet.authority import Wanted
-from kantor_fleet.compose import Order
+from kantor_fleet.processes.compose import ComposeConfig
+from kantor_fleet.security.authority import Wanted
 
 pytestmark = [pytest.mark.xdist_group("containers"), pytest.mark.timeout(600)]
 
@@ -64,7 +64,7 @@ def run(fleet: Fleet, folder: Path, *command: object) -> "subprocess.CompletedPr
 
 def test_nobody_gets_in_who_does_not_belong(fleet_of: MakeFleet, tmp_path: Path) -> None:
     """No certificate, a foreign authority's, another robot's: refused, with a line on both sides, or heard by nobody."""
-    fleet = fleet_of(Order(2), set="starts.random=true radio.range_m=800")
+    fleet = fleet_of(ComposeConfig(2), set="starts.random=true radio.range_m=800")
     fleet.compose("up", "--detach")
     fleet.await_log("worldsim", "explored")
     stolen = fleet.folder / "keys"

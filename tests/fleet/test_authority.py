@@ -13,11 +13,11 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_fleet import authority as issuing
-from kantor_fleet.authority import Authority, Wanted, issue, listing
-from kantor_protocol import credentials
-from kantor_protocol.credentials import Certificate, CredentialsError
-from strategies import examples
+from kantor_fleet.security import authority as issuing
+from kantor_fleet.security.authority import Authority, Wanted, issue, listing
+from kantor_protocol.transport import credentials
+from kantor_protocol.transport.credentials import Certificate, CredentialsError
+from support.strategies import examples
 
 if TYPE_CHECKING:
     from conftest import Kantor

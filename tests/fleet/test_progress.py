@@ -7,8 +7,8 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from kantor_fleet.progress import ProgressView, line_of
-from kantor_protocol.messages import VERSION, Progress
+from kantor_fleet.report.progress import ProgressView, line_of
+from kantor_protocol.wire.messages import VERSION, Progress
 
 UNDER_WAY = Progress(
     version=VERSION,

@@ -13,17 +13,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kantor_fleet.picture import Run, Trail
-from kantor_fleet.report import draw
-from kantor_fleet.style import team_colours
-from kantor_fleet.team import team
-from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import Observation, Outputs, Pose, State
-from kantor_protocol.scenario import parse
-from kantor_worldsim.loop import in_process, simulate
-from kantor_worldsim.records import Act, Batch, Ending, Incident, Opening, Record
-from kantor_worldsim.stage import Stage
-from kantor_worldsim.world import Ruling, Site
+from kantor_fleet.execution.in_process_team import team
+from kantor_fleet.report.picture import Run, Trail
+from kantor_fleet.report.report import draw
+from kantor_fleet.report.style import team_colours
+from kantor_protocol.base.counter_rng import Purpose
+from kantor_protocol.base.machine import Observation, Outputs, Pose, State
+from kantor_protocol.scenario.load import parse
+from kantor_worldsim.engine.event_loop import simulate
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record, StepRecord
+from kantor_worldsim.world.world import StepVerdict, WorldSetup
 
 MISSION = """
 name = "small"
@@ -66,9 +67,9 @@ Cut = Callable[[list[Record]], list[Record]]
 def play(*overrides: str, seed: int = 1) -> list[Record]:
     """The whole record of a small mission with `key.sub=value` overrides."""
     scenario = parse(MISSION, "small", overrides)
-    site = Site.of(scenario, seed)
+    site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    stage = Stage(scenario, seed, site, [records.append])
+    stage = Simulation(scenario, seed, site, [records.append])
     simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
     return records
 
@@ -109,7 +110,7 @@ def in_one_point(records: list[Record]) -> list[Record]:
 def garbled(records: list[Record]) -> list[Record]:
     """The record with packed pairs that cannot be read."""
 
-    def garble(act: Act) -> Act:
+    def garble(act: StepRecord) -> StepRecord:
         assert act.outputs is not None
         outputs = msgspec.structs.replace(act.outputs, lowered=b"\xff", spent=b"\xff")
         return msgspec.structs.replace(act, outputs=outputs)
@@ -277,16 +278,18 @@ def test_targets_walk_as_in_the_world() -> None:
     assert walked_m[target].tolist() != run.site.targets_m[target].tolist()
 
 
-def act(name: str, now_s: float, state: State, *, heard: bool = False, x_m: float = 1.0) -> Act:
+def act(
+    name: str, now_s: float, state: State, *, heard: bool = False, x_m: float = 1.0
+) -> StepRecord:
     """A step of one robot, at a place on the x axis."""
     pose = Pose(x_m, 0.0)
-    return Act(
+    return StepRecord(
         name=name,
         now_ns=round(now_s * 1e9),
         observation=Observation(0, pose),
         heard=(("r9", 1),) if heard else (),
         outputs=Outputs(step=round(now_s * 10), pose=pose, state=state),
-        ruling=Ruling(pose),
+        ruling=StepVerdict(pose),
     )
 
 
@@ -344,7 +347,7 @@ def test_outages_are_when_processes_did_nothing() -> None:
 def test_outages_and_cuts_are_drawn(tmp_path: Path) -> None:
     """The picture of a run under faults is not that of the same run with them left out."""
     records = play(*STRUCK)
-    calm = [record for record in records if not isinstance(record, Incident)]
+    calm = [record for record in records if not isinstance(record, ProcessEvent)]
 
     assert picture(records, tmp_path / "struck.png") != picture(calm, tmp_path / "calm.png")
 

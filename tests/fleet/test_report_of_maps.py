@@ -10,15 +10,15 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
-from grounds import drawn
-from kantor_fleet.picture import Run, draw_bumps, draw_known
-from kantor_fleet.report import draw
-from kantor_fleet.run import summary
-from kantor_protocol.grid import Frame
-from kantor_worldsim.exploration import Exploration
-from kantor_worldsim.maps import Ground
-from kantor_worldsim.records import Batch, Record, opening_of
-from mapping import ROOMS, explored, on_map, site_of
+from kantor_fleet.execution.mission import summary
+from kantor_fleet.report.picture import Run, draw_bumps, draw_known
+from kantor_fleet.report.report import draw
+from kantor_protocol.base.grid import Frame
+from kantor_worldsim.observers.metrics.mapping import MapMetrics
+from kantor_worldsim.record.records import Batch, Record, opening_of
+from kantor_worldsim.world.maps import Ground
+from support.grounds import drawn
+from support.missions import ROOMS, explored, on_map, site_of
 
 Records = Sequence[Record]
 TEN = "[" + ", ".join(f"[{1.5 + x}, {1.5 + y}]" for x in range(5) for y in range(2)) + "]"
@@ -31,10 +31,10 @@ def picture(records: Records, path: Path) -> Image.Image:
         return image
 
 
-def followed(records: Records) -> tuple[Run, Exploration]:
+def followed(records: Records) -> tuple[Run, MapMetrics]:
     run = Run.of(records)
     assert run is not None
-    assert isinstance(run.metrics, Exploration)
+    assert isinstance(run.metrics, MapMetrics)
     return run, run.metrics
 
 

@@ -21,9 +21,9 @@ from kantor_fleet.reproduce.claims import (
     interval,
     quartiles,
 )
-from kantor_fleet.reproduce.flights import Flight, Setting
 from kantor_fleet.reproduce.kabir_lee import FIGURES, drop_at_contact, loosest
-from kantor_worldsim.metrics import Row
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, Setting
+from kantor_worldsim.observers.metrics.density import DensityRow
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 HERE, THERE = Setting("here"), Setting("there")
 
 
-def flights(*robots_s: float) -> list[Flight]:
+def flights(*robots_s: float) -> list[MeasuredRun]:
     """Flights that stand for one number each."""
-    return [Flight(robots_s=value) for value in robots_s]
+    return [MeasuredRun(robots_s=value) for value in robots_s]
 
 
-def number(flight: Flight) -> float:
+def number(flight: MeasuredRun) -> float:
     return flight.robots_s
 
 
@@ -125,16 +125,16 @@ def test_an_interval_is_students() -> None:
     assert quartiles([7.0]) == (7.0, 7.0, 7.0)
 
 
-def test_measures_read_the_rows(row: Row) -> None:
+def test_measures_read_the_rows(row: DensityRow) -> None:
     """The fall until both have heard; the bound over the exact distance at its worst."""
     bounds = {9: 100.0, 10: 90.0, 11: 70.0, 12: 69.0, 40: 1.0}
     rows = [row._replace(tick=tick, w_ub_instant=bound) for tick, bound in bounds.items()]
     exact = [row._replace(w_ub_tight=tight, w1_exact=1.0) for tight in (1.5, 2.5, None, 2.0)]
     result = FakeResult(first_contact_tick=10)
 
-    assert drop_at_contact(Flight(rows=tuple(rows), result=result)) == pytest.approx(30.0)  # type: ignore[arg-type]
-    assert drop_at_contact(Flight(rows=tuple(rows), result=FakeResult(None))) == 0.0  # type: ignore[arg-type]
-    assert loosest(Flight(rows=(*exact, row))) == 2.5
+    assert drop_at_contact(MeasuredRun(rows=tuple(rows), result=result)) == pytest.approx(30.0)  # type: ignore[arg-type]
+    assert drop_at_contact(MeasuredRun(rows=tuple(rows), result=FakeResult(None))) == 0.0  # type: ignore[arg-type]
+    assert loosest(MeasuredRun(rows=(*exact, row))) == 2.5
 
 
 class FakeResult:
@@ -145,8 +145,8 @@ class FakeResult:
 
 
 @pytest.fixture
-def row() -> Row:
-    return Row(0, 0.0, 0, 0, 1.0, None, 1.0, 1.0, 0.0, 0, 0, 0, None, None)
+def row() -> DensityRow:
+    return DensityRow(0, 0.0, 0, 0, 1.0, None, 1.0, 1.0, 0.0, 0, 0, 0, None, None)
 
 
 def test_every_setting_of_every_figure_is_a_scenario_that_can_be_run() -> None:

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure as Picture
 from PIL import Image
 
-from kantor_fleet.exits import Exit
-from kantor_fleet.experiment import Case, Outcome
-from kantor_fleet.pools import Pool
-from kantor_fleet.reproduce import burgard, explored, kabir_lee, kme, papers, reproduce
+from kantor_fleet.cli.exits import Exit
+from kantor_fleet.execution.experiment import Case, Outcome
+from kantor_fleet.execution.pools import Pool
+from kantor_fleet.reproduce import burgard, explored, kabir_lee, kme, papers
 from kantor_fleet.reproduce.claims import (
     MISS,
     OK,
@@ -36,13 +36,20 @@ from kantor_fleet.reproduce.claims import (
     times,
 )
 from kantor_fleet.reproduce.figure import Figure
-from kantor_fleet.reproduce.flights import Flight, Flights, Moment, Setting
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, Moment, Setting
 from kantor_fleet.reproduce.measures import finished, map_row, wtv_final
+from kantor_fleet.reproduce.run import reproduce
 from kantor_fleet.sweep.journal import Journal
 from kantor_fleet.sweep.plan import Key
-from kantor_protocol.scenario import MAP_PLANNERS
-from kantor_worldsim.metrics import Bounds, ByRegions, BytesPerRobotTick, MapResult, Result
-from strategies import examples
+from kantor_protocol.scenario.schema import MAP_PLANNERS
+from kantor_worldsim.observers.metrics.result import (
+    Bounds,
+    ByRegions,
+    BytesPerRobotTick,
+    MapResult,
+    Result,
+)
+from support.strategies import examples
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -51,12 +58,12 @@ HERE, THERE, FAR = Setting("here"), Setting("there"), Setting("far")
 POSITIVE = st.floats(min_value=1e-3, max_value=1e6)
 
 
-def flights(*robots_s: float) -> list[Flight]:
+def flights(*robots_s: float) -> list[MeasuredRun]:
     """Flights that stand for one number each."""
-    return [Flight(robots_s=value) for value in robots_s]
+    return [MeasuredRun(robots_s=value) for value in robots_s]
 
 
-def number(flight: Flight) -> float:
+def number(flight: MeasuredRun) -> float:
     return flight.robots_s
 
 
@@ -258,7 +265,7 @@ class FakeResult:
         self.map = map_result(regions=regions, distance_m=float(tick), explored=1.0)
 
 
-def made_up(setting: Setting, seed: int) -> Flight:
+def made_up(setting: Setting, seed: int) -> MeasuredRun:
     """What might come of a run: the more robots the sooner, the later the planner the longer."""
     scenario = setting.find()
     planner = sorted(MAP_PLANNERS).index(scenario.planner.name)
@@ -266,12 +273,12 @@ def made_up(setting: Setting, seed: int) -> Flight:
     tick += 50 * (not scenario.planner.coordinated) * (scenario.robots.count > 1)
     course = tuple(Moment(t, 10.0 * t, 100.0 - t) for t in (*range(0, tick, 10), tick))
     result = FakeResult(seed, tick, 1.0 + tick)
-    return Flight(result=result, course=course)  # type: ignore[arg-type]
+    return MeasuredRun(result=result, course=course)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
-def drawn() -> Callable[[str], tuple[Flights, Picture]]:
-    def draw(name: str) -> tuple[Flights, Picture]:
+def drawn() -> Callable[[str], tuple[MeasuredRuns, Picture]]:
+    def draw(name: str) -> tuple[MeasuredRuns, Picture]:
         figure = papers.FIGURES[name]._replace(runs=42 if name == "kme-all" else 3)
         found = {
             setting: [made_up(setting, seed) for seed in seeds]
@@ -282,7 +289,7 @@ def drawn() -> Callable[[str], tuple[Flights, Picture]]:
     return draw
 
 
-def test_bars_are_means_in_seconds(drawn: Callable[[str], tuple[Flights, Picture]]) -> None:
+def test_bars_are_means_in_seconds(drawn: Callable[[str], tuple[MeasuredRuns, Picture]]) -> None:
     """Figure 8 of Burgard et al.: a diagram for each reading, beside the office."""
     _, picture = drawn("burgard-fig8")
 
@@ -297,7 +304,7 @@ def test_bars_are_means_in_seconds(drawn: Callable[[str], tuple[Flights, Picture
 
 @pytest.mark.parametrize(("name", "lines"), [("kme-fig6", 6), ("kme-fig7", 4), ("kme-fig8", 4)])
 def test_curves_end_where_the_last_run_ends(
-    name: str, lines: int, drawn: Callable[[str], tuple[Flights, Picture]]
+    name: str, lines: int, drawn: Callable[[str], tuple[MeasuredRuns, Picture]]
 ) -> None:
     found, picture = drawn(name)
 
@@ -322,7 +329,7 @@ def test_a_run_that_has_ended_stays_where_it_ended() -> None:
 
 
 def test_the_table_tells_every_measure_by_number_of_robots(
-    drawn: Callable[[str], tuple[Flights, Picture]],
+    drawn: Callable[[str], tuple[MeasuredRuns, Picture]],
 ) -> None:
     found, picture = drawn("kme-all")
 
@@ -407,11 +414,11 @@ def kept(folder: Path) -> int:
 
 
 def test_kept_flights_read_back_as_they_were(tmp_path: Path) -> None:
-    key, flight = Key("a", "b", 3, exact=False), Flight(course=(Moment(0, 1.5, 0.1),))
-    with Journal(tmp_path / "runs.jsonl", Flight) as journal:
+    key, flight = Key("a", "b", 3, exact=False), MeasuredRun(course=(Moment(0, 1.5, 0.1),))
+    with Journal(tmp_path / "runs.jsonl", MeasuredRun) as journal:
         journal.add(key, flight)
 
-    with Journal(tmp_path / "runs.jsonl", Flight) as journal:
+    with Journal(tmp_path / "runs.jsonl", MeasuredRun) as journal:
         assert journal.outcomes == {key: flight}
     with Journal(tmp_path / "runs.jsonl") as journal:  # a sweep reads what it knows
         assert journal.outcomes == {key: Outcome()}
@@ -424,7 +431,7 @@ def simple_figure() -> Figure:
     return Figure("a figure", 2, (claim,), lambda _flights: Picture(), map_row, kept=True)
 
 
-def pool_of(*flights_by_seed: Flight) -> Callable[[Iterable[Case]], Pool]:
+def pool_of(*flights_by_seed: MeasuredRun) -> Callable[[Iterable[Case]], Pool]:
     """Flies nothing, and has the answers."""
 
     def start(cases: Iterable[Case]) -> Pool:
@@ -438,7 +445,10 @@ def pool_of(*flights_by_seed: Flight) -> Callable[[Iterable[Case]], Pool]:
 def test_a_run_that_broke_a_rule_counts_and_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    good, bad = Flight(result=finished_run(0)), Flight(result=finished_run(1), failed="too fast")
+    good, bad = (
+        MeasuredRun(result=finished_run(0)),
+        MeasuredRun(result=finished_run(1), failed="too fast"),
+    )
 
     code = reproduce({"a": simple_figure()}, None, pool_of(good, bad), tmp_path)
 
@@ -451,7 +461,7 @@ def test_a_run_that_broke_a_rule_counts_and_is_told(
 
 def test_a_folder_keeps_the_verdicts_of_its_figures(tmp_path: Path) -> None:
     """Those of a figure that is drawn anew are replaced, whichever command drew it."""
-    pool = pool_of(*(Flight(result=finished_run(seed)) for seed in (0, 1)))
+    pool = pool_of(*(MeasuredRun(result=finished_run(seed)) for seed in (0, 1)))
 
     for name in ("a", "b", "a"):
         reproduce({name: simple_figure()}, None, pool, tmp_path)
@@ -462,14 +472,14 @@ def test_a_folder_keeps_the_verdicts_of_its_figures(tmp_path: Path) -> None:
 def test_a_run_without_a_result_is_run_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    good, none = Flight(result=finished_run(0)), Flight(failed="its worker died: SIGKILL")
+    good, none = MeasuredRun(result=finished_run(0)), MeasuredRun(failed="its worker died: SIGKILL")
 
     code = reproduce({"a": simple_figure()}, None, pool_of(good, none), tmp_path)
 
     assert code == Exit.NOT_MET
     assert "1 runs failed; nothing was written; the same command runs" in capsys.readouterr().err
     assert not (tmp_path / "a.csv").exists()
-    again = pool_of(none, Flight(result=finished_run(1)))  # seed 0 is kept
+    again = pool_of(none, MeasuredRun(result=finished_run(1)))  # seed 0 is kept
     assert reproduce({"a": simple_figure()}, None, again, tmp_path) == Exit.DONE
 
 

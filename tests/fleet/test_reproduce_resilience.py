@@ -7,10 +7,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from kantor_fleet.experiment import Case
+from kantor_fleet.execution.experiment import Case
 from kantor_fleet.reproduce import papers
 from kantor_fleet.reproduce.claims import MISS, OK, TOLD
-from kantor_fleet.reproduce.flights import Flight, Flights, fly
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, run_all
 from kantor_fleet.reproduce.resilience import (
     AIMS,
     DETECTION,
@@ -28,8 +28,10 @@ from kantor_fleet.reproduce.resilience import (
     setting,
     values,
 )
-from kantor_protocol.faults import Drop, Fault, Kill, Partition
-from strategies import mission
+from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.links import Drop, Partition
+from kantor_protocol.scenario.faults.processes import Kill
+from support.strategies import mission
 
 DROPPING, PARTED, LOSING = SCOURGES
 RUNS = 3
@@ -78,12 +80,12 @@ def test_one_more_robot_is_lost_and_nothing_else_changes(seed: int) -> None:
 
 # Conclusions, from flights that are made up.
 
-_FLOWN = fly(Case(mission("limit_s=0.5"), 1))
+_FLOWN = run_all(Case(mission("limit_s=0.5"), 1))
 
 
-def made_up(outcome: Callable[[str, Aim, float, int], float]) -> Flights:
+def made_up(outcome: Callable[[str, Aim, float, int], float]) -> MeasuredRuns:
     """Flights of all conditions. outcome: per cent or ticks, by merge, aim, degree and seed."""
-    flights: dict[object, list[Flight]] = {}
+    flights: dict[object, list[MeasuredRun]] = {}
     assert _FLOWN.result is not None
     for aim in AIMS:
         for scourge in SCOURGES:
@@ -96,7 +98,7 @@ def made_up(outcome: Callable[[str, Aim, float, int], float]) -> Flights:
                         seeds = range(RUNS) if len(flown) == 1 else (seed,)
                         found = [outcome(merge, aim, degree, each) for each in seeds]
                         flights[made] = [
-                            Flight(
+                            MeasuredRun(
                                 result=msgspec.structs.replace(
                                     _FLOWN.result,
                                     detection_rate=value / 100.0,

@@ -275,13 +275,13 @@ def test_world_sim_that_is_killed_on_its_way_out_leaves_its_run_alone(kantor: "K
     """Started again, it finds the mission over: it does nothing, and nothing is lost."""
     from multiprocessing import Pipe
 
-    from kantor_fleet.catalog import find
-    from kantor_fleet.local import Order, _be_world_sim
+    from kantor_fleet.processes.local import FleetConfig, _be_world_sim
+    from kantor_fleet.scenarios.catalog import find
 
     assert in_process(kantor, "fleet", *SHORT).code == 1
     (folder,) = kantor.runs()
     before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-    order = Order(find("fleet"), 0, "lockstep", 1.0, folder)
+    order = FleetConfig(find("fleet"), 0, "lockstep", 1.0, folder)
     _be_world_sim(order, "tcp/127.0.0.1:1", folder, kantor.folder / "log", Pipe()[1], True, False)
 
     assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before

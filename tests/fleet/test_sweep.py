@@ -15,15 +15,15 @@ import numpy as np
 import psutil
 import pytest
 
-from kantor_fleet.exits import Exit
-from kantor_fleet.experiment import Case, Outcome, run_case
-from kantor_fleet.pools import Pool, local
+from kantor_fleet.cli.exits import Exit
+from kantor_fleet.execution.experiment import Case, Outcome, run_case
+from kantor_fleet.execution.pools import Pool, local
 from kantor_fleet.sweep.journal import Journal
 from kantor_fleet.sweep.plan import Key, SweepError, parse_seeds, plan
-from kantor_fleet.sweep.run import Order, sweep
+from kantor_fleet.sweep.run import SweepConfig, sweep
 from kantor_fleet.sweep.summary import Spread
-from strategies import mission
-from workers import DEADLY_SEED, die_of_a_seed, fail_of_a_seed
+from support.strategies import mission
+from support.workers import DEADLY_SEED, die_of_a_seed, fail_of_a_seed
 
 if TYPE_CHECKING:
     from conftest import Finished, Kantor
@@ -498,7 +498,7 @@ def thunder(cases: Iterable[Case]) -> Pool:
 
 def test_the_exit_code_tells_of_failures(tmp_path: Path) -> None:
     """Whatever the pool."""
-    order = Order(plan("fleet", [], "0:2"), tmp_path)
+    order = SweepConfig(plan("fleet", [], "0:2"), tmp_path)
 
     assert sweep(order, thunder) is Exit.NOT_MET
     assert [row["failed"] for row in rows_of(tmp_path / "table.csv")] == ["thunder", "thunder"]
@@ -510,10 +510,10 @@ def test_changed_sources_and_exact_distances_are_other_runs(
     """Who edits a planner does not want the old one's results."""
     plans = plan("fleet", [], "0:2"), plan("fleet", [], "0:2", exact=True)
     for made in plans:
-        sweep(Order(made, tmp_path), thunder)
-        sweep(Order(made, tmp_path), thunder)
+        sweep(SweepConfig(made, tmp_path), thunder)
+        sweep(SweepConfig(made, tmp_path), thunder)
     assert len(journal_lines(tmp_path)) == 4
 
     monkeypatch.setattr("kantor_fleet.sweep.plan.code", lambda: "edited")
-    sweep(Order(plans[0], tmp_path), thunder)
+    sweep(SweepConfig(plans[0], tmp_path), thunder)
     assert len(journal_lines(tmp_path)) == 6

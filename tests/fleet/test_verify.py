@@ -5,17 +5,20 @@ from pathlib import Path
 
 import pytest
 
-from kantor_fleet.exits import Exit
-from kantor_fleet.team import team
-from kantor_fleet.verify import verify
-from kantor_protocol.machine import Inputs, Outputs, ParticipantId
-from kantor_protocol.scenario import Scenario, parse
-from kantor_worldsim.loop import Exchange, in_process, simulate
-from kantor_worldsim.metrics import Result
-from kantor_worldsim.recording import MANIFEST, Recording
-from kantor_worldsim.stage import Stage
-from kantor_worldsim.world import Site
-from strategies import SMALL
+from kantor_fleet.cli.exits import Exit
+from kantor_fleet.execution.in_process_team import team
+from kantor_fleet.execution.verify import verify
+from kantor_protocol.base.machine import Exchange, Inputs, Outputs, ParticipantId
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.engine.event_loop import simulate
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.observers.metrics.result import Result
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.record.run_folder import MANIFEST
+from kantor_worldsim.world.world import WorldSetup
+from support.strategies import SMALL
 
 TROUBLE = """
 [[faults]]
@@ -72,8 +75,8 @@ def troubled(*overrides: str) -> Scenario:
 def recorded(scenario: Scenario, folder: Path, machines: Exchange | None = None) -> Result:
     """Play a mission into a run folder."""
     recording = Recording(scenario, 1, "in-process", folder)
-    site = Site.of(scenario, 1)
-    stage = Stage(scenario, 1, site, [recording.take])
+    site = WorldSetup.of(scenario, 1)
+    stage = Simulation(scenario, 1, site, [recording.take])
     simulate(stage, machines or in_process(team(scenario, 1, site)), 1, lambda: False)
     return recording.finish()
 
@@ -116,7 +119,7 @@ class Forgetful:
     """A crew in which r1 does not answer at times, as over a bus that is too slow."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._crew = in_process(team(scenario, 1, Site.of(scenario, 1)))
+        self._crew = in_process(team(scenario, 1, WorldSetup.of(scenario, 1)))
 
     def __call__(self, inputs: dict[ParticipantId, Inputs], /) -> dict[ParticipantId, Outputs]:
         asleep = {"r1"} if inputs["r1"].now_ns == 500_000_000 else set()

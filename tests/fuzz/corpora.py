@@ -24,31 +24,38 @@ from fuzz.mutations import (
     pick,
     text_spans,
 )
-from kantor_fleet import authority
-from kantor_fleet.team import play
-from kantor_protocol import credentials
-from kantor_protocol.diary import DiaryFile
-from kantor_protocol.machine import Body, Inputs, Outputs, Pose
-from kantor_protocol.messages import (
+from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.security import authority
+from kantor_protocol.base.machine import Body, Inputs, Outputs, Pose
+from kantor_protocol.node.wal import WalFile
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.transport import credentials
+from kantor_protocol.wire.messages import (
     VERSION,
     Array,
-    Go,
     Mission,
     Progress,
     Ready,
     Refusal,
     Report,
+    StartClock,
+    StepRequest,
     Stop,
-    Turn,
-    decode_news,
+    decode_gossip,
     encode,
 )
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.journal import Journal
-from kantor_worldsim.records import Batch, Incident, Mailbag, Opening, Record, encode_record
-from kantor_worldsim.world import Site
-from mapping import ROOMS_MISSION, on_map, site_of
-from strategies import SMALL, mission
+from kantor_worldsim.record.journal import Journal
+from kantor_worldsim.record.records import (
+    Batch,
+    EnvelopeIndex,
+    Opening,
+    ProcessEvent,
+    Record,
+    encode_record,
+)
+from kantor_worldsim.world.world import WorldSetup
+from support.missions import ROOMS_MISSION, on_map, site_of
+from support.strategies import SMALL, mission
 
 GOODS = 48
 """Good inputs of a kind."""
@@ -60,12 +67,12 @@ GOODS = 48
 class Played:
     """A small mission with all that went through it."""
 
-    def __init__(self, scenario: Scenario, site: Site | None = None) -> None:
+    def __init__(self, scenario: Scenario, site: WorldSetup | None = None) -> None:
         self.scenario = scenario
-        self.site = site or Site.of(scenario, 1)
+        self.site = site or WorldSetup.of(scenario, 1)
         self.records: list[Record] = []
         play(scenario, 1, self.site, [self.records.append])
-        mailbag = Mailbag()
+        mailbag = EnvelopeIndex()
         self.inputs: list[Inputs] = []
         self.outputs: list[Outputs] = []
         self.acted: list[str] = []
@@ -154,7 +161,7 @@ def news(*names: str) -> Mutations:
 
 def news_fields(name: str) -> Framed:
     """The sender's place, and what it tells: have, logs, claims, registers."""
-    told = [decode_news(body) for body in pick(played(name).bodies(), GOODS, 2000)]
+    told = [decode_gossip(body) for body in pick(played(name).bodies(), GOODS, 2000)]
     goods = [
         (bytes((i % 3 + 1,)), n.have, n.logs, n.claims, n.registers) for i, n in enumerate(told)
     ]
@@ -191,9 +198,9 @@ def to_participants() -> Mutations:
                        Body(Pose(1.0, 2.0), 3, 4, 1)))
         for each in _every()
     ]  # fmt: skip
-    turns = [encode(Turn(VERSION, given)) for each in _every() for given in each.inputs]
+    turns = [encode(StepRequest(VERSION, given)) for each in _every() for given in each.inputs]
     observation = played("ledger").inputs[0].observation
-    other = [Go(VERSION, "ab", 5, 2.0, observation, 3), Stop(VERSION, "over")]
+    other = [StartClock(VERSION, "ab", 5, 2.0, observation, 3), Stop(VERSION, "over")]
     small = [*map(encode, other), encode(Refusal(VERSION, "ab", "no such robot"))]
     return messages([*told, *pick(turns, GOODS - 12, 1200), *small], longest=3000)
 
@@ -208,7 +215,7 @@ def progress() -> Mutations:
 
 def records() -> Mutations:
     """Of every kind."""
-    incident = Incident(7, "r1", "start", 2, 3, 1)
+    incident = ProcessEvent(7, "r1", "start", 2, 3, 1)
     found = [encode_record(record) for each in _every() for record in each.records]
     openings = [encode_record(each.opening) for each in _every()]
     return messages([*pick(found, GOODS - 8, 2500), *openings, encode_record(incident)], 64, 4000)
@@ -336,7 +343,7 @@ def diary_files() -> Mutations:
         contents = []
         for pages in (0, 1, 3):
             path = Path(folder) / str(pages)
-            diary = DiaryFile(path, "run")
+            diary = WalFile(path, "run")
             diary.begin(Body(Pose(1.0, 2.0)))
             for inputs in given[:pages]:
                 diary.note(encode(inputs))

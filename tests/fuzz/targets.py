@@ -19,43 +19,47 @@ import numpy as np
 
 from fuzz import corpora
 from fuzz.mutations import unframe
-from kantor_fleet.experiment import Outcome
+from kantor_fleet.execution.experiment import Outcome
+from kantor_fleet.execution.in_process_team import participant
 from kantor_fleet.sweep.journal import Journal as RunsJournal
 from kantor_fleet.sweep.plan import Key, SweepError
-from kantor_fleet.team import participant
-from kantor_protocol import credentials, keys
-from kantor_protocol import diary as diary_module
-from kantor_protocol.diary import DiaryFile
-from kantor_protocol.evidence import Evidence, entries
-from kantor_protocol.grid import FREE, OCCUPIED, UNKNOWN
-from kantor_protocol.life import Life, Pages
-from kantor_protocol.machine import Body, Envelope, Inputs, Observation, Pose, StateMachine
-from kantor_protocol.messages import (
+from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN
+from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Pose, StateMachine
+from kantor_protocol.base.varint import Pairs, pack_pairs, sum_pairs
+from kantor_protocol.node import wal as diary_module
+from kantor_protocol.node.recovery import RecoverableNode, WalContents
+from kantor_protocol.node.wal import WalFile
+from kantor_protocol.replication.gossip import build_replica
+from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
+from kantor_protocol.replication.registers import NUMBER_MAX, read_register
+from kantor_protocol.replication.replica import Replica, read_have
+from kantor_protocol.scenario.dump import to_toml, to_tree
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.load import from_tree, parse, with_chaos
+from kantor_protocol.transport import credentials
+from kantor_protocol.wire import keys
+from kantor_protocol.wire.messages import (
     Array,
     Mission,
     RefusedError,
     check_outputs,
     decode_from_participant,
+    decode_gossip,
     decode_inputs,
-    decode_news,
     decode_progress,
     decode_to_participant,
     encode,
-    encode_news,
+    encode_gossip,
 )
-from kantor_protocol.packing import Pairs, pack_pairs, sum_pairs
-from kantor_protocol.radio import replica_of
-from kantor_protocol.registers import NUMBER_MAX, read_register
-from kantor_protocol.replica import Replica, read_have
-from kantor_protocol.scenario import ScenarioError, from_tree, parse, to_toml, to_tree, with_chaos
-from kantor_protocol.weights import Units, WeightsSubscriber
-from kantor_worldsim import density, maps, reading
-from kantor_worldsim.journal import read as read_journal
-from kantor_worldsim.reading import ACTS, ALL_HEARD, ALL_SENT, INJECTED, PAIRS, VERDICTS
-from kantor_worldsim.records import decode_record, encode_record
-from kantor_worldsim.world import units_of
-from mapping import on_map
-from strategies import mission
+from kantor_protocol.wire.weights import Units, WeightsSubscriber
+from kantor_worldsim.record import columnar
+from kantor_worldsim.record.columnar import ACTS, ALL_HEARD, ALL_SENT, INJECTED, PAIRS, VERDICTS
+from kantor_worldsim.record.journal import read as read_journal
+from kantor_worldsim.record.records import decode_record, encode_record
+from kantor_worldsim.world import density, maps
+from kantor_worldsim.world.world import units_of
+from support.missions import on_map
+from support.strategies import mission
 
 Decode = Callable[[bytes], bool]
 
@@ -107,8 +111,8 @@ def _in_one_line(refusal: Exception) -> bool:
 
 
 def _news(content: bytes) -> None:
-    news = decode_news(content)
-    assert decode_news(encode_news(news)) == news, "news that changes on the way"
+    news = decode_gossip(content)
+    assert decode_gossip(encode_gossip(news)) == news, "news that changes on the way"
 
 
 def _from_participant(content: bytes) -> None:
@@ -201,7 +205,7 @@ def _learning(name: str, me: str = "r1", samples: int | None = None) -> Callable
             bound, units = entries(played.site.ground.frame), None
         else:
             bound, units = played.site.samples_m.shape[0], units_of(scenario, 12)
-        replica = replica_of(me, scenario, units, bound)
+        replica = build_replica(me, scenario, units, bound)
         registers = replica.registers
 
         def take(content: bytes) -> bool:
@@ -248,7 +252,7 @@ def _is_sound(replica: Replica) -> None:
 def _registers(_folder: Path) -> Decode:
     """Registers are read and learnt by themselves; what is sound can be read."""
     scenario = mission(*corpora.SHORT, *corpora.DENSITY["spectral"])
-    registers = replica_of("r1", scenario, Units.of(30, 12), 12).registers
+    registers = build_replica("r1", scenario, Units.of(30, 12), 12).registers
     width = registers.values.shape[1]
 
     def take(content: bytes) -> bool:
@@ -270,7 +274,7 @@ def _register_inputs() -> Inventive:
     from fuzz.mutations import LEB_TOKENS, Framed, pick
 
     told = [
-        decode_news(body)
+        decode_gossip(body)
         for name in ("spectral", "market")
         for body in pick(corpora.played(name).bodies(), corpora.GOODS, 1500)
     ]
@@ -288,7 +292,7 @@ def _evidence(_folder: Path) -> Decode:
     scenario = on_map(*corpora.MAP["burgard"])
     frame = corpora.played("burgard").opening.frame
     assert frame is not None
-    evidence = Evidence(frame, scenario.sensor, ranges=True)
+    evidence = OccupancyLog(frame, scenario.sensor, ranges=True)
     bound = entries(frame)
 
     def take(content: bytes) -> bool:
@@ -309,12 +313,12 @@ def _evidence(_folder: Path) -> Decode:
 
 def _reader(_folder: Path) -> Decode:
     """The kernel that fills a reader's tables, on any bytes and with too few rows."""
-    tables = reading.Reader()
+    tables = columnar.ColumnarDecoder()
     tables._make_room(64)
     sizes = tables._tables[0]
 
     def read(content: bytes) -> bool:
-        at = reading._read_batch(content, *tables._tables, tables._pose_bits, 3, 3, 12)
+        at = columnar._read_batch(content, *tables._tables, tables._pose_bits, 3, 3, 12)
         assert at <= len(content), "read beyond the end"
         if at >= 0:
             counts = sizes[[ACTS, ACTS, ALL_HEARD, ALL_SENT, VERDICTS, PAIRS, INJECTED]].tolist()
@@ -326,10 +330,10 @@ def _reader(_folder: Path) -> Decode:
 
 
 def _parts_of_news(content: bytes) -> bool:
-    epoch, have, have_end, logs, end = reading.parts_of_news(content, 0, len(content))
+    epoch, have, have_end, logs, end = columnar.parts_of_news(content, 0, len(content))
     assert end <= len(content)
     try:
-        news = decode_news(content)
+        news = decode_gossip(content)
     except RefusedError:
         assert end < 0, "a referee takes for news what robots refuse"
         return False
@@ -340,7 +344,7 @@ def _parts_of_news(content: bytes) -> bool:
 
 
 def _parts_of_weights(content: bytes) -> bool:
-    *_, low, high = reading.parts_of_weights(content, 0, len(content))
+    *_, low, high = columnar.parts_of_weights(content, 0, len(content))
     assert high <= len(content)
     assert high < 0 or low <= high
     return high >= 0
@@ -387,9 +391,9 @@ class _Leaf:
     def __init__(self, page: bytes) -> None:
         self._page = page
 
-    def read(self) -> Pages:
+    def read(self) -> WalContents:
         """What it holds."""
-        return Pages(Body(Pose(10.0, 10.0)), (self._page,))
+        return WalContents(Body(Pose(10.0, 10.0)), (self._page,))
 
     def begin(self, birth: Body) -> None:
         """Never."""
@@ -407,7 +411,7 @@ def _life(name: str, me: str) -> Callable[[Path], Decode]:
         machine = _newborn(me, played)
 
         def live(content: bytes) -> None:
-            Life(lambda _body: machine, _Leaf(content), Body(Pose(10.0, 10.0)))
+            RecoverableNode(lambda _body: machine, _Leaf(content), Body(Pose(10.0, 10.0)))
 
         return _refuses(RefusedError, live)
 
@@ -423,7 +427,7 @@ def _diary(folder: Path, *, framed: bool) -> Decode:
 
     def read(content: bytes) -> bool:
         path.write_bytes(_in_frames(unframe(content)) if framed else content)
-        diary = DiaryFile(path, "run")
+        diary = WalFile(path, "run")
         try:
             pages = diary.read()
         finally:
@@ -452,7 +456,7 @@ def _parse(content: bytes) -> None:
 
 
 def _override(content: bytes) -> None:
-    from strategies import SMALL
+    from support.strategies import SMALL
 
     parse(SMALL, "small", [content.decode("utf-8", "surrogateescape")])
 

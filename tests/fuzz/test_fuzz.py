@@ -12,7 +12,7 @@ import pytest
 from fuzz import fuzz
 from fuzz.mutations import LEB_TOKENS, MSGPACK_TOKENS, leb, msgpack_spans, number_spans
 from fuzz.targets import TARGETS, Decode, Inventive, Target
-from kantor_protocol.messages import encode
+from kantor_protocol.wire.messages import encode
 
 BATCH = 500
 SEED = 20

@@ -10,7 +10,7 @@ import pytest
 
 from kantor_fleet.reproduce.burgard import READINGS, Reading
 from kantor_fleet.reproduce.claims import mean_ratio
-from kantor_fleet.reproduce.flights import Flight, fly
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, run_all
 from kantor_fleet.reproduce.measures import distance_m, finished, surveyed
 
 A, B, C, D = READINGS
@@ -20,11 +20,11 @@ section = pytest.mark.xdist_group("burgard")
 
 
 @functools.cache
-def flown(letter: str, robots: int, *, coordinated: bool, seeds: int = SEEDS) -> list[Flight]:
+def flown(letter: str, robots: int, *, coordinated: bool, seeds: int = SEEDS) -> list[MeasuredRun]:
     """A reading over seeds 0, 1, …; no rule may be broken on the way."""
     reading = next(reading for reading in READINGS if reading.letter == letter)
     cases = reading.setting(robots, coordinated=coordinated).cases(range(seeds))
-    flights = [fly(case) for _, case in cases]
+    flights = [run_all(case) for _, case in cases]
     assert [flight.failed for flight in flights] == [None] * seeds
     return flights
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from kantor_fleet.catalog import find
-from kantor_fleet.experiment import Case, run_case
-from kantor_protocol.scenario import MAP_PLANNERS
+from kantor_fleet.execution.experiment import Case, run_case
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.scenario.schema import MAP_PLANNERS
 
 SIZES = {
     "office": ("map.size_m=[20.0,16.0]", "coordination=decentralized"),

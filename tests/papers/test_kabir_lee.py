@@ -16,15 +16,16 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial import cKDTree
 
-from kantor_fleet.catalog import find
-from kantor_fleet.team import play
-from kantor_protocol.packing import Pairs
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.metrics import Metrics, Result, Row
-from kantor_worldsim.recording import Recording
-from kantor_worldsim.records import Batch, Record
-from kantor_worldsim.world import Site
-from strategies import mission
+from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.observers.metrics.density import DensityMetrics, DensityRow
+from kantor_worldsim.observers.metrics.result import Result
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.record.records import Batch, Record
+from kantor_worldsim.world.world import WorldSetup
+from support.strategies import mission
 
 Places = npt.NDArray[np.float64]
 
@@ -39,14 +40,14 @@ class Flight(NamedTuple):
     """A run and what it was measured by, tick by tick."""
 
     result: Result
-    rows: Sequence[Row]
+    rows: Sequence[DensityRow]
 
 
 @functools.cache
 def flown(name: str, overrides: tuple[str, ...], seed: int) -> Flight:
     """A packaged mission, run once in process; no rule may be broken on the way."""
     scenario = find(name, overrides)
-    site = Site.of(scenario, seed)
+    site = WorldSetup.of(scenario, seed)
     recording = Recording(scenario, seed, "in-process")
     play(scenario, seed, site, [recording.take])
     result = recording.finish()
@@ -111,7 +112,7 @@ def test_vi_a_published_end_is_no_bound() -> None:
     the nearest neighbour over 2 L. What was really shipped costs about 37.
     """
     ends = [run.w_ub.paper for run in results(A, seeds=A_SEEDS)]
-    samples_m = Site.of(find(A), 0).samples_m
+    samples_m = WorldSetup.of(find(A), 0).samples_m
     nearest_m = cKDTree(samples_m).query(samples_m, k=2)[0][:, 1]
     least = float(nearest_m.sum()) / (2 * 10_000)
 
@@ -292,7 +293,7 @@ def test_iii_b_single_robot_ships_all_mass_with_all_points() -> None:
 class Instant(NamedTuple):
     """A small mission at the end of a tick."""
 
-    row: Row
+    row: DensityRow
     shipped_m: Places
     """(s, 2) where points were left."""
     robots_m: Places
@@ -310,8 +311,8 @@ class Small(NamedTuple):
 def small(*overrides: str) -> Small:
     """The small mission: N = 12, M = 30."""
     scenario = mission("metrics.every=1", *overrides)
-    site = Site.of(scenario, 1)
-    metrics = Metrics()
+    site = WorldSetup.of(scenario, 1)
+    metrics = DensityMetrics()
     shipped: list[tuple[float, float]] = []
     robots_m = site.starts_m.copy()
     told: list[tuple[int, list[tuple[float, float]], Places]] = [(0, [], robots_m.copy())]
@@ -426,7 +427,7 @@ def test_theorem_2_is_loose_by_the_number_of_robots() -> None:
 
 def shipments(scenario: Scenario) -> Iterator[tuple[Places, dict[int, int], Places, list[int]]]:
     """Each point of a lone robot: from where, what it filled, the samples, and what they had left."""
-    site = Site.of(scenario, 1)
+    site = WorldSetup.of(scenario, 1)
     records: list[Record] = []
     play(scenario, 1, site, [records.append])
     left = [5] * 12

@@ -10,7 +10,7 @@ import pytest
 
 from kantor_fleet.reproduce import kme
 from kantor_fleet.reproduce.claims import Measure, geometric, paired_ratios
-from kantor_fleet.reproduce.flights import Flight, Setting, fly
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, Setting, run_all
 from kantor_fleet.reproduce.measures import epv_mean, surveyed, wtv_final, wtv_mean
 
 CONFIGURATIONS = 9
@@ -20,10 +20,10 @@ section_c = pytest.mark.xdist_group("kme")
 
 
 @functools.cache
-def flown() -> Mapping[Setting, Sequence[Flight]]:
+def flown() -> Mapping[Setting, Sequence[MeasuredRun]]:
     """Those configurations, with no rule broken on the way."""
     flights = {
-        setting: [fly(case) for _, case in setting.cases(seeds)]
+        setting: [run_all(case) for _, case in setting.cases(seeds)]
         for setting, seeds in kme.part(CONFIGURATIONS).items()
     }
     failed = [flight.failed for runs in flights.values() for flight in runs]

@@ -13,14 +13,14 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_agent.planners.spectral import mean_over_mixture
-from kantor_fleet.catalog import find
-from kantor_fleet.team import play
-from kantor_protocol.modes import VISIT, rectangle_of, visit_at
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.checkers import Checker
-from kantor_worldsim.metrics import Metrics
-from kantor_worldsim.records import Act, Batch, Record
-from kantor_worldsim.world import Site
+from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.replication.cosine_basis import VISIT, rectangle_of, visit_at
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.observers.checkers.checker import Checker
+from kantor_worldsim.observers.metrics.density import DensityMetrics
+from kantor_worldsim.record.records import Batch, Record, StepRecord
+from kantor_worldsim.world.world import WorldSetup
 
 SEEDS = 3
 B = ("starts.random=true", "metrics.every=0")
@@ -35,15 +35,15 @@ class Flight(NamedTuple):
     scenario: Scenario
     detected: float
     """Percent of the targets."""
-    acts: list[Act]
+    acts: list[StepRecord]
 
 
 @functools.cache
 def flown(overrides: tuple[str, ...], seed: int) -> Flight:
     """Section VI-A's mission, run once in process."""
     scenario = find("paper-centralized", overrides)
-    site, metrics, checker = Site.of(scenario, seed), Metrics(), Checker()
-    acts: list[Act] = []
+    site, metrics, checker = WorldSetup.of(scenario, seed), DensityMetrics(), Checker()
+    acts: list[StepRecord] = []
 
     def keep(record: Record) -> None:
         if isinstance(record, Batch):

@@ -11,11 +11,11 @@ import msgspec
 import pytest
 import zenoh
 
-from intruders import plain_session
-from kantor_fleet.authority import Wanted, issue
-from kantor_protocol import credentials, settings
-from kantor_protocol.bus import free_endpoint
-from kantor_protocol.credentials import Certificate, Password
+from kantor_fleet.security.authority import Wanted, issue
+from kantor_protocol.transport import credentials, zenoh_config
+from kantor_protocol.transport.credentials import Certificate, Password
+from kantor_protocol.transport.endpoint import free_endpoint
+from support.intruders import plain_session
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 ROOT = "kantor/v1/kantor"
 
 
-def proof_of(folder: Path, user: str) -> settings.Settings:
+def proof_of(folder: Path, user: str) -> zenoh_config.ZenohConfig:
     """How a user shows who it is."""
-    return settings.client(credentials.find(folder / "credentials", user))
+    return zenoh_config.client_config(credentials.find(folder / "credentials", user))
 
 
-def strangers(folder: Path) -> list[settings.Settings]:
+def strangers(folder: Path) -> list[zenoh_config.ZenohConfig]:
     """What does not get anybody onto the bus."""
     r2 = credentials.find(folder / "credentials", "r2")
     if isinstance(r2, Password):
@@ -39,7 +39,7 @@ def strangers(folder: Path) -> list[settings.Settings]:
         assert isinstance(foreign, Certificate)
         guesses = [foreign, msgspec.structs.replace(foreign, authority=r2.authority)]
     short = {"connect/timeout_ms": 500}
-    return [short, *(settings.client(guess) | short for guess in guesses)]
+    return [short, *(zenoh_config.client_config(guess) | short for guess in guesses)]
 
 
 def hear(session: zenoh.Session, *keys: str) -> "SimpleQueue[tuple[str, bytes]]":

@@ -7,11 +7,17 @@ from typing import TYPE_CHECKING
 import pytest
 
 from kantor_fleet.campaign import processes
-from kantor_fleet.campaign.memory import Grown
-from kantor_fleet.campaign.processes import Flight, Soak, Terms, Totals
-from kantor_fleet.campaign.storms import LOCKSTEP_EVERY, STORM_S, is_lockstep, storm
-from kantor_protocol.faults import Fault, Impostor, Kill, OnProcesses, Pause
-from kantor_protocol.machine import SUPERVISOR, WORLD_SIM
+from kantor_fleet.campaign.process_scenarios import (
+    LOCKSTEP_EVERY,
+    STORM_S,
+    is_lockstep,
+    process_scenario,
+)
+from kantor_fleet.campaign.processes import ProcessMission, Soak, Terms, Totals
+from kantor_fleet.campaign.rss_monitor import Grown
+from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM
+from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.processes import Impostor, Kill, OnProcesses, Pause
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -33,7 +39,7 @@ def of_kind(faults: tuple[Fault, ...], kind: type[OnProcesses], who: str) -> int
 
 def test_storms_have_enough_of_everything_wherever_they_begin() -> None:
     """Any fifteen missions in a row have what a soak of a quarter of an hour must have seen."""
-    storms = [storm(seed) for seed in range(30)]
+    storms = [process_scenario(seed) for seed in range(30)]
     walls = [s.faults for seed, s in enumerate(storms) if not is_lockstep(seed)]
     missions = 15 * (LOCKSTEP_EVERY - 1) // LOCKSTEP_EVERY
     assert missions * min(of_kind(faults, Kill, "r") for faults in walls) >= 100
@@ -46,7 +52,7 @@ def test_storms_have_enough_of_everything_wherever_they_begin() -> None:
 def test_storms_end_and_nobody_pretends_to_be_away(storm_s: float) -> None:
     """After the storm all is calm, but for whoever is lost; impostors come when there is somebody to be."""
     for seed in range(20):
-        scenario = storm(seed, 4.0, storm_s)
+        scenario = process_scenario(seed, 4.0, storm_s)
         lost = [f for f in scenario.faults if f.until_s is None and not isinstance(f, Impostor)]
         assert all(isinstance(fault, Kill) for fault in lost)
         assert len(lost) <= 1
@@ -88,10 +94,10 @@ def test_the_first_violation_ends_a_soak_with_all_that_repeats_it(
 ) -> None:
     """Seed, commit, command, and the folder that is kept."""
 
-    def fly(seed: int, _terms: Terms, folder: Path, *_: object) -> Flight:
+    def fly(seed: int, _terms: Terms, folder: Path, *_: object) -> ProcessMission:
         folder.mkdir(parents=True)
         wrong = ("energy: t=1.000 s: r1: spends what it has not",) if seed == 2 else ()
-        return Flight(seed, "wall", "done", 1.0, wrong, Counter(kill=3), (0.5,), (1.0,))
+        return ProcessMission(seed, "wall", "done", 1.0, wrong, Counter(kill=3), (0.5,), (1.0,))
 
     monkeypatch.setattr(processes, "fly", fly)
     monkeypatch.setattr(processes, "warm_up", lambda: None)
@@ -117,7 +123,7 @@ def test_a_soak_is_met_if_all_are_back_in_time_and_memory_is_flat(
     """The bounds are those that the totals tell."""
     totals = Totals()
     grown = {"robot": Grown(1, 1000, grown_mb, grown_mb, 100.0)}
-    totals.add(Flight(0, "wall", "done", 40.0, (), Counter(), (rejoined_s,), grown=grown))
+    totals.add(ProcessMission(0, "wall", "done", 40.0, (), Counter(), (rejoined_s,), grown=grown))
     assert totals.met is met
     told = "\n".join(totals.lines(60.0))
     assert ("NOT" in told) is not met

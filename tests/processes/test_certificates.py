@@ -15,12 +15,17 @@ import msgspec
 import pytest
 import zenoh
 
-from fleets import await_line
-from intruders import plain_session
-from kantor_fleet.authority import Wanted, issue
-from kantor_protocol import credentials, keys, settings, tls
-from kantor_protocol.bus import BusError, Heard, Host, Joined, Left, free_endpoint, line
-from kantor_protocol.credentials import Certificate, Identity
+from kantor_fleet.security.authority import Wanted, issue
+from kantor_protocol.transport import credentials, tls, zenoh_config
+from kantor_protocol.transport.client import participant_session
+from kantor_protocol.transport.credentials import Certificate, Identity
+from kantor_protocol.transport.endpoint import free_endpoint
+from kantor_protocol.transport.events import Heard, Joined, Left
+from kantor_protocol.transport.router import HubRouter
+from kantor_protocol.transport.session import BusError
+from kantor_protocol.wire import keys
+from support.fleets import await_line
+from support.intruders import plain_session
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -44,15 +49,15 @@ def identity(folder: Path, user: str) -> Certificate:
 
 
 @contextmanager
-def hosted(who: Certificate, endpoint: str, said: list[str]) -> Iterator[Host]:
+def hosted(who: Certificate, endpoint: str, said: list[str]) -> Iterator[HubRouter]:
     """World-sim's end of the bus, or what passes itself off as it."""
-    with Host(who, endpoint, None, ROSTER, said.append) as host:
+    with HubRouter(who, endpoint, None, ROSTER, said.append) as host:
         yield host
 
 
 def join(endpoint: str, who: Identity) -> None:
     """Come and go."""
-    with line(endpoint, who, "nonce", PATIENCE_S):
+    with participant_session(endpoint, who, "nonce", PATIENCE_S):
         pass
 
 
@@ -145,9 +150,9 @@ def test_world_sim_and_whoever_is_refused_both_say_why(kantor: "Kantor") -> None
     assert err.count("\n") <= 1
 
 
-def anonymous(ours: Certificate) -> settings.Settings:
+def anonymous(ours: Certificate) -> zenoh_config.ZenohConfig:
     """The settings of somebody who trusts the authority and has no certificate."""
-    own = settings.client(ours)
+    own = zenoh_config.client_config(ours)
     authority = own["transport/link/tls"]["root_ca_certificate_base64"]
     return own | {
         "connect/timeout_ms": 500,
@@ -176,7 +181,7 @@ def test_a_revoked_robot_without_manners_is_not_heard(folder: Path) -> None:
     endpoint, said = free_endpoint("tls"), []
     with (
         hosted(identity(folder, "worldsim"), endpoint, said) as host,
-        plain_session(endpoint, settings.client(stolen)) as rogue,
+        plain_session(endpoint, zenoh_config.client_config(stolen)) as rogue,
     ):
         heard: list[zenoh.Sample] = []
         rogue.declare_subscriber(f"{keys.everything(FLEET)}", heard.append)
@@ -184,7 +189,7 @@ def test_a_revoked_robot_without_manners_is_not_heard(folder: Path) -> None:
         token = rogue.liveliness().declare_token(keys.alive(FLEET, "r3", "forged"))
         for name in ROSTER:
             rogue.put(keys.tx(FLEET, name), b"forged", congestion_control=BLOCK)
-        with line(endpoint, identity(folder, "r1"), "nonce", PATIENCE_S) as honest:
+        with participant_session(endpoint, identity(folder, "r1"), "nonce", PATIENCE_S) as honest:
             assert host.next(PATIENCE_S) == Joined("r1", "nonce")
             for name in ROSTER:
                 host.send(name, b"secret", patiently=True)
@@ -206,7 +211,9 @@ def test_a_robot_that_is_revoked_meanwhile_is_told(folder: Path) -> None:
     with ExitStack() as robots:
         with hosted(identity(folder, "worldsim"), endpoint, said) as host:
             r1, r3 = (
-                robots.enter_context(line(endpoint, identity(folder, name), name, PATIENCE_S))
+                robots.enter_context(
+                    participant_session(endpoint, identity(folder, name), name, PATIENCE_S)
+                )
                 for name in ("r1", "r3")
             )
             assert {host.next(PATIENCE_S), host.next(PATIENCE_S)} == {
@@ -252,7 +259,7 @@ def test_nobody_talks_to_a_false_world_sim(folder: Path, tmp_path: Path) -> None
 
 def test_plain_zenoh_is_not_taken_in_by_a_false_world_sim_either(folder: Path) -> None:
     """It is TLS that refuses: the bus itself, not only the look that comes before it."""
-    own = settings.client(identity(folder, "r1")) | {"connect/timeout_ms": 500}
+    own = zenoh_config.client_config(identity(folder, "r1")) | {"connect/timeout_ms": 500}
     with (
         hosted(identity(folder, "r2"), at := free_endpoint("tls"), []),
         pytest.raises(zenoh.ZError),
@@ -268,7 +275,7 @@ def test_a_certificate_counts_until_it_expires(folder: Path) -> None:
     r1 = identity(folder, "r1")
     with (
         hosted(identity(folder, "worldsim"), endpoint := free_endpoint("tls"), []) as host,
-        line(endpoint, r1, "nonce", PATIENCE_S),
+        participant_session(endpoint, r1, "nonce", PATIENCE_S),
     ):
         assert host.next(PATIENCE_S) == Joined("r1", "nonce")
         assert host.next(PATIENCE_S) == Left("r1", "nonce")
@@ -359,7 +366,7 @@ def test_who_is_not_of_the_kind_is_told_so(folder: Path) -> None:
     passwords = credentials.issue(folder.parent / "passwords", FLEET, ROSTER)
     users = credentials.users_file(folder.parent / "passwords")
     plain = free_endpoint()
-    with Host(passwords["worldsim"], plain, users, ROSTER):
+    with HubRouter(passwords["worldsim"], plain, users, ROSTER):
         assert "does not answer as one with certificates; check --connect" in refusal(
             plain.replace("tcp", "tls"), r1
         )

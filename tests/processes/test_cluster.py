@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 
 import psutil
 import pytest
-
 import workers
-from kantor_fleet import pools
-from kantor_fleet.exits import Exit
-from kantor_fleet.experiment import Case
-from kantor_fleet.sweep.plan import Plan, plan
-from kantor_fleet.sweep.run import Order, sweep
-from strategies import mission
+
+from kantor_fleet.cli.exits import Exit
+from kantor_fleet.execution import pools
+from kantor_fleet.execution.experiment import Case
+from kantor_fleet.sweep.plan import SweepPlan, plan
+from kantor_fleet.sweep.run import SweepConfig, sweep
+from support.strategies import mission
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -79,11 +79,11 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the sweep leaves that processes of this machine ran."""
     folder = tmp_path_factory.mktemp("reference")
-    assert sweep(Order(small_plan(), folder), partial(pools.local, jobs=2)) is Exit.DONE
+    assert sweep(SweepConfig(small_plan(), folder), partial(pools.local, jobs=2)) is Exit.DONE
     return folder
 
 
-def small_plan() -> Plan:
+def small_plan() -> SweepPlan:
     return plan("fleet", [VARY], SEEDS, SMALL)
 
 
@@ -172,7 +172,7 @@ def test_a_cluster_that_is_not_there(
     monkeypatch.setattr(pools, "_CONNECT_S", 0.3)
     address = "tcp://127.0.0.1:9"
 
-    code = sweep(Order(small_plan(), tmp_path), partial(pools.cluster, address=address))
+    code = sweep(SweepConfig(small_plan(), tmp_path), partial(pools.cluster, address=address))
 
     assert code is Exit.UNREACHABLE
     err = capsys.readouterr().err

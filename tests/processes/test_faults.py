@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from fleets import result_of
+from support.fleets import result_of
 
 if TYPE_CHECKING:
     from conftest import Kantor

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
-from fleets import await_line, children_named, result_of
-from kantor_fleet.catalog import find
-from kantor_fleet.team import play
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.metrics import Metrics
-from kantor_worldsim.world import Site
+from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.observers.metrics.density import DensityMetrics
+from kantor_worldsim.world.world import WorldSetup
+from support.fleets import await_line, children_named, result_of
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -27,7 +27,7 @@ LOSSY = (
 
 def detection(scenario: Scenario, seed: int) -> float:
     """The detection rate in virtual time."""
-    site, metrics = Site.of(scenario, seed), Metrics()
+    site, metrics = WorldSetup.of(scenario, seed), DensityMetrics()
     play(scenario, seed, site, [metrics.take])
     return len(metrics.finds) / len(site.targets_m)
 
@@ -128,7 +128,7 @@ def test_robots_start_by_hand_in_any_order(kantor: "Kantor") -> None:
     """r2 before world-sim, the supervisor and r1 after it; each needs an endpoint, an id and
     credentials, and gets the mission from world-sim.
     """
-    from kantor_protocol.bus import free_endpoint
+    from kantor_protocol.transport.endpoint import free_endpoint
 
     endpoint = free_endpoint()
     connect = ("--connect", endpoint)
@@ -151,7 +151,7 @@ def test_robots_start_by_hand_in_any_order(kantor: "Kantor") -> None:
 
 def test_a_robot_may_come_late(kantor: "Kantor") -> None:
     """World-sim starts without r5 when its patience ends; r5 joins in and works."""
-    from kantor_protocol.bus import free_endpoint
+    from kantor_protocol.transport.endpoint import free_endpoint
 
     endpoint = free_endpoint()
     world = kantor.start(
@@ -168,8 +168,8 @@ def test_a_robot_may_come_late(kantor: "Kantor") -> None:
     for robot in robots:
         assert robot.wait(timeout=30) == 0
     assert "all rules held" in out, out + err
-    from kantor_worldsim.journal import read
-    from kantor_worldsim.records import Batch
+    from kantor_worldsim.record.journal import read
+    from kantor_worldsim.record.records import Batch
 
     (folder,) = kantor.runs()
     acts = [
@@ -184,7 +184,7 @@ def test_a_robot_may_come_late(kantor: "Kantor") -> None:
 
 def test_ids_and_credentials_are_checked(kantor: "Kantor") -> None:
     """A doubled id, an unknown id, another's credentials, wrong credentials: one line each."""
-    from kantor_protocol.bus import free_endpoint
+    from kantor_protocol.transport.endpoint import free_endpoint
 
     endpoint = free_endpoint()
     world = kantor.start("worldsim", "paper-single", "--listen", endpoint, "--start-after", "60")
@@ -220,7 +220,7 @@ def test_ids_and_credentials_are_checked(kantor: "Kantor") -> None:
 
 def test_tap_prints_the_bus_decoded(kantor: "Kantor") -> None:
     """Poses, weights and radio, as plain msgpack says."""
-    from kantor_protocol.bus import free_endpoint
+    from kantor_protocol.transport.endpoint import free_endpoint
 
     endpoint = free_endpoint()
     world = kantor.start("worldsim", "paper-single", "--listen", endpoint, "--set", "limit_s=40")
@@ -239,7 +239,7 @@ def test_tap_prints_the_bus_decoded(kantor: "Kantor") -> None:
 
 def test_a_second_world_sim_on_the_port_is_refused(kantor: "Kantor") -> None:
     """Exit code 4 and a line that says what to do; no run folder is left."""
-    from kantor_protocol.bus import free_endpoint
+    from kantor_protocol.transport.endpoint import free_endpoint
 
     endpoint = free_endpoint()
     first = kantor.start("worldsim", "paper-single", "--listen", endpoint)

@@ -12,19 +12,18 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
-from kantor_protocol import credentials, keys
-from kantor_protocol.bus import (
-    Flooded,
-    Heard,
-    Host,
-    Joined,
-    Line,
-    free_endpoint,
-    line,
-    watch,
+from kantor_protocol.transport import credentials
+from kantor_protocol.transport.client import (
+    ParticipantSession,
+    observer_session,
+    participant_session,
 )
-from kantor_protocol.quota import BURST_BYTES, BURST_MESSAGES, Quota
-from kantor_protocol.settings import POSE_BYTES_MAX, SHOWN_PER_S
+from kantor_protocol.transport.endpoint import free_endpoint
+from kantor_protocol.transport.events import Flooded, Heard, Joined
+from kantor_protocol.transport.rate_limit import BURST_BYTES, BURST_MESSAGES, RateLimit
+from kantor_protocol.transport.router import HubRouter
+from kantor_protocol.transport.zenoh_config import POSE_BYTES_MAX, SHOWN_PER_S
+from kantor_protocol.wire import keys
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -33,20 +32,20 @@ FLEET, ROSTER = "kantor", ("r1", "r2")
 PATIENCE_S = 20.0
 MESSAGES, LARGE_MESSAGES = 5000, 40
 MIB = 1 << 20
-QUOTA = Quota(100.0, 1e6)
+QUOTA = RateLimit(100.0, 1e6)
 
 
 @contextmanager
-def hosted(folder: Path) -> Iterator[tuple[Host, Line, Line, str]]:
+def hosted(folder: Path) -> Iterator[tuple[HubRouter, ParticipantSession, ParticipantSession, str]]:
     """World-sim's end, two robots' ends, and where it listens."""
     identities = credentials.issue(folder, FLEET, ROSTER)
     endpoint = free_endpoint()
     with ExitStack() as stack:
         users = credentials.users_file(folder)
-        host = stack.enter_context(Host(identities[credentials.HOST], endpoint, users, ROSTER))
+        host = stack.enter_context(HubRouter(identities[credentials.HOST], endpoint, users, ROSTER))
         host.limit(dict.fromkeys(ROSTER, QUOTA))
         robots = [
-            stack.enter_context(line(endpoint, identities[name], name, PATIENCE_S))
+            stack.enter_context(participant_session(endpoint, identities[name], name, PATIENCE_S))
             for name in ROSTER
         ]
         joined = {next_of(host, Joined).name for _ in ROSTER}
@@ -54,14 +53,14 @@ def hosted(folder: Path) -> Iterator[tuple[Host, Line, Line, str]]:
         yield host, robots[0], robots[1], endpoint
 
 
-def next_of(host: Host, kind: type) -> Joined:
+def next_of(host: HubRouter, kind: type) -> Joined:
     """The next event, which is of a kind."""
     event = host.next(PATIENCE_S)
     assert isinstance(event, kind)
     return event  # type: ignore[return-value]
 
 
-def until(host: Host, payload: bytes) -> tuple[list[Heard], list[Flooded]]:
+def until(host: HubRouter, payload: bytes) -> tuple[list[Heard], list[Flooded]]:
     """What comes before a message."""
     heard, flooded = [], []
     while (event := host.next(PATIENCE_S)) is not None:
@@ -113,7 +112,7 @@ def test_what_observers_see_is_limited_by_the_router(tmp_path: Path) -> None:
     """No pose is longer than a pose, and there are no more than can be looked at; others' are untouched."""
     with hosted(tmp_path) as (_, honest, hostile, endpoint):
         observer = credentials.find(tmp_path, credentials.OBSERVER)
-        with watch(endpoint, observer, keys.everything(FLEET), PATIENCE_S) as seen:
+        with observer_session(endpoint, observer, keys.everything(FLEET), PATIENCE_S) as seen:
             start_s = time.monotonic()
             hostile.publish_pose(bytes(POSE_BYTES_MAX + 1))
             for _ in range(MESSAGES):
@@ -151,7 +150,7 @@ def test_a_mission_after_a_flood_is_the_mission_without_it(kantor: "Kantor") -> 
     assert world.stdout is not None
     assert any(text.startswith("t=") for text in world.stdout)
     identity = credentials.find(kantor.folder / "credentials", "r2")
-    with line(endpoint, identity, "flood", PATIENCE_S) as hostile:
+    with participant_session(endpoint, identity, "flood", PATIENCE_S) as hostile:
         assert hostile.next(PATIENCE_S) is not None  # it is let in, and so is heard
         for _ in range(MESSAGES):
             hostile.send(b"flood", patiently=True)

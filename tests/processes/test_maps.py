@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from fleets import await_line, children_named, result_of
+from support.fleets import await_line, children_named, result_of
 
 if TYPE_CHECKING:
     from conftest import Kantor

@@ -13,7 +13,10 @@ from typing import TYPE_CHECKING
 import pytest
 import zenoh
 
-from fleets import (
+from kantor_protocol.transport import zenoh_config
+from kantor_protocol.transport.credentials import Certificate, read
+from kantor_protocol.transport.endpoint import free_endpoint
+from support.fleets import (
     acts_of,
     await_act,
     await_incident,
@@ -22,10 +25,7 @@ from fleets import (
     records_of,
     result_of,
 )
-from intruders import plain_session
-from kantor_protocol import settings
-from kantor_protocol.bus import free_endpoint
-from kantor_protocol.credentials import Certificate, read
+from support.intruders import plain_session
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -81,7 +81,7 @@ class Place:
         """Whoever has somebody's file, and plain Zenoh without any rules of its own."""
         identity = read(self.kantor.folder / "keys" / f"{user}.toml", Certificate)
         assert identity is not None
-        with plain_session(connect, settings.client(identity), mode, listen) as session:
+        with plain_session(connect, zenoh_config.client_config(identity), mode, listen) as session:
             yield session
 
 

@@ -3,8 +3,8 @@
 import signal
 from typing import TYPE_CHECKING
 
-from fleets import await_line, incidents_of, result_of
-from kantor_protocol.bus import free_endpoint
+from kantor_protocol.transport.endpoint import free_endpoint
+from support.fleets import await_line, incidents_of, result_of
 
 if TYPE_CHECKING:
     from conftest import Kantor

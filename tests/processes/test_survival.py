@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING
 import psutil
 import pytest
 
-from fleets import (
+from kantor_protocol.transport.endpoint import free_endpoint
+from kantor_worldsim.record.records import Batch, ProcessEvent
+from support.fleets import (
     acts_of,
     await_act,
     await_incident,
@@ -20,8 +22,6 @@ from fleets import (
     records_of,
     result_of,
 )
-from kantor_protocol.bus import free_endpoint
-from kantor_worldsim.records import Batch, Incident
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -174,7 +174,7 @@ def nothing_happens_between(records: list[object], first: str, last: str, who: s
     """Whether nothing is on record between what stopped a process and what had it go on."""
     inside = False
     for record in records:
-        if isinstance(record, Incident) and record.who == who:
+        if isinstance(record, ProcessEvent) and record.who == who:
             inside = record.what == first or (inside and record.what != last)
         elif isinstance(record, Batch) and inside:
             return False

@@ -3,15 +3,16 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol import access, keys
-from strategies import examples
+from kantor_protocol.transport import acl
+from kantor_protocol.wire import keys
+from support.strategies import examples
 
 FLEET = "f"
 ROSTER = ("r1", "r2", "r3", "r10", "supervisor")
 some_members = st.lists(st.sampled_from(ROSTER), unique=True, min_size=1)
 
 
-def names_in(grants: access.Grants) -> set[str]:
+def names_in(grants: acl.Grants) -> set[str]:
     """Whose keys a subject may use, but for knowing who subscribes."""
     uses = [grant for grant in grants if (grant.flow, grant.message) != HEARS_OF]
     parsed = [keys.parse(key) for grant in uses for key in grant.keys]
@@ -28,25 +29,25 @@ def test_a_site_may_do_what_its_robots_may(members: list[str]) -> None:
     of_robots = {
         (grant.flow, grant.message, key)
         for name in members
-        for grant in access.robot(FLEET, name)
+        for grant in acl.robot(FLEET, name)
         for key in grant.keys
     }
     of_site = {
         (grant.flow, grant.message, key)
-        for grant in access.site(FLEET, members)
+        for grant in acl.site(FLEET, members)
         if (grant.flow, grant.message) != HEARS_OF
         for key in grant.keys
     }
 
     assert of_site == of_robots
-    assert names_in(access.site(FLEET, members)) == set(members)
+    assert names_in(acl.site(FLEET, members)) == set(members)
 
 
 @given(some_members)
 @examples(20)
 def test_what_one_end_of_a_link_lets_out_the_other_lets_in(members: list[str]) -> None:
     """The hub's rules about a site and the site's about the hub are mirror images."""
-    site, hub = access.site(FLEET, members), access.hub(FLEET, members)
+    site, hub = acl.site(FLEET, members), acl.hub(FLEET, members)
 
     assert [grant.mirrored for grant in hub] == list(site)
     assert {(grant.message, grant.keys) for grant in hub} == {
@@ -57,8 +58,8 @@ def test_what_one_end_of_a_link_lets_out_the_other_lets_in(members: list[str]) -
 
 def test_everything_else_is_denied() -> None:
     """Rules have ids of their own, and every rule is somebody's."""
-    control = access.control(
-        [(name, {"usernames": [name]}, access.robot(FLEET, name)) for name in ROSTER]
+    control = acl.control(
+        [(name, {"usernames": [name]}, acl.robot(FLEET, name)) for name in ROSTER]
     )
 
     labels = [rule["id"] for rule in control["rules"]]

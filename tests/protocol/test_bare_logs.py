@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.replica import Replica
-from replicas import entries, read_logs
-from strategies import examples
+from kantor_protocol.replication.replica import Replica
+from support.replicas import entries, read_logs
+from support.strategies import examples
 
 BOUND = 50
 

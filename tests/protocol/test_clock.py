@@ -6,10 +6,11 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from kantor_protocol.clock import clocks
-from kantor_protocol.machine import SUPERVISOR
-from kantor_protocol.scenario import Scenario, ScenarioError
-from strategies import examples, mission
+from kantor_protocol.base.machine import SUPERVISOR
+from kantor_protocol.scenario.clocks import step_clocks
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.schema import Scenario
+from support.strategies import examples, mission
 
 PERIOD_NS = 100_000_000
 
@@ -18,7 +19,7 @@ def timetable(scenario: Scenario, seed: int, steps: int) -> list[tuple[int, str]
     """Everybody's first steps, by time."""
     return sorted(
         (clock.due_ns(step), name)
-        for name, clock in clocks(scenario, seed).items()
+        for name, clock in step_clocks(scenario, seed).items()
         for step in range(1, steps + 1)
     )
 
@@ -48,7 +49,7 @@ def test_time_rises_with_every_step(
         )
     except ScenarioError:
         assume(False)
-    for clock in clocks(scenario, seed).values():
+    for clock in step_clocks(scenario, seed).values():
         dues_ns = [clock.due_ns(step) for step in range(1, 60)]
 
         assert all(before < after for before, after in pairwise([0, *dues_ns]))
@@ -103,7 +104,7 @@ def test_in_turn_the_supervisor_speaks_between_any_two_robots(count: int) -> Non
         "starts.random=true",
         "starts.poses_m=[]",
     )
-    made = clocks(scenario, 1)
+    made = step_clocks(scenario, 1)
     steps = {name: 1000 * count if name == SUPERVISOR else 1000 for name in made}
     due = sorted(
         (clock.due_ns(step), name)
@@ -127,7 +128,7 @@ def test_same_seed_same_clock() -> None:
 def test_spread_and_drift_keep_within_their_bounds() -> None:
     """Periods lie in [1 - spread, 1 + spread] times the nominal one, rates within the drift."""
     scenario = mission("clock.spread=0.2", "clock.drift_ppm=500.0")
-    made = [clock for seed in range(40) for clock in clocks(scenario, seed).values()]
+    made = [clock for seed in range(40) for clock in step_clocks(scenario, seed).values()]
 
     assert all(0.8 * PERIOD_NS <= clock.period_ns <= 1.2 * PERIOD_NS for clock in made)
     assert all(-500 <= clock.drift_ppm <= 500 for clock in made)
@@ -139,7 +140,7 @@ def test_jitter_only_delays() -> None:
     scenario = mission("clock.jitter_s=0.02")
     late_ns = [
         clock.due_ns(step) - step * PERIOD_NS
-        for clock in clocks(scenario, 3).values()
+        for clock in step_clocks(scenario, 3).values()
         for step in range(1, 100)
     ]
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol import credentials
-from kantor_protocol.credentials import Certificate, CredentialsError, Member, Password
-from strategies import examples
+from kantor_protocol.transport import credentials
+from kantor_protocol.transport.credentials import Certificate, CredentialsError, Member, Password
+from support.strategies import examples
 
 NOW = datetime(2026, 11, 23, tzinfo=UTC)
 USERS = ("r1", "r2", "r3", "observer", "supervisor")

@@ -14,11 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.diary import _MAGIC, DiaryFile, _frame, tear
-from kantor_protocol.life import Life, Pages
-from kantor_protocol.machine import Body, Inputs, Observation, Outputs, Pose
-from kantor_protocol.messages import encode
-from strategies import INPUTS, examples
+from kantor_protocol.base.machine import Body, Inputs, Observation, Outputs, Pose
+from kantor_protocol.node.recovery import RecoverableNode, WalContents
+from kantor_protocol.node.wal import _MAGIC, WalFile, _frame, tear
+from kantor_protocol.wire.messages import encode
+from support.strategies import INPUTS, examples
 
 BIRTH = Body(Pose(1.0, 2.0), step=3, energy_spent=2, epoch=1)
 
@@ -33,16 +33,16 @@ PAGES = [page(step) for step in range(3, 9)]
 
 def written(path: Path, pages: list[bytes], run: str = "run") -> None:
     """A diary that somebody left."""
-    diary = DiaryFile(path, run)
+    diary = WalFile(path, run)
     diary.begin(BIRTH)
     for content in pages:
         diary.note(content)
     diary.close()
 
 
-def found(path: Path, run: str = "run") -> Pages | None:
+def found(path: Path, run: str = "run") -> WalContents | None:
     """What whoever comes next finds."""
-    diary = DiaryFile(path, run)
+    diary = WalFile(path, run)
     pages = diary.read()
     diary.close()
     return pages
@@ -55,20 +55,20 @@ def test_what_is_noted_is_read(inputs: list[Inputs]) -> None:
         path = Path(folder) / "r1.diary"
         written(path, [encode(given_) for given_ in inputs])
 
-        assert found(path) == Pages(BIRTH, [encode(given_) for given_ in inputs])
+        assert found(path) == WalContents(BIRTH, [encode(given_) for given_ in inputs])
 
 
 def test_a_diary_is_continued_where_it_ends(tmp_path: Path) -> None:
     path = tmp_path / "r1.diary"
     written(path, PAGES[:2])
-    again = DiaryFile(path, "run")
+    again = WalFile(path, "run")
     again.read()
     again.skew_ns = -7
     again.note(PAGES[2])
     again.close()
 
-    last = DiaryFile(path, "run")
-    assert last.read() == Pages(BIRTH, PAGES[:3])
+    last = WalFile(path, "run")
+    assert last.read() == WalContents(BIRTH, PAGES[:3])
     assert last.skew_ns == -7
 
 
@@ -120,12 +120,12 @@ def test_a_cut_diary_is_continued_after_its_last_sound_page(tmp_path: Path) -> N
     written(path, PAGES[:3])
     with path.open("ab") as file:
         file.truncate(path.stat().st_size - 3)
-    again = DiaryFile(path, "run")
+    again = WalFile(path, "run")
     again.read()
     again.note(PAGES[4])
     again.close()
 
-    assert found(path) == Pages(BIRTH, [*PAGES[:2], PAGES[4]])
+    assert found(path) == WalContents(BIRTH, [*PAGES[:2], PAGES[4]])
 
 
 def test_a_diary_of_another_run_or_of_none_is_nothing(tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_a_diary_of_another_run_or_of_none_is_nothing(tmp_path: Path) -> None:
     written(path, PAGES, run="yesterday's")
     assert found(path) is None
     written(path, PAGES[:1])
-    assert found(path) == Pages(BIRTH, PAGES[:1])
+    assert found(path) == WalContents(BIRTH, PAGES[:1])
     assert [file.name for file in tmp_path.iterdir()] == ["r1.diary"]
 
 
@@ -148,10 +148,10 @@ def test_torn_it_lacks_a_step_and_ends_in_the_middle_of_a_page(
     tear(path, step)
 
     assert (path.stat().st_size == whole) == (left == len(PAGES))
-    assert found(path) == Pages(BIRTH, PAGES[:left])
+    assert found(path) == WalContents(BIRTH, PAGES[:left])
     tear(path, 0)
     tear(path, 0)
-    assert found(path) == Pages(BIRTH, [])
+    assert found(path) == WalContents(BIRTH, [])
 
 
 def found_beside(path: Path) -> list[bytes]:
@@ -177,7 +177,7 @@ def room_for(size: int) -> Iterator[None]:
 def test_a_full_disk_takes_no_page_and_no_half_of_one(tmp_path: Path, spare: int) -> None:
     """The page is refused with an error, and fits when there is room again."""
     path = tmp_path / "r1.diary"
-    diary = DiaryFile(path, "run")
+    diary = WalFile(path, "run")
     diary.begin(BIRTH)
     diary.note(PAGES[0])
     with room_for(path.stat().st_size + spare), pytest.raises(OSError, match="File too large"):
@@ -187,17 +187,17 @@ def test_a_full_disk_takes_no_page_and_no_half_of_one(tmp_path: Path, spare: int
     diary.note(PAGES[2])
     diary.close()
 
-    assert found(path) == Pages(BIRTH, PAGES[:3])
+    assert found(path) == WalContents(BIRTH, PAGES[:3])
 
 
 def test_a_full_disk_keeps_the_old_diary_when_a_new_one_does_not_fit(tmp_path: Path) -> None:
     path = tmp_path / "r1.diary"
     written(path, PAGES[:1])
-    diary = DiaryFile(path, "run")
+    diary = WalFile(path, "run")
     with room_for(20), pytest.raises(OSError, match="File too large"):
         diary.begin(BIRTH)
 
-    assert found(path) == Pages(BIRTH, PAGES[:1])
+    assert found(path) == WalContents(BIRTH, PAGES[:1])
     assert [file.name for file in tmp_path.iterdir()] == ["r1.diary"]
 
 
@@ -214,7 +214,7 @@ class Counter:
 
 def keep_frozen(path: Path, ready: Callable[[], None]) -> None:
     """A predecessor that was stopped in the middle of its life."""
-    life = Life(Counter, DiaryFile(path, "run"), Body(Pose(0.0, 0.0)))
+    life = RecoverableNode(Counter, WalFile(path, "run"), Body(Pose(0.0, 0.0)))
     life.step(Inputs(1, Observation(0, Pose(0.0, 0.0))))
     ready()
     signal.pause()
@@ -230,12 +230,12 @@ def test_two_writers_never_share_a_diary(tmp_path: Path) -> None:
     assert ready.wait(60)
     try:
         body = Body(Pose(0.0, 0.0), step=1)
-        successor = Life(Counter, DiaryFile(path, "run"), body)
+        successor = RecoverableNode(Counter, WalFile(path, "run"), body)
         assert (successor.epoch, successor.step_count) == (1, 1)
         os.kill(frozen.pid or 0, signal.SIGKILL)
         frozen.join()
         successor.step(Inputs(2, Observation(1, Pose(0.0, 0.0))))
-        third = Life(Counter, DiaryFile(path, "run"), body)
+        third = RecoverableNode(Counter, WalFile(path, "run"), body)
         assert (third.epoch, third.step_count) == (1, 1)
     finally:
         frozen.kill()

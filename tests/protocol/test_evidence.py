@@ -7,25 +7,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from grounds import Place, drawn, places
-from kantor_protocol.evidence import (
+from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN, next_cell
+from kantor_protocol.base.machine import Pose
+from kantor_protocol.replication.occupancy_log import (
     CERTAIN,
     CODES,
     HIT,
     NO_RETURN,
     PASS,
     RANGE_BINS,
-    Evidence,
+    OccupancyLog,
     beam_rad,
+    dead_frontier,
     entries,
-    void,
 )
-from kantor_protocol.grid import FREE, OCCUPIED, UNKNOWN, next_cell
-from kantor_protocol.machine import Pose
-from kantor_protocol.scenario import Sensor
-from kantor_worldsim.maps import Ground
-from kantor_worldsim.sensors import RangeFinder
-from strategies import examples
+from kantor_protocol.scenario.schema import SensorOptions
+from kantor_worldsim.world.maps import Ground
+from kantor_worldsim.world.sensors import RangeFinder
+from support.grounds import Place, drawn, places
+from support.strategies import examples
 
 BEAMS = st.sampled_from([1, 4, 8, 24, 360]) | st.integers(1, 400)
 VIEWS_DEG = st.sampled_from([360.0, 360.0, 180.0, 90.0]) | st.floats(1.0, 360.0)
@@ -38,9 +38,9 @@ def sensor_of(
     beams: int = 360,
     view_deg: float = 360.0,
     noise_cells: float = 0.0,
-) -> Sensor:
+) -> SensorOptions:
     side_m = ground.frame.resolution_m
-    return Sensor(
+    return SensorOptions(
         range_m=range_cells * side_m,
         beams=beams,
         field_of_view_deg=view_deg,
@@ -48,10 +48,10 @@ def sensor_of(
     )
 
 
-def scanned(ground: Ground, sensor: Sensor, *poses: Pose) -> Evidence:
+def scanned(ground: Ground, sensor: SensorOptions, *poses: Pose) -> OccupancyLog:
     """What a robot concludes from one scan at each pose."""
     finder = RangeFinder(sensor, ground, 1)
-    evidence = Evidence(ground.frame, sensor, ranges=False)
+    evidence = OccupancyLog(ground.frame, sensor, ranges=False)
     for step, pose in enumerate(poses):
         evidence.take(finder.scan(0, step, pose), pose, moved=True)
     return evidence
@@ -187,7 +187,7 @@ def test_scan_says_what_its_beams_say_in_sum(hits: int, passes: int, evidence: i
     ground = drawn("........")
     beams = hits * [round(3 / 8 * CODES)] + passes * [NO_RETURN]
     sensor = sensor_of(ground, 8.0, len(beams), 1.0)
-    evidences = [Evidence(ground.frame, sensor, ranges=False) for _ in range(2)]
+    evidences = [OccupancyLog(ground.frame, sensor, ranges=False) for _ in range(2)]
     for times in (1, 2):
         for layer, scan in zip(evidences, (beams, beams[::-1]), strict=True):
             layer.take(codes(*scan), Pose(0.0, 0.5), moved=True)
@@ -200,7 +200,7 @@ def test_later_evidence_turns_a_cell() -> None:
     """A wall that is gone becomes free once more evidence speaks against it than for it."""
     ground = drawn("....")
     sensor = sensor_of(ground, 4.0, 1)
-    evidence = Evidence(ground.frame, sensor, ranges=False)
+    evidence = OccupancyLog(ground.frame, sensor, ranges=False)
     pose, cell = Pose(0.5, 0.5), 2
     told = [evidence.take(codes(round(1.5 / 4.0 * CODES)), pose, moved=True).tolist()]
     told += [evidence.take(codes(NO_RETURN), pose, moved=True).tolist() for _ in range(3)]
@@ -217,7 +217,7 @@ def test_entries_are_the_changes_of_kind(place: Place, data: st.DataObject) -> N
     """Rising, each cell at most once, and together they are the layer."""
     ground, pose = place
     sensor = sensor_of(ground, 6.0, 24)
-    evidence = Evidence(ground.frame, sensor, ranges=False)
+    evidence = OccupancyLog(ground.frame, sensor, ranges=False)
     told = np.zeros(ground.frame.cells, dtype=np.uint8)
     scans = data.draw(
         st.lists(st.lists(st.integers(0, NO_RETURN), min_size=24, max_size=24), max_size=6)
@@ -239,21 +239,21 @@ def test_ranges_are_told_after_a_move_only() -> None:
     """A few of each scan, in bins; what found nothing is in the last bin."""
     ground = drawn("..#")
     sensor = sensor_of(ground, 4.0, 16, 1.0)
-    evidence = Evidence(ground.frame, sensor, ranges=True)
+    evidence = OccupancyLog(ground.frame, sensor, ranges=True)
     near, none = codes(*16 * [round(1.5 / 4.0 * CODES)]), codes(*16 * [NO_RETURN])
     first, base = 3 * ground.frame.cells, RANGE_BINS
 
     assert evidence.take(near, Pose(0.5, 0.5), moved=True)[-4:].tolist() == 4 * [first + 11]
     assert evidence.take(near, Pose(0.5, 0.5), moved=False).tolist() == []
     assert (evidence.take(none, Pose(0.5, 0.5), moved=True)[-4:] == first + base - 1).all()
-    assert void(ground.frame, 2) < first < entries(ground.frame) == first + base
+    assert dead_frontier(ground.frame, 2) < first < entries(ground.frame) == first + base
 
 
 @pytest.mark.parametrize("scan", [b"", b"\0", 719 * b"\0", 722 * b"\0"])
 def test_scan_of_another_size_is_void(scan: bytes) -> None:
     """It changes nothing."""
     ground = drawn("...")
-    evidence = Evidence(ground.frame, sensor_of(ground, 4.0), ranges=True)
+    evidence = OccupancyLog(ground.frame, sensor_of(ground, 4.0), ranges=True)
 
     assert evidence.take(scan, Pose(0.5, 0.5), moved=True).size == 0
     assert not evidence.odds.any()
@@ -271,7 +271,7 @@ def test_from_outside_a_scan_says_nothing(
 ) -> None:
     """A pose that is not on the map adds no evidence, however absurd it is."""
     ground = drawn("...", "...")
-    evidence = Evidence(ground.frame, sensor_of(ground, 4.0, 8, 360.0, noise), ranges=False)
+    evidence = OccupancyLog(ground.frame, sensor_of(ground, 4.0, 8, 360.0, noise), ranges=False)
     evidence.take(codes(*scan), Pose(x_m, y_m), moved=True)
     inside = 0.0 <= x_m < 3.0 and 0.0 <= y_m < 2.0
 

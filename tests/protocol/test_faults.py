@@ -9,18 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from grounds import exploration
-from kantor_protocol.faults import KINDS, OneWay, Partition
-from kantor_protocol.scenario import (
-    Scenario,
-    ScenarioError,
-    from_tree,
-    parse,
-    to_toml,
-    to_tree,
-    with_chaos,
-)
-from strategies import SMALL, TOML_KEYS, TOML_VALUES, examples, mission, paths_of, planted
+from kantor_protocol.scenario.dump import to_toml, to_tree
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.faults.links import OneWay, Partition
+from kantor_protocol.scenario.faults.schedule import KINDS
+from kantor_protocol.scenario.load import from_tree, parse, with_chaos
+from kantor_protocol.scenario.schema import Scenario
+from support.grounds import exploration
+from support.strategies import SMALL, TOML_KEYS, TOML_VALUES, examples, mission, paths_of, planted
 
 EVERY_KIND = """
 [[faults]]

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from grounds import Place, drawn, places
-from kantor_protocol.grid import FREE, NOWHERE, Frame, free_way
-from strategies import examples
+from kantor_protocol.base.grid import FREE, NOWHERE, Frame, free_way
+from support.grounds import Place, drawn, places
+from support.strategies import examples
 
 
 def test_cells_are_counted_from_the_lower_left() -> None:

@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+import replicas
 from hypothesis import given
 from hypothesis import strategies as st
 
-import replicas
-from kantor_protocol.registers import Registers, read_register
-from kantor_protocol.replica import NOBODY, Replica, read_have, spend
-from kantor_protocol.slots import EPOCHS_MAX, known_to, slots_told
-from kantor_protocol.weights import Units
-from strategies import examples
+from kantor_protocol.base.incarnations import EPOCHS_MAX, known_to
+from kantor_protocol.replication.registers import Registers, read_register
+from kantor_protocol.replication.replica import Replica, read_have
+from kantor_protocol.replication.replica_kernels import NOBODY, spend
+from kantor_protocol.wire.version_vector import slots_told
+from kantor_protocol.wire.weights import Units
+from support.strategies import examples
 
 N = 6
 UNITS = Units.of(8, N)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from kantor_protocol.keyed import Purpose, generator, philox, to_unit, uniform
-from plain_philox import philox_plain
-from strategies import SEEDS, WORDS, examples
+from kantor_protocol.base.counter_rng import Purpose, generator, philox, to_unit, uniform
+from support.plain_philox import philox_plain
+from support.strategies import SEEDS, WORDS, examples
 
 Words = tuple[int, int, int, int]
 

@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from kantor_protocol.faults import Disk
-from kantor_protocol.life import Life, Memory, Mortal
-from kantor_protocol.machine import Body, Inputs, Observation, Outputs, Pose
-from kantor_protocol.messages import encode
-from strategies import examples
+from kantor_protocol.base.machine import Body, Inputs, Observation, Outputs, Pose
+from kantor_protocol.node.recovery import InMemoryLog, KillableNode, RecoverableNode
+from kantor_protocol.scenario.faults.processes import Disk
+from kantor_protocol.wire.messages import encode
+from support.strategies import examples
 
 HOME = Body(Pose(1.0, 2.0))
 
@@ -34,7 +34,9 @@ def turn(step: int, now_ns: int) -> Inputs:
     return Inputs(now_ns, Observation(step, Pose(0.0, 0.0)))
 
 
-def told(machine: Rememberer | Life | Mortal, times_ns: Sequence[int], step: int = 0) -> list[int]:
+def told(
+    machine: Rememberer | RecoverableNode | KillableNode, times_ns: Sequence[int], step: int = 0
+) -> list[int]:
     """What comes of turns at these times, after so many steps."""
     return [machine.step(turn(step + i, now_ns)).refused for i, now_ns in enumerate(times_ns)]
 
@@ -51,9 +53,9 @@ TIMES = st.lists(st.integers(1, 10**6), min_size=1, max_size=8)
 @given(before=TIMES, after=TIMES)
 def test_who_has_the_diary_has_the_machine(before: list[int], after: list[int]) -> None:
     """Built anew from its diary it goes on as if nothing had been."""
-    diary = Memory()
-    first = told(Life(Rememberer, diary, HOME), before)
-    again = Life(Rememberer, diary, at(len(before)))
+    diary = InMemoryLog()
+    first = told(RecoverableNode(Rememberer, diary, HOME), before)
+    again = RecoverableNode(Rememberer, diary, at(len(before)))
 
     assert (again.epoch, again.step_count) == (0, len(before))
     assert first + told(again, after, len(before)) == told(Rememberer(HOME), before + after)
@@ -63,12 +65,12 @@ def test_who_has_the_diary_has_the_machine(before: list[int], after: list[int]) 
 @given(times_ns=TIMES, again=st.integers(0, 3))
 def test_step_is_done_once(times_ns: list[int], again: int) -> None:
     """Asked again for its last step it answers from memory, before its death and after."""
-    diary = Memory()
-    life = Life(Rememberer, diary, HOME)
+    diary = InMemoryLog()
+    life = RecoverableNode(Rememberer, diary, HOME)
     last = turn(len(times_ns) - 1, times_ns[-1])
     first = told(life, times_ns)
     answers = [life.step(last).refused for _ in range(again)]
-    reborn = Life(Rememberer, diary, at(len(times_ns) - 1))
+    reborn = RecoverableNode(Rememberer, diary, at(len(times_ns) - 1))
 
     assert answers == [first[-1]] * again
     assert reborn.step(last).refused == first[-1]
@@ -81,8 +83,8 @@ def test_step_is_done_once(times_ns: list[int], again: int) -> None:
 @given(times_ns=TIMES)
 def test_encoded_turns_are_turns(times_ns: list[int]) -> None:
     """What comes encoded is noted as it came, and answered like any turn; also when it comes again."""
-    diary = Memory()
-    life = Life(Rememberer, diary, HOME)
+    diary = InMemoryLog()
+    life = RecoverableNode(Rememberer, diary, HOME)
     pages = [encode(turn(i, now_ns)) for i, now_ns in enumerate(times_ns)]
     answers = [life.take(page).refused for page in (*pages, pages[-1])]
     read = diary.read()
@@ -92,7 +94,7 @@ def test_encoded_turns_are_turns(times_ns: list[int]) -> None:
     assert list(read.inputs) == pages
 
 
-class FullDisk(Memory):
+class FullDisk(InMemoryLog):
     """A diary that cannot be written at times."""
 
     full = False
@@ -106,7 +108,7 @@ class FullDisk(Memory):
 def test_what_cannot_be_noted_is_not_done() -> None:
     """On a full disk the machine stands still; when there is room again it goes on where it was."""
     diary = FullDisk()
-    life = Life(Rememberer, diary, HOME)
+    life = RecoverableNode(Rememberer, diary, HOME)
     before = told(life, [1, 2])
     diary.full = True
     with pytest.raises(OSError, match="full"):
@@ -117,42 +119,44 @@ def test_what_cannot_be_noted_is_not_done() -> None:
     assert before + told(life, [4], 2) == told(Rememberer(HOME), [1, 2, 4])
 
 
-def torn(diary: Memory) -> None:
+def torn(diary: InMemoryLog) -> None:
     diary.damage("torn", 3)
 
 
-def lost(diary: Memory) -> None:
+def lost(diary: InMemoryLog) -> None:
     diary.damage("lost", 3)
 
 
 @pytest.mark.parametrize("damage", [torn, lost])
-def test_who_lacks_a_step_that_others_know_of_is_another(damage: Callable[[Memory], None]) -> None:
+def test_who_lacks_a_step_that_others_know_of_is_another(
+    damage: Callable[[InMemoryLog], None],
+) -> None:
     """It knows what the world tells of the body, and nothing else."""
-    diary = Memory()
-    told(Life(Rememberer, diary, HOME), [1, 2, 3])
+    diary = InMemoryLog()
+    told(RecoverableNode(Rememberer, diary, HOME), [1, 2, 3])
     damage(diary)
-    reborn = Life(Rememberer, diary, at(3))
+    reborn = RecoverableNode(Rememberer, diary, at(3))
 
     assert (reborn.epoch, reborn.step_count, reborn.unheard) == (1, 3, None)
     assert told(reborn, [4, 5], 3) == told(Rememberer(at(3, epoch=1)), [4, 5], 3)
 
 
 @pytest.mark.parametrize("damage", [torn, lost])
-def test_who_never_acted_stays_the_same(damage: Callable[[Memory], None]) -> None:
+def test_who_never_acted_stays_the_same(damage: Callable[[InMemoryLog], None]) -> None:
     """Nobody can hold anything of it."""
-    diary = Memory()
-    Life(Rememberer, diary, HOME)
+    diary = InMemoryLog()
+    RecoverableNode(Rememberer, diary, HOME)
     damage(diary)
 
-    assert Life(Rememberer, diary, HOME).epoch == 0
+    assert RecoverableNode(Rememberer, diary, HOME).epoch == 0
 
 
 def test_diary_of_another_incarnation_is_no_use() -> None:
     """A process that comes back after another took its body over must not write on in its old log."""
-    diary = Memory()
-    told(Life(Rememberer, diary, HOME), [1, 2, 3, 4])
+    diary = InMemoryLog()
+    told(RecoverableNode(Rememberer, diary, HOME), [1, 2, 3, 4])
 
-    assert Life(Rememberer, diary, at(3, epoch=2)).epoch == 3
+    assert RecoverableNode(Rememberer, diary, at(3, epoch=2)).epoch == 3
 
 
 DISKS: st.SearchStrategy[Disk] = st.sampled_from(["kept", "torn", "lost"])
@@ -169,7 +173,7 @@ def test_nothing_is_lost_and_nothing_is_twice(orders: list[tuple[str, Disk, int]
 
     An incarnation is the machine that took over the body as the world knew it, and knows what it told.
     """
-    mortal = Mortal(Rememberer, HOME)
+    mortal = KillableNode(Rememberer, HOME)
     birth, body = HOME, HOME
     times_ns: list[int] = []
     for order, disk, now_ns in orders:

@@ -11,34 +11,34 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.grid import Frame
-from kantor_protocol.machine import Body, Envelope, Inputs, Observation, Outputs, Pose, State
-from kantor_protocol.messages import (
+from kantor_protocol.base.grid import Frame
+from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Outputs, Pose, State
+from kantor_protocol.wire.messages import (
     BODY_BYTES_MAX,
     MESSAGE_BYTES_MAX,
     VERSION,
     Array,
-    Go,
+    GossipMessage,
     Mission,
-    News,
     PoseMessage,
     Progress,
     Ready,
     Refusal,
     RefusedError,
     Report,
+    StartClock,
+    StepRequest,
     Stop,
-    Turn,
     check_outputs,
     decode_from_participant,
+    decode_gossip,
     decode_inputs,
-    decode_news,
     decode_progress,
     decode_to_participant,
     encode,
-    encode_news,
+    encode_gossip,
 )
-from strategies import (
+from support.strategies import (
     COUNTS,
     FINITE,
     INPUTS,
@@ -80,8 +80,8 @@ TO_PARTICIPANT = st.one_of(
         body=st.builds(Body, pose=POSES, step=COUNTS, energy_spent=COUNTS, epoch=COUNTS),
     ),
     st.builds(Refusal, version=V, nonce=NAMES, reason=NAMES),
-    st.builds(Go, version=V, nonce=NAMES, now_ns=COUNTS, speed=FINITE),
-    st.builds(Turn, version=V, inputs=INPUTS),
+    st.builds(StartClock, version=V, nonce=NAMES, now_ns=COUNTS, speed=FINITE),
+    st.builds(StepRequest, version=V, inputs=INPUTS),
     st.builds(Stop, version=V, reason=NAMES),
 )
 POSE_MESSAGES = st.builds(PoseMessage, version=V, step=COUNTS, now_ns=COUNTS, pose=POSES)
@@ -102,7 +102,7 @@ PROGRESS = st.builds(
     robots=COUNTS,
 )
 
-GOLDEN_NEWS = News(
+GOLDEN_NEWS = GossipMessage(
     version=1,
     step=7,
     x_m=1.5,
@@ -142,10 +142,10 @@ GOLDEN_REPORT_BYTES = bytes.fromhex(
 
 @examples(60)
 @given(news=NEWS)
-def test_news_comes_back_as_it_was(news: News) -> None:
+def test_news_comes_back_as_it_was(news: GossipMessage) -> None:
     """What one participant tells another survives the radio."""
-    assert decode_news(encode_news(news)) == news
-    assert decode_news(encode(news)) == news
+    assert decode_gossip(encode_gossip(news)) == news
+    assert decode_gossip(encode(news)) == news
 
 
 @examples(60)
@@ -158,7 +158,7 @@ def test_word_of_a_participant_comes_back_as_it_was(message: Report | Ready) -> 
 @examples(60)
 @given(message=TO_PARTICIPANT)
 def test_word_to_a_participant_comes_back_as_it_was(
-    message: Mission | Refusal | Go | Turn | Stop,
+    message: Mission | Refusal | StartClock | StepRequest | Stop,
 ) -> None:
     """On `<id>/rx`: Mission, Refusal, Go, Turn and Stop."""
     assert decode_to_participant(encode(message)) == message
@@ -181,14 +181,14 @@ def test_inputs_come_back_as_they_were(inputs: Inputs) -> None:
 
 @examples(60)
 @given(news=NEWS)
-def test_independent_decoder_reads_news(news: News) -> None:
+def test_independent_decoder_reads_news(news: GossipMessage) -> None:
     """A record is a msgpack array: tag, version, fields in order. `msgpack` knows nothing more."""
     fields = [news.step, news.x_m, news.y_m, news.have, news.logs, news.claims]
     further = [news.registers, news.epoch]
     while further and not further[-1]:
         further.pop()
 
-    assert msgpack.unpackb(encode_news(news)) == [1, VERSION, *fields, *further]
+    assert msgpack.unpackb(encode_gossip(news)) == [1, VERSION, *fields, *further]
     assert msgpack.unpackb(encode(news)) == [1, VERSION, *fields, news.registers, news.epoch]
 
 
@@ -204,22 +204,33 @@ def test_independent_decoder_reads_every_message(message: msgspec.Struct) -> Non
 
 def test_no_two_messages_share_a_tag() -> None:
     """A tag says what a message is, on any key."""
-    kinds = (News, Mission, Refusal, Go, Turn, Report, Ready, Stop, PoseMessage, Progress)
+    kinds = (
+        GossipMessage,
+        Mission,
+        Refusal,
+        StartClock,
+        StepRequest,
+        Report,
+        Ready,
+        Stop,
+        PoseMessage,
+        Progress,
+    )
 
     assert len({kind.__struct_config__.tag for kind in kinds}) == len(kinds)
 
 
 def test_news_has_not_drifted() -> None:
     """The golden bytes of a News, both ways."""
-    assert encode_news(GOLDEN_NEWS) == GOLDEN_NEWS_BYTES
-    assert decode_news(GOLDEN_NEWS_BYTES) == GOLDEN_NEWS
+    assert encode_gossip(GOLDEN_NEWS) == GOLDEN_NEWS_BYTES
+    assert decode_gossip(GOLDEN_NEWS_BYTES) == GOLDEN_NEWS
 
 
 def test_registers_come_last() -> None:
     """Add-only: to a message without them the field is appended, to an array of nine items."""
     said = msgspec.structs.replace(GOLDEN_NEWS, registers=b"\x01\x02")
 
-    assert encode_news(said) == b"\x99" + GOLDEN_NEWS_BYTES[1:] + b"\xc4\x02\x01\x02"
+    assert encode_gossip(said) == b"\x99" + GOLDEN_NEWS_BYTES[1:] + b"\xc4\x02\x01\x02"
 
 
 def test_report_has_not_drifted() -> None:
@@ -242,7 +253,7 @@ def test_another_version_is_refused(version: int) -> None:
     ready = msgpack.packb([7, version, "n"])
     stop = msgpack.packb([8, version, "over"])
     for decode, payload in (
-        (decode_news, news),
+        (decode_gossip, news),
         (decode_from_participant, ready),
         (decode_to_participant, stop),
     ):
@@ -252,9 +263,11 @@ def test_another_version_is_refused(version: int) -> None:
 
 @examples(60)
 @given(news=NEWS, more=st.lists(st.none() | COUNTS | st.text(max_size=5), min_size=1, max_size=3))
-def test_further_fields_of_news_are_ignored(news: News, more: list[int | str | None]) -> None:
+def test_further_fields_of_news_are_ignored(
+    news: GossipMessage, more: list[int | str | None]
+) -> None:
     """Add-only: a newer sender may append fields that this reader does not know."""
-    assert decode_news(msgpack.packb([*msgpack.unpackb(encode(news)), *more])) == news
+    assert decode_gossip(msgpack.packb([*msgpack.unpackb(encode(news)), *more])) == news
 
 
 @examples(60)
@@ -303,13 +316,13 @@ def test_outputs_with_a_number_that_is_none_are_refused(number: float, slot: int
 def test_news_from_nowhere_is_refused(number: float, axis: str) -> None:
     """The place of a speaker is finite."""
     with pytest.raises(RefusedError, match="finite"):
-        decode_news(encode(msgspec.structs.replace(GOLDEN_NEWS, **{axis: number})))
+        decode_gossip(encode(msgspec.structs.replace(GOLDEN_NEWS, **{axis: number})))
 
 
 def test_news_from_before_the_start_is_refused() -> None:
     """Steps count upwards from 0."""
     with pytest.raises(RefusedError):
-        decode_news(encode(msgspec.structs.replace(GOLDEN_NEWS, step=-1)))
+        decode_gossip(encode(msgspec.structs.replace(GOLDEN_NEWS, step=-1)))
 
 
 @pytest.mark.parametrize("count", [-1, 2**63, 2**64 - 1])
@@ -334,10 +347,10 @@ def test_longest_body_is_taken_and_a_longer_one_refused() -> None:
     pose = Pose(0.0, 0.0)
 
     assert len(fits) == BODY_BYTES_MAX
-    assert decode_news(fits).step == 7
+    assert decode_gossip(fits).step == 7
     check_outputs(Outputs(step=1, pose=pose, outbox=(Envelope("r1", 1, "", fits),)))
     with pytest.raises(RefusedError, match="bytes"):
-        decode_news(longer)
+        decode_gossip(longer)
     with pytest.raises(RefusedError, match="oversized"):
         check_outputs(Outputs(step=1, pose=pose, outbox=(Envelope("r1", 1, "", longer),)))
 
@@ -349,7 +362,7 @@ def test_oversized_message_is_refused() -> None:
 
 
 DOORS = (
-    decode_news,
+    decode_gossip,
     decode_from_participant,
     decode_to_participant,
     decode_progress,
@@ -405,7 +418,7 @@ def test_deep_nesting_is_refused(level: bytes) -> None:
         with pytest.raises(RefusedError):
             decode(deep)
     with pytest.raises(RefusedError):
-        decode_news(further)
+        decode_gossip(further)
 
 
 @pytest.mark.parametrize(
@@ -417,7 +430,7 @@ def test_length_that_does_not_follow_is_refused(head: bytes) -> None:
         with pytest.raises(RefusedError):
             decode(head)
     with pytest.raises(RefusedError):
-        decode_news(b"\x98\x01\x01\x07" + head)
+        decode_gossip(b"\x98\x01\x01\x07" + head)
 
 
 @pytest.mark.parametrize("dtype", ["<f8", ">f8", "<i4", ">i4", "|u1", "<i8"])
@@ -483,11 +496,11 @@ def test_any_array_opens_or_is_refused(dtype: str, shape: tuple[int, ...], conte
 def test_turn_carries_the_inbox_in_order_of_arrival() -> None:
     """What a participant is given is a value, down to the order of its inbox."""
     inbox = (Envelope("r2", 4, "", b"b"), Envelope("r3", 4, "r1", b"c"))
-    turn = Turn(VERSION, Inputs(1, Observation(0, Pose(0.0, 0.0), (3, 5)), inbox))
+    turn = StepRequest(VERSION, Inputs(1, Observation(0, Pose(0.0, 0.0), (3, 5)), inbox))
 
     assert decode_to_participant(encode(turn)) == turn
 
 
 if __name__ == "__main__":
-    print(encode_news(GOLDEN_NEWS).hex())  # noqa: T201  to be pasted above
+    print(encode_gossip(GOLDEN_NEWS).hex())  # noqa: T201  to be pasted above
     print(encode(GOLDEN_REPORT).hex())  # noqa: T201

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.packing import (
+from kantor_protocol.base.varint import (
     MALFORMED,
     Pairs,
     put_int,
@@ -14,7 +14,7 @@ from kantor_protocol.packing import (
     take_int,
     take_uint,
 )
-from strategies import COUNTS, examples
+from support.strategies import COUNTS, examples
 
 BOUND = 5000
 SIGNED = st.integers(-(2**62), 2**62 - 1)

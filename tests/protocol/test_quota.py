@@ -3,11 +3,18 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.clock import clocks
-from kantor_protocol.messages import MESSAGE_BYTES_MAX
-from kantor_protocol.quota import BURST_BYTES, BURST_MESSAGES, Bucket, Excess, Quota, quotas
-from kantor_protocol.scenario import parse
-from strategies import examples
+from kantor_protocol.scenario.clocks import step_clocks
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.transport.rate_limit import (
+    BURST_BYTES,
+    BURST_MESSAGES,
+    Excess,
+    RateLimit,
+    TokenBucket,
+    rate_limits,
+)
+from kantor_protocol.wire.messages import MESSAGE_BYTES_MAX
+from support.strategies import examples
 
 SIZES = st.integers(0, 2 * MESSAGE_BYTES_MAX)
 PAUSES_S = st.floats(0.0, 2.0)
@@ -30,8 +37,8 @@ def test_whatever_is_said_no_more_is_taken_than_was_asked_for_and_earned(
     steps_per_s: float, said: list[tuple[float, int, bool]]
 ) -> None:
     """Messages and bytes are within the quota at any time, and what is not taken is counted."""
-    quota = Quota.of(steps_per_s)
-    bucket = Bucket(quota)
+    quota = RateLimit.of(steps_per_s)
+    bucket = TokenBucket(quota)
     now_s = 0.0
     asked = taken = taken_bytes = 0
     excess = Excess(0, 0)
@@ -55,7 +62,7 @@ def test_whatever_is_said_no_more_is_taken_than_was_asked_for_and_earned(
 @given(st.lists(st.integers(0, MESSAGE_BYTES_MAX), max_size=2000), st.integers(0, 5000))
 def test_an_answer_is_always_taken(sizes: list[int], flood: int) -> None:
     """Turn by turn, however fast turns follow each other, and whatever was said before."""
-    bucket = Bucket(Quota.of(0.0))
+    bucket = TokenBucket(RateLimit.of(0.0))
     for _ in range(flood):
         bucket.take(MESSAGE_BYTES_MAX, 0.0)
     for size in sizes:
@@ -68,7 +75,7 @@ def test_an_answer_is_always_taken(sizes: list[int], flood: int) -> None:
 def test_a_sound_robot_is_within_its_quota(speed: float, frozen_s: list[float]) -> None:
     """It steps by its clock and says what is not heard again; frozen worlds find all of that at once."""
     period_s = 0.1 / speed
-    bucket = Bucket(Quota.of(1.0 / period_s))
+    bucket = TokenBucket(RateLimit.of(1.0 / period_s))
     now_s = 0.0
     for freeze_s in [*frozen_s, 0.0]:
         for _ in range(500):
@@ -81,10 +88,10 @@ def test_a_sound_robot_is_within_its_quota(speed: float, frozen_s: list[float]) 
 def test_a_quota_follows_from_the_mission() -> None:
     """Who steps oftener may say more; who is asked for each step has that from being asked."""
     scenario = parse(SCENARIO, "test")
-    wall = quotas(clocks(scenario, 0), "wall", 2.0)
-    turns = quotas(clocks(scenario, 0), "lockstep", 2.0)
+    wall = rate_limits(step_clocks(scenario, 0), "wall", 2.0)
+    turns = rate_limits(step_clocks(scenario, 0), "lockstep", 2.0)
 
     assert list(wall) == list(scenario.roster)
-    assert wall["r1"] == Quota.of(4.0)
-    assert wall["supervisor"] == Quota.of(16.0)
-    assert set(turns.values()) == {Quota.of(0.0)}
+    assert wall["r1"] == RateLimit.of(4.0)
+    assert wall["supervisor"] == RateLimit.of(16.0)
+    assert set(turns.values()) == {RateLimit.of(0.0)}

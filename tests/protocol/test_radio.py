@@ -2,19 +2,19 @@
 
 import pytest
 
-from kantor_protocol.machine import SUPERVISOR, Envelope, Pose
-from kantor_protocol.messages import News, decode_news, encode
-from kantor_protocol.radio import Radio, patience_steps, replica_of
-from kantor_protocol.weights import Units
-from strategies import mission
+from kantor_protocol.base.machine import SUPERVISOR, Envelope, Pose
+from kantor_protocol.replication.gossip import Gossip, ack_timeout_steps, build_replica
+from kantor_protocol.wire.messages import GossipMessage, decode_gossip, encode
+from kantor_protocol.wire.weights import Units
+from support.strategies import mission
 
 TEAM = mission()
-SOUND = encode(News(version=1, step=1, x_m=0.0, y_m=0.0, have=b"", logs=b"", claims=b""))
+SOUND = encode(GossipMessage(version=1, step=1, x_m=0.0, y_m=0.0, have=b"", logs=b"", claims=b""))
 
 
 def heard(*envelopes: Envelope, taken: bool = True) -> tuple[list[int], int]:
     """Which places in the roster r2 learns from, and how many envelopes it refuses."""
-    radio = Radio("r2", TEAM)
+    radio = Gossip("r2", TEAM)
     places: list[int] = []
 
     def learn(source: int, *_parts: bytes) -> bool:
@@ -59,11 +59,13 @@ def test_word_carries_what_the_replica_composes(coordination: str) -> None:
     scenario = mission(f"coordination={coordination}")
     target = SUPERVISOR if scenario.centralized else ""
     units = Units.of(30, 12)
-    envelope = Radio("r2", scenario).say(replica_of("r2", scenario, units, 12), 7, Pose(1.0, 2.0))
-    have, logs, claims = replica_of("r2", scenario, units, 12).compose()
+    envelope = Gossip("r2", scenario).say(
+        build_replica("r2", scenario, units, 12), 7, Pose(1.0, 2.0)
+    )
+    have, logs, claims = build_replica("r2", scenario, units, 12).compose()
 
     assert envelope == Envelope("r2", 7, target, envelope.body)
-    assert decode_news(envelope.body) == News(1, 7, 1.0, 2.0, have, logs, claims)
+    assert decode_gossip(envelope.body) == GossipMessage(1, 7, 1.0, 2.0, have, logs, claims)
 
 
 def test_word_carries_registers_where_the_planner_has_them() -> None:
@@ -72,17 +74,17 @@ def test_word_carries_registers_where_the_planner_has_them() -> None:
         scenario = mission("coordination=centralized", *overrides)
         units = Units.of(30, 12)
         for name in scenario.roster:
-            held = replica_of(name, scenario, units, 12)
-            word = Radio(name, scenario).say(held, 1, Pose(1.0, 2.0))
+            held = build_replica(name, scenario, units, 12)
+            word = Gossip(name, scenario).say(held, 1, Pose(1.0, 2.0))
 
             assert held.registers.values.shape == (4, width)
-            assert decode_news(word.body).registers == bytes(4 if width else 0)
+            assert decode_gossip(word.body).registers == bytes(4 if width else 0)
 
 
 def test_unsound_registers_are_refused_with_all_that_came_with_them() -> None:
     """A message is taken in whole or not at all, whichever part is broken."""
     units = Units.of(30, 12)
-    held = replica_of("r1", mission("planner=spectral", "planner.modes=1"), units, 12)
+    held = build_replica("r1", mission("planner=spectral", "planner.modes=1"), units, 12)
     logs = bytes([1, 0, 1, 1, 2 * 3, 2])
     register = bytes([0, 1, 0, 1, 1, 1, 2 * 9])
 
@@ -105,7 +107,7 @@ def test_replica_follows_the_mission(
     *, name: str, overrides: tuple[str, ...], merges: str, relays: bool, beacons: bool
 ) -> None:
     """Merge rule and beacon are the mission's; only the supervisor forwards at once."""
-    manner = replica_of(name, mission(*overrides), Units.of(30, 12), 12).manner
+    manner = build_replica(name, mission(*overrides), Units.of(30, 12), 12).manner
 
     assert manner.ledger == (merges == "ledger")
     assert (manner.relay, manner.beacon) == (relays, beacons)
@@ -127,4 +129,4 @@ def test_answer_is_due_after_both_ways_and_the_others_next_step(
     name: str, overrides: tuple[str, ...], steps: int
 ) -> None:
     """Patience is counted in own steps; the supervisor's are shorter when robots act in turn."""
-    assert patience_steps(name, mission(*overrides)) == steps
+    assert ack_timeout_steps(name, mission(*overrides)) == steps

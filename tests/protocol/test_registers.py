@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.registers import NUMBER_MAX, STAMP_MAX, Registers, read_register
-from strategies import examples
+from kantor_protocol.replication.registers import NUMBER_MAX, STAMP_MAX, Registers, read_register
+from support.strategies import examples
 
 WIDTH = 3
 

@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import replicas
 from hypothesis import given
 from hypothesis import strategies as st
 
-import replicas
-from kantor_protocol.replica import KNOWN_MAX, NOBODY, Replica, spend
-from kantor_protocol.weights import Units
-from strategies import examples
+from kantor_protocol.replication.replica import Replica
+from kantor_protocol.replication.replica_kernels import KNOWN_MAX, NOBODY, spend
+from kantor_protocol.wire.weights import Units
+from support.strategies import examples
 
 N = 6
 UNITS = Units.of(8, N)

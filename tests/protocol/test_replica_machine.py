@@ -9,14 +9,15 @@ but for what nobody alive has heard of.
 from collections import Counter
 from typing import Any
 
+import replicas
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-import replicas
-from kantor_protocol.replica import NOBODY, Replica, spend
-from kantor_protocol.weights import Units
-from strategies import examples
+from kantor_protocol.replication.replica import Replica
+from kantor_protocol.replication.replica_kernels import NOBODY, spend
+from kantor_protocol.wire.weights import Units
+from support.strategies import examples
 
 N = 6
 UNITS = Units.of(8, N)

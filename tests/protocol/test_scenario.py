@@ -11,22 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.clock import clocks
-from kantor_protocol.machine import SUPERVISOR
-from kantor_protocol.scenario import (
-    Planner,
-    Scenario,
-    ScenarioError,
-    from_tree,
-    is_image,
-    load,
-    parse,
-    rooted,
-    to_toml,
-    to_tree,
-)
-from kantor_protocol.weights import Units
-from strategies import (
+from kantor_protocol.base.machine import SUPERVISOR
+from kantor_protocol.scenario.clocks import step_clocks
+from kantor_protocol.scenario.dump import to_toml, to_tree
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.load import from_tree, load, parse, rooted
+from kantor_protocol.scenario.schema import PlannerOptions, Scenario
+from kantor_protocol.scenario.validate import is_image
+from kantor_protocol.wire.weights import Units
+from support.strategies import (
     SMALL,
     TOML_KEYS,
     TOML_TREES,
@@ -235,7 +228,7 @@ def test_a_name_alone_says_which_planner_or_vehicle(written: str) -> None:
     """A table that has a name may be set to it; what else is in the table stays."""
     scenario = mission("planner.horizon=5", written, "vehicle=dubins", "planner.modes=10")
 
-    assert scenario.planner == Planner(name="spectral", horizon=5, modes=10)
+    assert scenario.planner == PlannerOptions(name="spectral", horizon=5, modes=10)
     assert scenario.vehicle.name == "dubins"
 
 
@@ -364,7 +357,7 @@ def survives(make: Callable[[], Scenario]) -> None:
     else:
         assert parse(to_toml(scenario), "written") == scenario
         assert scenario.limit_ns > 0
-        assert len(clocks(scenario, 1)) == len(scenario.roster)
+        assert len(step_clocks(scenario, 1)) == len(scenario.roster)
         assert math.isfinite(sum(scenario.supervisor_m))
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from kantor_protocol.tls import Refusals, logged_reason
+from kantor_protocol.transport.tls import Refusals, logged_reason
 
 START = "\x1b[2m2026-11-23T01:03:57.322606Z\x1b[0m \x1b[33m WARN\x1b[0m acc-0 ThreadId(04) "
 START += "\x1b[2mzenoh_link_tls::unicast\x1b[0m\x1b[2m:\x1b[0m "

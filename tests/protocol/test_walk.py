@@ -4,25 +4,25 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.keyed import Purpose
-from kantor_protocol.walk import Walk
-from plain_philox import philox_plain
-from strategies import SEEDS, examples, scattered
+from kantor_protocol.base.counter_rng import Purpose
+from kantor_protocol.base.random_walk import RandomWalk
+from support.plain_philox import philox_plain
+from support.strategies import SEEDS, examples, scattered
 
 PERIOD_NS = 100_000_000
 DIFFUSIONS_M = st.floats(1e-3, 1e3)
 
 
-def walk(diffusion_m: float, seed: int, purpose: Purpose = Purpose.SAMPLE_WALK) -> Walk:
+def walk(diffusion_m: float, seed: int, purpose: Purpose = Purpose.SAMPLE_WALK) -> RandomWalk:
     """Eight points that walk once a period."""
-    return Walk(scattered(8), diffusion_m, PERIOD_NS, seed, purpose)
+    return RandomWalk(scattered(8), diffusion_m, PERIOD_NS, seed, purpose)
 
 
 @examples(50)
 @given(seed=SEEDS, diffusion_m=DIFFUSIONS_M)
 def test_step_stays_within_the_amplitude(seed: int, diffusion_m: float) -> None:
     """Eq. 13-14: each coordinate moves by v w with w in [-1, 1]."""
-    points = Walk(np.zeros((50, 2)), diffusion_m, PERIOD_NS, seed, Purpose.TARGET_WALK)
+    points = RandomWalk(np.zeros((50, 2)), diffusion_m, PERIOD_NS, seed, Purpose.TARGET_WALK)
     points.advance(PERIOD_NS)
 
     assert bool((np.abs(points.xy_m) <= diffusion_m).all())
@@ -100,6 +100,6 @@ def test_samples_and_targets_do_not_walk_alike() -> None:
 def test_first_points_are_copied() -> None:
     """A walk does not move the array that it was given."""
     given_m = scattered(8)
-    Walk(given_m, 7.0, PERIOD_NS, 1, Purpose.SAMPLE_WALK).advance(10 * PERIOD_NS)
+    RandomWalk(given_m, 7.0, PERIOD_NS, 1, Purpose.SAMPLE_WALK).advance(10 * PERIOD_NS)
 
     assert given_m.tolist() == scattered(8).tolist()

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.packing import Pairs
-from kantor_protocol.weights import Units, Weights, WeightsPublisher, WeightsSubscriber
-from strategies import examples
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.wire.weights import Units, Weights, WeightsPublisher, WeightsSubscriber
+from support.strategies import examples
 
 Fall = tuple[int, int]
 """(sample, units) by which it falls."""

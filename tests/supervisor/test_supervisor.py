@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from kantor_protocol.machine import (
+from kantor_protocol.base.machine import (
     EVERYBODY,
     SUPERVISOR,
     Body,
@@ -14,12 +14,12 @@ from kantor_protocol.machine import (
     Pose,
     State,
 )
-from kantor_protocol.messages import decode_inputs, decode_news, encode
-from kantor_protocol.packing import Pairs
-from kantor_protocol.scenario import Scenario
-from kantor_protocol.weights import Units, WeightsSubscriber
-from kantor_supervisor.core import Supervisor
-from strategies import Transcript, cast, mission, rehearse, scattered
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import decode_gossip, decode_inputs, encode
+from kantor_protocol.wire.weights import Units, WeightsSubscriber
+from kantor_supervisor.density import DensitySupervisor
+from support.strategies import Transcript, cast, mission, rehearse, scattered
 
 N = 12
 SAMPLES_M = scattered(N)
@@ -38,9 +38,9 @@ def transcripts(name: str, rounds: int = 30) -> dict[str, Transcript]:
     return rehearse(cast(MISSIONS[name], SAMPLES_M), MISSIONS[name], rounds)
 
 
-def supervisor(scenario: Scenario) -> Supervisor:
+def supervisor(scenario: Scenario) -> DensitySupervisor:
     """A supervisor that has heard nobody."""
-    return Supervisor(SUPERVISOR, scenario, Body(Pose(*scenario.supervisor_m)), N)
+    return DensitySupervisor(SUPERVISOR, scenario, Body(Pose(*scenario.supervisor_m)), N)
 
 
 def vector_after(outputs: list[Outputs]) -> list[int]:
@@ -69,7 +69,7 @@ def test_same_inputs_give_the_same_bytes(name: str) -> None:
 def test_supervisor_stands_and_ships_nothing(name: str, place: tuple[float, float]) -> None:
     """It has a place and a radio, and no energy to spend."""
     for step, (_, outputs) in enumerate(transcripts(name)[SUPERVISOR], 1):
-        news = decode_news(outputs.outbox[0].body)
+        news = decode_gossip(outputs.outbox[0].body)
 
         assert outputs.pose == Pose(*place)
         assert (outputs.step, outputs.goal, outputs.spent) == (step, None, b"")
@@ -195,7 +195,7 @@ def test_first_word_of_a_supervisor_that_has_heard_nobody() -> None:
     scenario = MISSIONS["ledger"]
     look = Observation(0, Pose(50.0, 50.0))
     outputs = supervisor(scenario).step(Inputs(150_000_000, look))
-    news = decode_news(outputs.outbox[0].body)
+    news = decode_gossip(outputs.outbox[0].body)
 
     assert (news.have, news.logs, news.claims) == (bytes(8), b"", b"")
     assert outputs.state is State.EXPLORING

@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import pytest
 
-from kantor_fleet.team import play
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.records import Record
-from kantor_worldsim.world import Site
-from strategies import mission
+from kantor_fleet.execution.in_process_team import play
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.record.records import Record
+from kantor_worldsim.world.world import WorldSetup
+from support.strategies import mission
 
 ROOMY = ("samples.count=60", "energy.points=90", "energy.steps=60", "targets.count=40")
 """L = 180: three units a sample, two a point; twice the energy that is needed."""
@@ -17,7 +17,7 @@ ROOMY = ("samples.count=60", "energy.points=90", "energy.steps=60", "targets.cou
 
 @functools.cache
 def _played(scenario: Scenario, seed: int) -> tuple[Record, ...]:
-    site = Site.of(scenario, seed)
+    site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
     play(scenario, seed, site, [records.append])
     return tuple(records)

@@ -3,44 +3,44 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_worldsim.admission import REFUSALS, Admission, Entry
-from strategies import examples
+from kantor_worldsim.exchange.membership import REFUSALS, JoinDecision, Membership
+from support.strategies import examples
 
 
 def test_a_second_process_is_refused_while_the_first_is_there() -> None:
-    admission = Admission(("r1", "r2"))
-    assert admission.join("r1", "one") is Entry.NEW
-    assert admission.join("r1", "other") is Entry.TAKEN
+    admission = Membership(("r1", "r2"))
+    assert admission.join("r1", "one") is JoinDecision.NEW
+    assert admission.join("r1", "other") is JoinDecision.TAKEN
     assert not admission.leave("r1", "other")
     assert admission.player("r1") == "one"
-    assert admission.join("r2", "two") is Entry.NEW
+    assert admission.join("r2", "two") is JoinDecision.NEW
 
 
 def test_a_process_that_comes_back_with_nobody_in_between_goes_on() -> None:
-    admission = Admission(("r1",))
+    admission = Membership(("r1",))
     admission.join("r1", "one")
     assert admission.leave("r1", "one")
     assert admission.player("r1") is None
-    assert admission.join("r1", "one") is Entry.BACK
+    assert admission.join("r1", "one") is JoinDecision.BACK
 
 
 def test_a_frozen_predecessor_is_refused_for_ever() -> None:
-    admission = Admission(("r1",))
+    admission = Membership(("r1",))
     admission.join("r1", "one")
     admission.leave("r1", "one")
-    assert admission.join("r1", "two") is Entry.NEW
-    assert admission.join("r1", "one") is Entry.FENCED
+    assert admission.join("r1", "two") is JoinDecision.NEW
+    assert admission.join("r1", "one") is JoinDecision.FENCED
     admission.leave("r1", "two")
-    assert admission.join("r1", "one") is Entry.FENCED
-    assert admission.join("r1", "two") is Entry.BACK
+    assert admission.join("r1", "one") is JoinDecision.FENCED
+    assert admission.join("r1", "two") is JoinDecision.BACK
 
 
 def test_nobody_plays_who_is_not_in_the_team() -> None:
-    admission = Admission(("r1",))
-    assert admission.join("r2", "one") is Entry.UNKNOWN
+    admission = Membership(("r1",))
+    assert admission.join("r2", "one") is JoinDecision.UNKNOWN
     assert not admission.leave("r2", "one")
     assert admission.player("r1") is None
-    assert set(REFUSALS) == set(Entry) - {Entry.NEW, Entry.BACK}
+    assert set(REFUSALS) == set(JoinDecision) - {JoinDecision.NEW, JoinDecision.BACK}
 
 
 EVENTS = st.lists(
@@ -55,7 +55,7 @@ def test_one_plays_at_a_time_and_who_was_succeeded_never_again(
     events: list[tuple[bool, str, str]],
 ) -> None:
     """Against the rule in words: the history of those let in never returns to an earlier one."""
-    admission = Admission(("r1", "r2"))
+    admission = Membership(("r1", "r2"))
     history: dict[str, list[str]] = {"r1": [], "r2": [], "r3": []}
     here: dict[str, str] = {}
     for comes, name, letter in events:
@@ -67,18 +67,18 @@ def test_one_plays_at_a_time_and_who_was_succeeded_never_again(
             continue
         entry = admission.join(name, nonce)
         past = history[name]
-        if entry is Entry.NEW:
+        if entry is JoinDecision.NEW:
             assert name not in here
             assert nonce not in past
             past.append(nonce)
             here[name] = nonce
-        elif entry is Entry.BACK:
+        elif entry is JoinDecision.BACK:
             assert nonce == past[-1]
             here[name] = nonce
-        elif entry is Entry.TAKEN:
+        elif entry is JoinDecision.TAKEN:
             assert here[name] != nonce
             assert nonce not in past
-        elif entry is Entry.FENCED:
+        elif entry is JoinDecision.FENCED:
             assert nonce in past[:-1]
         else:
             assert name == "r3"

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_worldsim.bounds import Auction
-from kantor_worldsim.exact import w1
-from strategies import SEEDS, examples
+from kantor_worldsim.observers.metrics.wasserstein_bounds import Auction
+from kantor_worldsim.observers.metrics.wasserstein_exact import w1
+from support.strategies import SEEDS, examples
 
 Array = npt.NDArray[np.float64]
 

@@ -8,13 +8,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from grounds import drawn, exploration, grounds
-from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.channel import DROPPED, OPEN, Channel, Sent, Verdict, Walls, links
-from kantor_worldsim.maps import Ground
-from kantor_worldsim.sensors import walls_between
-from strategies import SEEDS, examples, mission
+from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.radio.channel import (
+    DROPPED,
+    OPEN,
+    Channel,
+    DeliveryDecision,
+    Sent,
+    Walls,
+    links,
+)
+from kantor_worldsim.world.maps import Ground
+from kantor_worldsim.world.sensors import walls_between
+from support.grounds import drawn, exploration, grounds
+from support.strategies import SEEDS, examples, mission
 
 MS = 1_000_000
 CENTRALIZED = "coordination=centralized"
@@ -50,7 +58,7 @@ def channel(
     return made
 
 
-def receivers(verdicts: Iterable[Verdict]) -> list[ParticipantId]:
+def receivers(verdicts: Iterable[DeliveryDecision]) -> list[ParticipantId]:
     return [verdict.target for verdict in verdicts]
 
 
@@ -362,7 +370,7 @@ def test_draws_differ_between_links_sequences_and_seeds() -> None:
     assert all(0 < sum(fate) < 64 for fate in fates)
 
 
-def _copies(verdicts: Sequence[Verdict]) -> dict[tuple[str, int, str], list[int]]:
+def _copies(verdicts: Sequence[DeliveryDecision]) -> dict[tuple[str, int, str], list[int]]:
     """When each copy arrives, by (source, sequence, target)."""
     copies: dict[tuple[str, int, str], list[int]] = {}
     for verdict in verdicts:
@@ -500,7 +508,10 @@ def test_dropped_is_ruled_on_but_never_under_way() -> None:
     radio = channel("radio.drop=0.999999")
     verdicts, _ = radio.transmit([said("r1", 1)])
 
-    assert verdicts == [Verdict("r1", 1, "r2", DROPPED), Verdict("r1", 1, "r3", DROPPED)]
+    assert verdicts == [
+        DeliveryDecision("r1", 1, "r2", DROPPED),
+        DeliveryDecision("r1", 1, "r3", DROPPED),
+    ]
     assert radio.next_due_ns() is None
 
 

@@ -12,20 +12,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.faults import AnyFault, Kill, Partition, Range
-from kantor_protocol.machine import SUPERVISOR, Envelope, ParticipantId, Pose
-from kantor_protocol.messages import News, decode_news, encode
-from kantor_protocol.modes import VISIT
-from kantor_protocol.packing import Pairs, put_uint
-from kantor_protocol.registers import read_register
-from kantor_protocol.replica import read_have
-from kantor_protocol.weights import WeightsMessage, WeightsSubscriber
-from kantor_worldsim.channel import DROPPED, Verdict
-from kantor_worldsim.checkers import Checker, check
-from kantor_worldsim.records import Act, Batch, Ending, Incident, Opening, Record
-from referees import listed, rules
-from replicas import read_logs
-from strategies import SEEDS, examples
+from kantor_protocol.base.machine import SUPERVISOR, Envelope, ParticipantId, Pose
+from kantor_protocol.base.varint import Pairs, put_uint
+from kantor_protocol.replication.cosine_basis import VISIT
+from kantor_protocol.replication.registers import read_register
+from kantor_protocol.replication.replica import read_have
+from kantor_protocol.scenario.faults.links import Partition, Range
+from kantor_protocol.scenario.faults.processes import Kill
+from kantor_protocol.scenario.faults.schedule import AnyFault
+from kantor_protocol.wire.messages import GossipMessage, decode_gossip, encode
+from kantor_protocol.wire.weights import WeightsMessage, WeightsSubscriber
+from kantor_worldsim.observers.checkers.checker import Checker, check
+from kantor_worldsim.radio.channel import DROPPED, DeliveryDecision
+from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record, StepRecord
+from support.checkers import listed, rules
+from support.replicas import read_logs
+from support.strategies import SEEDS, examples
 
 Play = Callable[..., tuple[Record, ...]]
 Records = Sequence[Record]
@@ -50,14 +52,14 @@ DEAF = ("radio.range_m=0", "supervisor.range_m=0")
 
 # Ways to change a record.
 
-Change = Callable[[Act], Act]
+Change = Callable[[StepRecord], StepRecord]
 
 
 def batches(records: Records) -> list[Batch]:
     return [record for record in records if isinstance(record, Batch)]
 
 
-def acts(records: Records, name: ParticipantId) -> list[Act]:
+def acts(records: Records, name: ParticipantId) -> list[StepRecord]:
     """What a participant did, in order."""
     return [act for batch in batches(records) for act in batch.acts if act.name == name]
 
@@ -72,7 +74,7 @@ def put(records: Records, old: Any, new: Any) -> list[Record]:
     return [new if record is old else record for record in records]
 
 
-def put_act(records: Records, old: Act, change: Change) -> list[Record]:
+def put_act(records: Records, old: StepRecord, change: Change) -> list[Record]:
     """The records with one act changed."""
 
     def changed(batch: Batch) -> Batch:
@@ -101,10 +103,10 @@ def heard(*references: tuple[ParticipantId, int]) -> Change:
     return lambda act: msgspec.structs.replace(act, heard=references)
 
 
-def news(act: Act, change: Callable[[News], News]) -> Change:
+def news(act: StepRecord, change: Callable[[GossipMessage], GossipMessage]) -> Change:
     """A change of the message that a participant sent."""
     (envelope,) = act.outputs.outbox
-    body = encode(change(decode_news(envelope.body)))
+    body = encode(change(decode_gossip(envelope.body)))
     return outputs(outbox=(msgspec.structs.replace(envelope, body=body),))
 
 
@@ -112,7 +114,7 @@ LATE_NS = 1 << 60
 """After every end: who is to hear something then never does."""
 
 
-def add_verdict(records: Records, batch: Batch, verdict: Verdict) -> list[Record]:
+def add_verdict(records: Records, batch: Batch, verdict: DeliveryDecision) -> list[Record]:
     """The records with one more verdict of the radio."""
     told = msgspec.structs.replace(batch, verdicts=(*batch.verdicts, verdict))
     return put(records, batch, told)
@@ -151,9 +153,9 @@ def uints(*values: int) -> bytes:
     return buffer[:at].tobytes()
 
 
-def own_register(act: Act, origins: int = 3, slot: int = 0) -> int:
+def own_register(act: StepRecord, origins: int = 3, slot: int = 0) -> int:
     """How many writes the register of a slot has that is sent along; 0 if there is none."""
-    content = decode_news(act.outputs.outbox[0].body).registers
+    content = decode_gossip(act.outputs.outbox[0].body).registers
     found = read_register(content, origins, 9, slot)
     assert found is not None
     return found[0]
@@ -271,13 +273,13 @@ def breaks(*broken: str, run: tuple[str, ...] = ()) -> Callable[[Break], Break]:
 @breaks("range", run=RADIOS["short"])
 def _delivered_over_the_hills(records: Records) -> list[Record]:
     first = batches(records)[0]
-    return add_verdict(records, first, Verdict("r1", 1, "r2", LATE_NS))
+    return add_verdict(records, first, DeliveryDecision("r1", 1, "r2", LATE_NS))
 
 
 @breaks("range", run=("coordination=centralized", "supervisor.range_m=20"))
 def _delivered_to_a_far_supervisor(records: Records) -> list[Record]:
     first = batches(records)[0]
-    return add_verdict(records, first, Verdict("r1", 1, SUPERVISOR, LATE_NS))
+    return add_verdict(records, first, DeliveryDecision("r1", 1, SUPERVISOR, LATE_NS))
 
 
 @breaks("range")
@@ -315,7 +317,7 @@ def revived(records: Records) -> list[Record]:
 @breaks("range", run=SHRUNK)
 def _delivered_beyond_the_shrunk_range(records: Records) -> list[Record]:
     first = batches(records)[0]
-    return add_verdict(records, first, Verdict("r1", 1, "r2", LATE_NS))
+    return add_verdict(records, first, DeliveryDecision("r1", 1, "r2", LATE_NS))
 
 
 @breaks("range")
@@ -359,10 +361,10 @@ def _replayed_across_a_partition(records: Records) -> list[Record]:
     sixth = batches(deaf)[5]
     told = tuple(put_heard(act, apart) for act in sixth.acts)
     deaf = put(deaf, sixth, msgspec.structs.replace(sixth, acts=told))
-    return add_verdict(under(deaf, cut), apart, Verdict("r1", 2, "r3", LATE_NS))
+    return add_verdict(under(deaf, cut), apart, DeliveryDecision("r1", 2, "r3", LATE_NS))
 
 
-def put_heard(act: Act, batch: Batch) -> Act:
+def put_heard(act: StepRecord, batch: Batch) -> StepRecord:
     """The act without what a batch did not deliver to it."""
     told = {(v.source, v.sequence) for v in batch.verdicts if v.target == act.name}
     return msgspec.structs.replace(act, heard=tuple(ref for ref in act.heard if ref in told))
@@ -408,19 +410,19 @@ def _heard_more_copies_than_were_ruled(records: Records) -> list[Record]:
 @breaks("delivery")
 def _delivered_what_was_never_sent(records: Records) -> list[Record]:
     first = batches(records)[0]
-    return add_verdict(records, first, Verdict("r1", 77, "r2", first.now_ns))
+    return add_verdict(records, first, DeliveryDecision("r1", 77, "r2", first.now_ns))
 
 
 @breaks("delivery")
 def _delivered_to_a_stranger(records: Records) -> list[Record]:
     first = batches(records)[0]
-    return add_verdict(records, first, Verdict("r1", 1, "r9", first.now_ns))
+    return add_verdict(records, first, DeliveryDecision("r1", 1, "r9", first.now_ns))
 
 
 @breaks("delivery", run=("coordination=centralized",))
 def _delivered_to_somebody_else(records: Records) -> list[Record]:
     first = batches(records)[0]
-    return add_verdict(records, first, Verdict("r1", 1, "r2", first.now_ns))
+    return add_verdict(records, first, DeliveryDecision("r1", 1, "r2", first.now_ns))
 
 
 @breaks("weights", run=MERGES["min"])
@@ -556,7 +558,7 @@ def _sends_logs_that_do_not_decode(records: Records) -> list[Record]:
 def _holds_more_of_a_log_than_there_is(records: Records) -> list[Record]:
     last = acts(records, "r1")[-1]
 
-    def boast(said: News) -> News:
+    def boast(said: GossipMessage) -> GossipMessage:
         own, *others = read_have(said.have, 3) or []
         stamps = said.have[len(uints(own, *others)) :]
         return msgspec.structs.replace(said, have=uints(own, others[0] + 1, others[1]) + stamps)
@@ -619,7 +621,7 @@ def _sends_sums_that_are_not_its_own(records: Records) -> list[Record]:
 def _says_that_it_wrote_more_often(records: Records) -> list[Record]:
     act = [act for act in acts(records, "r1") if own_register(act)][-1]
 
-    def boast(said: News) -> News:
+    def boast(said: GossipMessage) -> GossipMessage:
         before, stamp, rest = said.registers[:4], said.registers[4], said.registers[5:]
         return msgspec.structs.replace(said, registers=before + bytes([stamp + 1]) + rest)
 
@@ -764,11 +766,11 @@ def test_no_complaint_whatever_befalls_processes(
     assert befell(records)
 
 
-def befell(records: Records, what: str = "") -> list[Incident]:
+def befell(records: Records, what: str = "") -> list[ProcessEvent]:
     """The incidents of a kind, or all but those of links."""
-    found = [record for record in records if isinstance(record, Incident)]
+    found = [record for record in records if isinstance(record, ProcessEvent)]
     return [each for each in found if what in {"", each.what}] or [
-        Incident(0, "record", "injected") for batch in batches(records) if batch.injected
+        ProcessEvent(0, "record", "injected") for batch in batches(records) if batch.injected
     ]
 
 
@@ -861,7 +863,7 @@ def _budget_was_for_all_its_lives(records: Records) -> list[Record]:
 def _forgets_its_predecessors_log(records: Records) -> list[Record]:
     act = acts(records, "r2")[-1]
 
-    def forget(said: News) -> News:
+    def forget(said: GossipMessage) -> GossipMessage:
         told = read_have(said.have, 6) or []
         rest = said.have[len(uints(*told)) :]
         return msgspec.structs.replace(said, have=uints(told[0], 0, *told[2:]) + rest)
@@ -873,7 +875,7 @@ def _forgets_its_predecessors_log(records: Records) -> list[Record]:
 def _holds_entries_of_nobody(records: Records) -> list[Record]:
     act = acts(records, "r1")[-1]
 
-    def invent(said: News) -> News:
+    def invent(said: GossipMessage) -> GossipMessage:
         told = read_have(said.have, 3) or []
         return msgspec.structs.replace(said, have=uints(*told, 1, 0, 0, *([0] * 6)))
 
@@ -890,7 +892,7 @@ def _forwards_what_its_origin_never_made(records: Records) -> list[Record]:
 @breaks("register", run=(*FORGETFUL, *SPECTRAL))
 def _goes_on_with_its_predecessors_sums(records: Records) -> list[Record]:
     act = next(act for act in reversed(acts(records, "r2")) if own_register(act, 6, 4))
-    content = decode_news(act.outputs.outbox[0].body).registers
+    content = decode_gossip(act.outputs.outbox[0].body).registers
     _, sums = read_register(content, 6, 9, 4) or (0, [])
     register = uints(0, 0, 0, 0, 0, 0, 4, own_register(act, 6, 4), 1, 2 * (sums[0] + VISIT))
     change = news(act, lambda said: msgspec.structs.replace(said, registers=register))
@@ -899,12 +901,12 @@ def _goes_on_with_its_predecessors_sums(records: Records) -> list[Record]:
 
 @breaks("incident")
 def _struck_by_no_fault(records: Records) -> list[Record]:
-    return [*records[:9], Incident(batches(records)[7].now_ns, "r1", "slow"), *records[9:]]
+    return [*records[:9], ProcessEvent(batches(records)[7].now_ns, "r1", "slow"), *records[9:]]
 
 
 @breaks("incident")
 def _strikes_a_stranger(records: Records) -> list[Record]:
-    return [*records[:9], Incident(batches(records)[7].now_ns, "r9", "leave"), *records[9:]]
+    return [*records[:9], ProcessEvent(batches(records)[7].now_ns, "r9", "leave"), *records[9:]]
 
 
 @breaks("incident", run=COPIED)

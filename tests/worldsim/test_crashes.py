@@ -9,20 +9,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from grounds import exploration
-from kantor_fleet.team import participant, play
-from kantor_protocol.faults import Kill, Pause
-from kantor_protocol.life import Mortal
-from kantor_protocol.machine import WORLD_SIM, Body, Outputs, ParticipantId, Pose
-from kantor_protocol.messages import decode_news
-from kantor_protocol.scenario import Scenario, parse
-from kantor_worldsim.channel import DROPPED
-from kantor_worldsim.loop import in_process, simulate
-from kantor_worldsim.records import Act, Batch, Ending, Incident, Mailbag, Record
-from kantor_worldsim.stage import ForeignRecordError, Stage
-from kantor_worldsim.world import Site
-from mapping import ROOMS
-from strategies import SMALL, examples
+from kantor_fleet.execution.in_process_team import participant, play
+from kantor_protocol.base.machine import WORLD_SIM, Body, Outputs, ParticipantId, Pose
+from kantor_protocol.node.recovery import KillableNode
+from kantor_protocol.scenario.faults.processes import Kill, Pause
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import decode_gossip
+from kantor_worldsim.engine.event_loop import simulate
+from kantor_worldsim.engine.simulation import ForeignRecordError, Simulation
+from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.radio.channel import DROPPED
+from kantor_worldsim.record.records import (
+    Batch,
+    Ending,
+    EnvelopeIndex,
+    ProcessEvent,
+    Record,
+    StepRecord,
+)
+from kantor_worldsim.world.world import WorldSetup
+from support.grounds import exploration
+from support.missions import ROOMS
+from support.strategies import SMALL, examples
 
 MS = 1_000_000
 ROOMY = ("samples.count=60", "energy.points=90", "energy.steps=60", "limit_s=12")
@@ -47,7 +56,7 @@ def run(*faults: str, overrides: tuple[str, ...] = ()) -> list[Record]:
     """The record of such a mission."""
     scenario = troubled(*faults, overrides=overrides)
     records: list[Record] = []
-    play(scenario, 1, Site.of(scenario, 1), [records.append])
+    play(scenario, 1, WorldSetup.of(scenario, 1), [records.append])
     return records
 
 
@@ -61,17 +70,17 @@ def batches(records: list[Record]) -> list[Batch]:
     return [record for record in records if isinstance(record, Batch)]
 
 
-def incidents(records: list[Record]) -> list[Incident]:
-    return [record for record in records if isinstance(record, Incident)]
+def incidents(records: list[Record]) -> list[ProcessEvent]:
+    return [record for record in records if isinstance(record, ProcessEvent)]
 
 
-def acts(records: list[Record], name: ParticipantId) -> list[Act]:
+def acts(records: list[Record], name: ParticipantId) -> list[StepRecord]:
     """A participant's answered steps."""
     told = (act for batch in batches(records) for act in batch.acts)
     return [act for act in told if act.name == name and act.outputs is not None]
 
 
-def outputs(act: Act) -> Outputs:
+def outputs(act: StepRecord) -> Outputs:
     assert act.outputs is not None
     return act.outputs
 
@@ -186,7 +195,7 @@ def test_who_forgot_comes_back_as_another(pace: str, disk: str, mid_step: bool) 
     starts = [incident for incident in incidents(records) if incident.what == "start"]
     told = acts(records, "r1")
     epochs = {
-        outputs(act).step: decode_news(envelope.body).epoch
+        outputs(act).step: decode_gossip(envelope.body).epoch
         for act in told
         for envelope in outputs(act).outbox
     }
@@ -224,7 +233,7 @@ def test_late_joiner_takes_part() -> None:
         for verdict in batch.verdicts
     }
 
-    assert incidents(records) == [Incident(1550 * MS, "r3", "start", 0)]
+    assert incidents(records) == [ProcessEvent(1550 * MS, "r3", "start", 0)]
     assert (first.now_ns, outputs(first).step) == (1600 * MS, 1)
     heard = [reference for act in acts(records, "r3") for reference in act.heard]
     assert min(sent_ns[reference] for reference in heard) >= 1550 * MS
@@ -275,7 +284,7 @@ def test_wrong_clock_is_on_record_and_breaks_no_rule(pace: str, offset_s: float)
     records = run(clock, overrides=(*LOSSY, *PACES[pace]))
     wrong = [act for act in acts(records, "r2") if 1000 * MS <= act.now_ns < 2000 * MS]
     act = next(act for act in acts(records, "r2") if act.skew_ns)
-    mailbag = Mailbag()
+    mailbag = EnvelopeIndex()
     for batch in batches(records):
         mailbag.post(batch)
 
@@ -290,7 +299,7 @@ def test_impostor_is_refused() -> None:
     """Somebody else plays that robot."""
     records = run('kind = "impostor"; who = ["r2"]; from_s = 1.0')
 
-    assert incidents(records) == [Incident(1000 * MS, "r2", "pretend", 0)]
+    assert incidents(records) == [ProcessEvent(1000 * MS, "r2", "pretend", 0)]
     assert batches(records) == batches(undisturbed(()))
 
 
@@ -364,8 +373,8 @@ def test_world_sim_goes_on_from_its_record(
     )
     during = range(from_ms * MS, (from_ms + span_ms) * MS)
 
-    assert [b for b in killed if not isinstance(b, Incident)][1:] == [
-        b for b in paused if not isinstance(b, Incident)
+    assert [b for b in killed if not isinstance(b, ProcessEvent)][1:] == [
+        b for b in paused if not isinstance(b, ProcessEvent)
     ][1:]
     assert not any(batch.now_ns in during for batch in batches(killed))
     told = [(i.now_ns, i.what) for i in incidents(killed) if i.who == WORLD_SIM]
@@ -383,7 +392,9 @@ def test_world_with_a_map_goes_on_from_its_record(coordination: str) -> None:
         "radio.range_m=6",
         "vehicle.speed_m_s=10",
     )
-    site = Site(np.zeros((0, 2)), np.array([[9.5, 4.5]]), np.array([[1.5, 1.5], [2.5, 1.5]]), ROOMS)
+    site = WorldSetup(
+        np.zeros((0, 2)), np.array([[9.5, 4.5]]), np.array([[1.5, 1.5], [2.5, 1.5]]), ROOMS
+    )
     lost = Kill(who=("r1",), from_s=0.42, until_s=0.91, disk="lost")
 
     def explored(outage: Kill | Pause) -> list[Batch]:
@@ -409,11 +420,11 @@ MORTALS = (
 )
 
 
-def everybody_mortal(scenario: Scenario, site: Site) -> dict[ParticipantId, Mortal]:
-    def mortal(name: ParticipantId) -> Mortal:
-        place = Stage(scenario, 1, site, []).body(name).pose
+def everybody_mortal(scenario: Scenario, site: WorldSetup) -> dict[ParticipantId, KillableNode]:
+    def mortal(name: ParticipantId) -> KillableNode:
+        place = Simulation(scenario, 1, site, []).body(name).pose
         build = functools.partial(participant, name, scenario, 1, site)
-        return Mortal(build, Body(place))
+        return KillableNode(build, Body(place))
 
     return {name: mortal(name) for name in scenario.roster}
 
@@ -422,19 +433,19 @@ def everybody_mortal(scenario: Scenario, site: Site) -> dict[ParticipantId, Mort
 def test_mission_goes_on_from_any_record(pace: str) -> None:
     """Stopped anywhere, resumed from what was told, with the robots as they are: the same record."""
     scenario = troubled(*MORTALS, overrides=(*LOSSY, *PACES[pace], "limit_s=3"))
-    site = Site.of(scenario, 1)
+    site = WorldSetup.of(scenario, 1)
     whole: list[Record] = []
     play(scenario, 1, site, [whole.append])
     for asks in range(1, 60, 2):
         crew = in_process(everybody_mortal(scenario, site))
         left = iter(range(asks))
         records: list[Record] = []
-        stage = Stage(scenario, 1, site, [records.append])
+        stage = Simulation(scenario, 1, site, [records.append])
         simulate(stage, crew, 1, lambda left=left: next(left, None) is None)  # type: ignore[misc]
         if records[-1] == whole[-1]:
             break
         records.pop()
-        again = Stage.resumed(scenario, 1, site, tuple(records), [records.append])
+        again = Simulation.resumed(scenario, 1, site, tuple(records), [records.append])
         simulate(again, crew, 1, lambda: False)
 
         assert records == whole
@@ -443,7 +454,7 @@ def test_mission_goes_on_from_any_record(pace: str) -> None:
 def test_records_that_do_not_follow_are_refused() -> None:
     """A journal of another version, or one that was changed, is named with its place."""
     scenario = troubled(overrides=LOSSY)
-    site = Site.of(scenario, 1)
+    site = WorldSetup.of(scenario, 1)
     records = run(overrides=LOSSY)
     number, batch = next(
         (i, record)
@@ -462,16 +473,16 @@ def test_records_that_do_not_follow_are_refused() -> None:
         replace(batch, out_of_range=99),
     ):
         with pytest.raises(ForeignRecordError, match=f"^record {number}: "):
-            Stage.resumed(scenario, 1, site, [*records[:number], changed], [])
+            Simulation.resumed(scenario, 1, site, [*records[:number], changed], [])
     with pytest.raises(ForeignRecordError, match=f"^record {len(records) - 1}: "):
-        Stage.resumed(scenario, 1, site, records, [])
+        Simulation.resumed(scenario, 1, site, records, [])
 
 
 def test_only_what_was_heard_is_taken_from_what_is_under_way() -> None:
     """A stage that is resumed holds exactly what nobody has heard yet."""
     scenario = troubled(overrides=LOSSY)
     records = run(overrides=LOSSY)[:30]
-    stage = Stage.resumed(scenario, 1, Site.of(scenario, 1), records, [])
+    stage = Simulation.resumed(scenario, 1, WorldSetup.of(scenario, 1), records, [])
     under_way = Counter(
         (v.target, v.source, v.sequence)
         for batch in batches(records)

@@ -14,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from kantor_protocol.scenario import Scenario, ScenarioError
-from kantor_worldsim.density import samples_of, starts_of, targets_of
-from strategies import Points, crowds, examples, mission
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.world.density import samples_of, starts_of, targets_of
+from support.strategies import Points, crowds, examples, mission
 
 DOMAIN = ("domain.min_m=[-50.0, 0.0]", "domain.max_m=[50.0, 50.0]", "starts.random=true")
 

@@ -4,14 +4,15 @@ from typing import cast
 
 import pytest
 
-from kantor_protocol.bus import Event, Host, Joined
-from kantor_protocol.messages import Mission, decode_to_participant
-from kantor_worldsim.doorway import AGAIN_S, Doorway
-from kantor_worldsim.plan import Plan
-from kantor_worldsim.recording import Recording
-from kantor_worldsim.stage import Stage
-from kantor_worldsim.world import Site
-from strategies import mission
+from kantor_protocol.transport.events import Event, Joined
+from kantor_protocol.transport.router import HubRouter
+from kantor_protocol.wire.messages import Mission, decode_to_participant
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.config import MissionConfig
+from kantor_worldsim.exchange.lobby import AGAIN_S, Lobby
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.world.world import WorldSetup
+from support.strategies import mission
 
 
 class Bus:
@@ -42,11 +43,11 @@ class Bus:
 def test_who_is_there_and_silent_is_told_its_mission_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Behind a site's router a process may be seen before it can be reached: it is told once in AGAIN_S."""
     bus, scenario = Bus(), mission()
-    monkeypatch.setattr("kantor_worldsim.doorway.time", bus)
-    site = Site.of(scenario, 0)
-    plan = Plan(scenario, 0, site, "wall")
-    doorway = Doorway(
-        cast("Host", bus),
+    monkeypatch.setattr("kantor_worldsim.exchange.lobby.time", bus)
+    site = WorldSetup.of(scenario, 0)
+    plan = MissionConfig(scenario, 0, site, "wall")
+    doorway = Lobby(
+        cast("HubRouter", bus),
         plan,
         Recording(scenario, 0, "wall"),
         lambda: False,
@@ -54,7 +55,7 @@ def test_who_is_there_and_silent_is_told_its_mission_again(monkeypatch: pytest.M
         None,
         lambda _line: None,
     )
-    doorway.stage = Stage(scenario, 0, site, [])
+    doorway.stage = Simulation(scenario, 0, site, [])
     bus.events.append(Joined("r1", "nonce"))
     while bus.now_s < 3.5 * AGAIN_S:
         doorway.next(0.1 * AGAIN_S)

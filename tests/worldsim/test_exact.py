@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import wasserstein_distance
 
-from kantor_protocol.scenario import MAP_PLANNERS, PlannerName
-from kantor_worldsim.checkers import Checker
-from kantor_worldsim.exact import w1
-from kantor_worldsim.metrics import Metrics, Row
-from kantor_worldsim.records import Record
-from strategies import SEEDS, examples
+from kantor_protocol.scenario.schema import MAP_PLANNERS, PlannerName
+from kantor_worldsim.observers.checkers.checker import Checker
+from kantor_worldsim.observers.metrics.density import DensityMetrics, DensityRow
+from kantor_worldsim.observers.metrics.wasserstein_exact import w1
+from kantor_worldsim.record.records import Record
+from support.strategies import SEEDS, examples
 
 Play = Callable[..., tuple[Record, ...]]
 
@@ -57,9 +57,9 @@ def test_on_a_line_it_is_the_area_between_the_distributions(seed: int, n: int, m
     assert distance == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
-def judged(records: tuple[Record, ...], every: int) -> tuple[list[Row], Checker]:
+def judged(records: tuple[Record, ...], every: int) -> tuple[list[DensityRow], Checker]:
     """The rows of a record with exact distances, and a checker that has seen them."""
-    metrics, checker = Metrics(every), Checker()
+    metrics, checker = DensityMetrics(every), Checker()
     for record in records:
         metrics.take(record)
     for row in metrics.rows:
@@ -102,7 +102,7 @@ def test_it_is_computed_when_asked_for(played: Play) -> None:
     records = played("metrics.every=1")
 
     def ticks(every: int | None) -> list[int]:
-        metrics = Metrics(every)
+        metrics = DensityMetrics(every)
         for record in records:
             metrics.take(record)
         return [row.tick for row in metrics.rows if row.w1_exact is not None]

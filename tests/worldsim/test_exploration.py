@@ -9,35 +9,36 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from kantor_fleet.team import play
-from kantor_protocol.grid import Frame
-from kantor_protocol.machine import Observation, Outputs, Pose, State
-from kantor_worldsim.channel import DROPPED
-from kantor_worldsim.exploration import SHAPES, Exploration, MapRow
-from kantor_worldsim.metrics import MapResult, Metrics, Result
-from kantor_worldsim.recording import Recording, metrics_of
-from kantor_worldsim.records import Act, Batch, Ending, Opening, Record, opening_of
-from kantor_worldsim.survey import Survey
-from kantor_worldsim.world import Ruling
-from mapping import ROOMS, explored, on_map, site_of
-from strategies import mission
+from kantor_fleet.execution.in_process_team import play
+from kantor_protocol.base.grid import Frame
+from kantor_protocol.base.machine import Observation, Outputs, Pose, State
+from kantor_worldsim.observers.metrics.density import DensityMetrics
+from kantor_worldsim.observers.metrics.map_tracker import MapTracker
+from kantor_worldsim.observers.metrics.mapping import SHAPES, MapMetrics, MapRow
+from kantor_worldsim.observers.metrics.result import MapResult, Result
+from kantor_worldsim.observers.recording import Recording, metrics_of
+from kantor_worldsim.radio.channel import DROPPED
+from kantor_worldsim.record.records import Batch, Ending, Opening, Record, StepRecord, opening_of
+from kantor_worldsim.world.world import StepVerdict
+from support.missions import ROOMS, explored, on_map, site_of
+from support.strategies import mission
 
 PERIOD_NS = 100_000_000
 Records = Sequence[Record]
 
 
-def measured(records: Records) -> Exploration:
-    metrics = Exploration()
+def measured(records: Records) -> MapMetrics:
+    metrics = MapMetrics()
     for record in records:
         metrics.take(record)
     return metrics
 
 
-def result_of(metrics: Exploration) -> Result:
+def result_of(metrics: MapMetrics) -> Result:
     return metrics.result(exchange="-", digest="-", wall_s=0.0, record="whole", complaints=())
 
 
-def map_of(metrics: Exploration) -> MapResult:
+def map_of(metrics: MapMetrics) -> MapResult:
     found = result_of(metrics).map
     assert found is not None
     return found
@@ -200,7 +201,7 @@ def test_generic_counts_are_those_of_the_record() -> None:
 
 def test_own_bytes_of_maps_are_counted() -> None:
     """What robots send of logs, without the rest of a message and without the supervisor's."""
-    from kantor_protocol.messages import decode_news
+    from kantor_protocol.wire.messages import decode_gossip
 
     records = explored("coordination=centralized")
     acts = [
@@ -211,7 +212,7 @@ def test_own_bytes_of_maps_are_counted() -> None:
         if act.name != "supervisor"
     ]
     sent = [
-        len(decode_news(e.body).logs) for act in acts if act.outputs for e in act.outputs.outbox
+        len(decode_gossip(e.body).logs) for act in acts if act.outputs for e in act.outputs.outbox
     ]
     found = map_of(measured(records)).log_bytes_per_robot_tick
 
@@ -237,7 +238,7 @@ class Errand:
 
     def __init__(self) -> None:
         self.scenario = on_map("robots.count=1", "starts.poses_m=[[1.5, 8.5]]", "metrics.every=1")
-        self.metrics = Exploration()
+        self.metrics = MapMetrics()
         self.metrics.take(opening_of(self.scenario, 1, site_of(self.scenario), {"r1": ()}))
         self.tick = 0
         self.pose = Pose(1.5, 8.5)
@@ -254,8 +255,8 @@ class Errand:
         look = Observation(self.tick, self.pose)
         self.tick, self.pose = self.tick + 1, Pose(x_m, 8.5)
         outputs = Outputs(self.tick, self.pose, goal=goal_m, state=state)
-        ruling = Ruling(self.pose, bumped=bumped)
-        act = Act("r1", self.tick * PERIOD_NS, look, (), outputs, ruling)
+        ruling = StepVerdict(self.pose, bumped=bumped)
+        act = StepRecord("r1", self.tick * PERIOD_NS, look, (), outputs, ruling)
         self.metrics.take(Batch(self.tick * PERIOD_NS, (act,), (), 0))
 
     def end(self) -> MapResult:
@@ -326,13 +327,13 @@ def test_bumps_are_counted() -> None:
 
 def test_class_is_chosen_by_what_is_explored() -> None:
     """A density has bounds, a map has regions."""
-    assert isinstance(metrics_of(mission()), Metrics)
-    assert isinstance(metrics_of(on_map()), Exploration)
+    assert isinstance(metrics_of(mission()), DensityMetrics)
+    assert isinstance(metrics_of(on_map()), MapMetrics)
 
 
 def test_glance_has_distance_and_share() -> None:
     """Cheap at any time, also before anything."""
-    assert Exploration().glance().mass_left == 1.0
+    assert MapMetrics().glance().mass_left == 1.0
     metrics = measured(explored())
     glance = metrics.glance()
 
@@ -360,8 +361,8 @@ def test_run_folder_has_rows_and_result(tmp_path: Path) -> None:
 
 def test_survey_may_be_shared_only_with_who_comes_later() -> None:
     """The measures are the same with a survey of their own."""
-    survey = Survey()
-    shared, own = Exploration(survey=survey), Exploration()
+    survey = MapTracker()
+    shared, own = MapMetrics(survey=survey), MapMetrics()
     for record in explored():
         shared.take(record)
         survey.take(record)

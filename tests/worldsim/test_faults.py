@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from grounds import drawn, exploration
-from kantor_protocol.faults import (
-    AnyFault,
+from kantor_protocol.base.counter_rng import Purpose, uniform
+from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
+from kantor_protocol.scenario.dump import to_tree
+from kantor_protocol.scenario.faults.links import (
     Bandwidth,
     Burst,
     Clog,
@@ -26,24 +27,24 @@ from kantor_protocol.faults import (
     Range,
     Reorder,
     Replay,
-    kind_of,
 )
-from kantor_protocol.keyed import Purpose, uniform
-from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
-from kantor_protocol.scenario import Scenario, from_tree, to_tree
-from kantor_worldsim.channel import DROPPED, Channel, Sent, Verdict
-from kantor_worldsim.checkers import check
-from kantor_worldsim.faults import LinkFaults
-from kantor_worldsim.hostile import FIRST_SEQUENCE
-from kantor_worldsim.journal import Journal
-from kantor_worldsim.maps import Ground
-from kantor_worldsim.metrics import FaultCounts, Result
-from kantor_worldsim.recording import metrics_of
-from kantor_worldsim.records import Batch, Ending, Opening, Record
-from kantor_worldsim.rules import in_burst
-from mapping import explored
-from plain_faults import PASS, Fate, PlainFaults
-from strategies import SEEDS, examples, mission
+from kantor_protocol.scenario.faults.schedule import AnyFault, kind_of
+from kantor_protocol.scenario.load import from_tree
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.observers.checkers.checker import check
+from kantor_worldsim.observers.metrics.result import FaultCounts, Result
+from kantor_worldsim.observers.recording import metrics_of
+from kantor_worldsim.radio.channel import DROPPED, Channel, DeliveryDecision, Sent
+from kantor_worldsim.radio.fault_kernels import in_burst
+from kantor_worldsim.radio.forgeries import FIRST_SEQUENCE
+from kantor_worldsim.radio.link_faults import LinkFaults
+from kantor_worldsim.record.journal import Journal
+from kantor_worldsim.record.records import Batch, Ending, Opening, Record
+from kantor_worldsim.world.maps import Ground
+from support.grounds import drawn, exploration
+from support.missions import explored
+from support.plain_faults import PASS, Fate, PlainFaults
+from support.strategies import SEEDS, examples, mission
 
 Play = Callable[..., tuple[Record, ...]]
 
@@ -71,7 +72,7 @@ class Air:
         for name in self.scenario.roster:
             self.channel.place(name, Pose(*(at or {}).get(name, (0.0, 0.0))))
 
-    def say(self, *sent: Sent) -> list[Verdict]:
+    def say(self, *sent: Sent) -> list[DeliveryDecision]:
         """What becomes of envelopes."""
         return self.channel.transmit(sent)[0]
 
@@ -106,11 +107,11 @@ def chatter(count: int, roster: Sequence[str] = ("r1", "r2", "r3"), size: int = 
     ]
 
 
-def dues(verdicts: Sequence[Verdict]) -> list[int]:
+def dues(verdicts: Sequence[DeliveryDecision]) -> list[int]:
     return [verdict.due_ns for verdict in verdicts]
 
 
-def reached(verdicts: Sequence[Verdict]) -> set[str]:
+def reached(verdicts: Sequence[DeliveryDecision]) -> set[str]:
     """Links over which something passed, as source>target."""
     return {f"{v.source}>{v.target}" for v in verdicts if v.due_ns != DROPPED}
 
@@ -600,7 +601,7 @@ def test_one_fault_more_saves_nobody(
         assert isinstance(fault, Replay | Duplicate) or after[key] >= before[key]
 
 
-def _arrivals(verdicts: Sequence[Verdict]) -> dict[tuple[str, int, str], int]:
+def _arrivals(verdicts: Sequence[DeliveryDecision]) -> dict[tuple[str, int, str], int]:
     """When the first copy of each message that was sent arrives at each receiver."""
     arrivals: dict[tuple[str, int, str], int] = {}
     for source, sequence, target, due_ns in map(msgspec.structs.astuple, verdicts):

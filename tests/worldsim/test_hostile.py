@@ -9,43 +9,43 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_fleet.team import play
-from kantor_protocol.faults import Delay, Drop, Hostile, Partition
-from kantor_protocol.machine import EVERYBODY, SUPERVISOR, Envelope, Pose
-from kantor_protocol.messages import (
+from kantor_fleet.execution.in_process_team import play
+from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, Pose
+from kantor_protocol.scenario.faults.links import Delay, Drop, Hostile, Partition
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import (
     BODY_BYTES_MAX,
-    News,
+    GossipMessage,
     RefusedError,
-    decode_news,
-    encode_news,
+    decode_gossip,
+    encode_gossip,
 )
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim import faults as injection
-from kantor_worldsim.channel import DROPPED, Channel, Sent, Verdict
-from kantor_worldsim.faults import LinkFaults
-from kantor_worldsim.hostile import (
+from kantor_worldsim.radio import link_faults as injection
+from kantor_worldsim.radio.channel import DROPPED, Channel, DeliveryDecision, Sent
+from kantor_worldsim.radio.forgeries import (
     FIRST_SEQUENCE,
     FORGERS,
     OVERSIZED_SHARE,
-    Dice,
+    ForgeryDraws,
     forge,
     forged,
     strangers,
 )
-from kantor_worldsim.records import (
+from kantor_worldsim.radio.link_faults import LinkFaults
+from kantor_worldsim.record.records import (
     Batch,
-    Mailbag,
+    EnvelopeIndex,
     Opening,
     Record,
     decode_record,
     encode_record,
 )
-from kantor_worldsim.world import Site
-from mapping import on_map, site_of
-from strategies import NEWS, SEEDS, examples, mission
+from kantor_worldsim.world.world import WorldSetup
+from support.missions import on_map, site_of
+from support.strategies import NEWS, SEEDS, examples, mission
 
 MS = 1_000_000
-BODY = encode_news(News(1, 7, 1.0, 2.0, b"\1\2\3\4\5\6", b"\0\0\1\1\2\1", b"\0\1\1\0"))
+BODY = encode_gossip(GossipMessage(1, 7, 1.0, 2.0, b"\1\2\3\4\5\6", b"\0\0\1\1\2\1", b"\0\1\1\0"))
 NAMES = ("r1", "r2", "r3")
 
 
@@ -59,7 +59,7 @@ class Air:
         for name in self.scenario.roster:
             self.channel.place(name, Pose(0.0, 0.0))
 
-    def say(self, *sent: Sent) -> tuple[list[Verdict], list[Verdict]]:
+    def say(self, *sent: Sent) -> tuple[list[DeliveryDecision], list[DeliveryDecision]]:
         """What becomes of envelopes, and of what comes beside them."""
         verdicts = self.channel.transmit(sent)[0]
         beside = [v for v in verdicts if v.sequence >= FIRST_SEQUENCE]
@@ -154,7 +154,9 @@ def test_nobody_is_called_like_a_stranger() -> None:
 
 
 def test_every_entry_of_the_catalogue_comes_and_the_oversized_are_rare() -> None:
-    made = [forge(Dice(1, 5, i, 0), Envelope("r1", i, "", BODY), ("x",)) for i in range(8000)]
+    made = [
+        forge(ForgeryDraws(1, 5, i, 0), Envelope("r1", i, "", BODY), ("x",)) for i in range(8000)
+    ]
     oversized = sum(len(body) > BODY_BYTES_MAX for _, body in made)
     strange = sum(source == "x" for source, _ in made)
 
@@ -173,16 +175,18 @@ def test_every_entry_of_the_catalogue_comes_and_the_oversized_are_rare() -> None
     which=st.integers(0, len(FORGERS) - 1),
 )
 def test_forgers_are_total_and_forge_the_same_again(
-    news: News, noise: bytes, seed: int, which: int
+    news: GossipMessage, noise: bytes, seed: int, which: int
 ) -> None:
-    for body in (encode_news(news), noise, b""):
-        first, second = (forged(FORGERS[which], Dice(seed, 1, 2, 3), body) for _ in range(2))
+    for body in (encode_gossip(news), noise, b""):
+        first, second = (
+            forged(FORGERS[which], ForgeryDraws(seed, 1, 2, 3), body) for _ in range(2)
+        )
         assert first == second
 
 
 def _is_news(body: bytes) -> bool:
     try:
-        decode_news(body)
+        decode_gossip(body)
     except RefusedError:
         return False
     return True
@@ -190,7 +194,7 @@ def _is_news(body: bytes) -> bool:
 
 def test_some_forgeries_are_only_found_out_by_what_they_say() -> None:
     """So the door is not all that is tested."""
-    found_out = [f for f in FORGERS if _is_news(forged(f, Dice(1, 1, 1, 1), BODY))]
+    found_out = [f for f in FORGERS if _is_news(forged(f, ForgeryDraws(1, 1, 1, 1), BODY))]
 
     assert len(found_out) >= 8
 
@@ -213,7 +217,7 @@ WORLDS: dict[str, Callable[[], Scenario]] = {
 
 def recorded(scenario: Scenario) -> list[Record]:
     """The records of a mission."""
-    site = site_of(scenario) if scenario.mapping else Site.of(scenario, 1)
+    site = site_of(scenario) if scenario.mapping else WorldSetup.of(scenario, 1)
     records: list[Record] = []
     play(scenario, 1, site, [records.append])
     return records
@@ -252,7 +256,9 @@ def test_nobody_takes_in_anything_of_the_catalogue(
     """
     made: Counter[object] = Counter()
 
-    def in_turn(dice: Dice, envelope: Envelope, names: tuple[str, ...]) -> tuple[str, bytes]:
+    def in_turn(
+        dice: ForgeryDraws, envelope: Envelope, names: tuple[str, ...]
+    ) -> tuple[str, bytes]:
         which = made.total() % (len(FORGERS) + len(names))
         made[which] += 1
         if which < len(FORGERS):
@@ -278,7 +284,7 @@ def test_nobody_takes_in_anything_of_the_catalogue(
 def test_inboxes_with_forgeries_can_be_opened_again() -> None:
     """From the records as they are kept, also when they have to be encoded first."""
     scenario = msgspec.structs.replace(mission(), faults=3 * (Hostile(probability=0.5),))
-    mailbag = Mailbag()
+    mailbag = EnvelopeIndex()
     heard = 0
     for record in recorded(scenario):
         again = decode_record(encode_record(record))

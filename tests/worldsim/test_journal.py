@@ -14,9 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from kantor_fleet.team import play
-from kantor_protocol.scenario import load
-from kantor_worldsim.journal import (
+from kantor_fleet.execution.in_process_team import play
+from kantor_protocol.scenario.load import load
+from kantor_worldsim.observers.metrics.density import DensityMetrics
+from kantor_worldsim.observers.metrics.result import Result
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.record.journal import (
     METRICS_TOPIC,
     RECORD_TOPIC,
     Digest,
@@ -24,19 +27,17 @@ from kantor_worldsim.journal import (
     file_digest,
     read,
 )
-from kantor_worldsim.metrics import Metrics, Result
-from kantor_worldsim.recording import (
+from kantor_worldsim.record.records import Record, decode_record, encode_record
+from kantor_worldsim.record.run_folder import (
     JOURNAL,
     MANIFEST,
     METRICS,
     RESULT,
     SCENARIO,
-    Recording,
     folder_for,
 )
-from kantor_worldsim.records import Record, decode_record, encode_record
-from kantor_worldsim.world import Site
-from strategies import examples, mission
+from kantor_worldsim.world.world import WorldSetup
+from support.strategies import examples, mission
 
 pytestmark = pytest.mark.xdist_group("journal")
 
@@ -48,7 +49,7 @@ LONG = ("robots.count=3", "energy.points=9000", "samples.count=4000", "metrics.e
 
 def write(records: tuple[Record, ...], path: Path) -> Journal:
     """A journal with records and the metrics that follow from them."""
-    journal, metrics = Journal(path), Metrics()
+    journal, metrics = Journal(path), DensityMetrics()
     written = 0
     for record in records:
         journal.take(record)
@@ -90,7 +91,7 @@ def content(records: tuple[Record, ...], folder: Path) -> bytes:
 def run_in(folder: Path, *overrides: str) -> Result:
     """A mission recorded in a folder."""
     scenario = mission(*overrides)
-    site = Site.of(scenario, 1)
+    site = WorldSetup.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process", folder)
     play(scenario, 1, site, [recording.take])
     return recording.finish()

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.grid import CELLS_MAX, FREE, OCCUPIED, UNKNOWN, Frame
-from kantor_protocol.scenario import ScenarioError
-from kantor_worldsim.layouts import LAYOUTS, layout
-from kantor_worldsim.maps import Cells, parts
-from strategies import examples
+from kantor_protocol.base.grid import CELLS_MAX, FREE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_worldsim.world.layouts import LAYOUTS, layout
+from kantor_worldsim.world.maps import Cells, parts
+from support.strategies import examples
 
 SEEDED = [name for name in LAYOUTS if name != "blank"]
 

@@ -6,18 +6,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from kantor_fleet.team import team
-from kantor_protocol.machine import EVERYBODY, SUPERVISOR
-from kantor_protocol.messages import decode_news, encode_news
-from kantor_protocol.packing import put_uint
-from kantor_protocol.replica import read_have
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.liveness import Liveness, settling_ns
-from kantor_worldsim.loop import in_process, simulate
-from kantor_worldsim.records import Act, Batch, Ending, Record
-from kantor_worldsim.stage import Stage
-from kantor_worldsim.world import Site
-from strategies import mission
+from kantor_fleet.execution.in_process_team import team
+from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR
+from kantor_protocol.base.varint import put_uint
+from kantor_protocol.replication.replica import read_have
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import decode_gossip, encode_gossip
+from kantor_worldsim.engine.event_loop import simulate
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.observers.checkers.liveness import LivenessChecker, settling_ns
+from kantor_worldsim.record.records import Batch, Ending, Record, StepRecord
+from kantor_worldsim.world.world import WorldSetup
+from support.strategies import mission
 
 SIZE = ("samples.count=60", "energy.points=90", "energy.steps=60", "limit_s=300")
 LOST = "faults=[{kind='kill', who=['r2'], from_s=0.75, until_s=1.5, disk='lost'}]"
@@ -26,7 +27,7 @@ AWAY = "faults=[{kind='kill', who=['supervisor'], from_s=0.5, until_s=2.0}]"
 GUIDED = "coordination=centralized"
 
 
-class _Patient(Stage):
+class _Patient(Simulation):
     """A stage on which the mission goes on for a while when everybody rests."""
 
     rested_ns = -1
@@ -43,15 +44,15 @@ class _Patient(Stage):
 def rested(*overrides: str, seed: int = 1) -> list[Record]:
     """The records of a mission that goes on until news could be everywhere."""
     scenario: Scenario = mission(*SIZE, *overrides)
-    site = Site.of(scenario, seed)
+    site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
     stage = _Patient(scenario, seed, site, [records.append])
     simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
     return records
 
 
-def judged(records: Sequence[Record]) -> Liveness:
-    referee = Liveness()
+def judged(records: Sequence[Record]) -> LivenessChecker:
+    referee = LivenessChecker()
     for record in records:
         referee.take(record)
     return referee
@@ -96,11 +97,11 @@ def test_nothing_is_judged_before_it_can_be_known() -> None:
     assert lasting.judged == {"L2"}
 
 
-def acts(records: Sequence[Record], name: str) -> list[Act]:
+def acts(records: Sequence[Record], name: str) -> list[StepRecord]:
     return [act for r in records if isinstance(r, Batch) for act in r.acts if act.name == name]
 
 
-def altered(records: Sequence[Record], change: Callable[[Act], Act]) -> list[Record]:
+def altered(records: Sequence[Record], change: Callable[[StepRecord], StepRecord]) -> list[Record]:
     """The records with every act changed."""
     return [
         msgspec.structs.replace(r, acts=tuple(map(change, r.acts))) if isinstance(r, Batch) else r
@@ -111,7 +112,7 @@ def altered(records: Sequence[Record], change: Callable[[Act], Act]) -> list[Rec
 def returning(records: Sequence[Record], name: str, **values: object) -> list[Record]:
     """The records with everything that a participant returned changed."""
 
-    def change(act: Act) -> Act:
+    def change(act: StepRecord) -> StepRecord:
         if act.name != name or act.outputs is None:
             return act
         told = msgspec.structs.replace(act.outputs, **values)
@@ -120,13 +121,13 @@ def returning(records: Sequence[Record], name: str, **values: object) -> list[Re
     return altered(records, change)
 
 
-def said(have: Sequence[int], act: Act) -> object:
+def said(have: Sequence[int], act: StepRecord) -> object:
     """The last message of an act with other log lengths."""
     assert act.outputs is not None
     (envelope,) = act.outputs.outbox
-    news = decode_news(envelope.body)
+    news = decode_gossip(envelope.body)
     rest = news.have[len(_uints(read_have(news.have, 3) or [])) :]
-    body = encode_news(msgspec.structs.replace(news, have=_uints(have) + rest))
+    body = encode_gossip(msgspec.structs.replace(news, have=_uints(have) + rest))
     return (msgspec.structs.replace(envelope, body=body),)
 
 
@@ -137,9 +138,9 @@ def _uints(values: Sequence[int]) -> bytes:
     return buffer[:at].tobytes()
 
 
-def have_of(act: Act) -> list[int]:
+def have_of(act: StepRecord) -> list[int]:
     assert act.outputs is not None
-    return read_have(decode_news(act.outputs.outbox[0].body).have, 3) or []
+    return read_have(decode_gossip(act.outputs.outbox[0].body).have, 3) or []
 
 
 def test_who_never_learns_is_named() -> None:
@@ -167,7 +168,7 @@ def test_who_does_not_turn_to_others_is_named(target: str) -> None:
     """L3: one that waits for a dead supervisor, and one that ignores it when it is back."""
     records = rested(AWAY, GUIDED)
 
-    def change(act: Act) -> Act:
+    def change(act: StepRecord) -> StepRecord:
         if act.name != "r1" or act.outputs is None:
             return act
         box = tuple(msgspec.structs.replace(e, target=target) for e in act.outputs.outbox)

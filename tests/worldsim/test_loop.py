@@ -10,18 +10,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_fleet.team import play, team
-from kantor_protocol.clock import Clock, clocks
-from kantor_protocol.machine import Exchange, Inputs, Outputs, ParticipantId, Pose
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.channel import DROPPED
-from kantor_worldsim.checkers import check
-from kantor_worldsim.journal import Journal
-from kantor_worldsim.loop import Agenda, in_process, simulate
-from kantor_worldsim.records import Batch, Ending, Record
-from kantor_worldsim.stage import Stage, Step
-from kantor_worldsim.world import Site
-from strategies import SEEDS, examples, mission
+from kantor_fleet.execution.in_process_team import play, team
+from kantor_protocol.base.machine import Exchange, Inputs, Outputs, ParticipantId, Pose
+from kantor_protocol.scenario.clocks import StepClock, step_clocks
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.engine.event_loop import Agenda, simulate
+from kantor_worldsim.engine.simulation import Simulation, Step
+from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.observers.checkers.checker import check
+from kantor_worldsim.radio.channel import DROPPED
+from kantor_worldsim.record.journal import Journal
+from kantor_worldsim.record.records import Batch, Ending, Record
+from kantor_worldsim.world.world import WorldSetup
+from support.strategies import SEEDS, examples, mission
 
 Play = Callable[..., tuple[Record, ...]]
 MS = 1_000_000
@@ -57,12 +58,12 @@ def run(
     *,
     exchange: Callable[[Exchange], Exchange] = lambda plain: plain,
     stopped: Callable[[], bool] = lambda: False,
-    prepare: Callable[[Stage], None] = lambda stage: None,
+    prepare: Callable[[Simulation], None] = lambda stage: None,
 ) -> list[Record]:
     """The records of a mission whose exchange, stop or stage is meddled with."""
-    site = Site.of(scenario, 1)
+    site = WorldSetup.of(scenario, 1)
     records: list[Record] = []
-    stage = Stage(scenario, 1, site, [records.append])
+    stage = Simulation(scenario, 1, site, [records.append])
     prepare(stage)
     simulate(stage, exchange(in_process(team(scenario, 1, site))), 1, stopped)
     return records
@@ -75,7 +76,7 @@ def test_same_seed_gives_the_same_record() -> None:
     """Twice the same digest; another seed, another one."""
     scenario = mission("coordination=centralized", *LOSSY)
     first, second = (digest(tuple(run(scenario))) for _ in range(2))
-    site = Site.of(scenario, 2)
+    site = WorldSetup.of(scenario, 2)
     others: list[Record] = []
     play(scenario, 2, site, [others.append])
 
@@ -104,7 +105,7 @@ for coordination in ("centralized", "decentralized"):
 
 def test_record_does_not_depend_on_the_hash_seed() -> None:
     """No set or dictionary order of the interpreter reaches a record."""
-    from strategies import SMALL
+    from support.strategies import SMALL
 
     told = set()
     for hash_seed in ("0", "1", "4711"):
@@ -124,11 +125,11 @@ def test_record_does_not_depend_on_the_hash_seed() -> None:
 
 def by_definition(scenario: Scenario, seed: int) -> list[Record]:
     """What simulate stands for: one moment after the other, without looking ahead."""
-    site = Site.of(scenario, seed)
+    site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    stage = Stage(scenario, seed, site, [records.append])
+    stage = Simulation(scenario, seed, site, [records.append])
     machines = team(scenario, seed, site)
-    owned = clocks(scenario, seed)
+    owned = step_clocks(scenario, seed)
     steps = dict.fromkeys(owned, 1)
     while True:
         due = {name: clock.due_ns(steps[name]) for name, clock in owned.items()}
@@ -175,7 +176,7 @@ def test_agenda_is_in_order_and_complete(
 ) -> None:
     """Every step of every clock comes, once, in the order of time, none beyond the look-ahead."""
     owned = {
-        f"r{i}": Clock(period_ms * MS, phase_ms * MS, 0, 0, seed, i)
+        f"r{i}": StepClock(period_ms * MS, phase_ms * MS, 0, 0, seed, i)
         for i, (period_ms, phase_ms) in enumerate(zip(periods_ms, phases_ms, strict=False))
     }
     agenda = Agenda(owned)
@@ -250,7 +251,9 @@ def test_messages_pass_the_codec() -> None:
             returned.append(Outputs(1, Pose(1.0, 2.0), goal=(3.0, 4.0), spent=b"abc"))
             return returned[-1]
 
-    inputs = Inputs(5, Stage(mission(), 1, Site.of(mission(), 1), []).inputs("r1", 5).observation)
+    inputs = Inputs(
+        5, Simulation(mission(), 1, WorldSetup.of(mission(), 1), []).inputs("r1", 5).observation
+    )
     outputs = in_process({"r1": Echo()})({"r1": inputs})["r1"]
 
     assert given == [inputs]
@@ -297,7 +300,7 @@ def test_others_go_on_without_a_missing_robot(merge: tuple[str, ...]) -> None:
 def test_robot_that_has_left_is_not_waited_for() -> None:
     """When whoever runs the robots knows that one is gone, the mission ends with the others."""
 
-    def leave(stage: Stage) -> None:
+    def leave(stage: Simulation) -> None:
         stage.gone = {"r2"}
 
     records = run(mission("energy.steps=60"), exchange=without("r2", 0), prepare=leave)

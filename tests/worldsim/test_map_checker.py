@@ -8,23 +8,29 @@ import msgspec
 import numpy as np
 import pytest
 
-from grounds import drawn
-from kantor_fleet.team import play
-from kantor_protocol.evidence import void
-from kantor_protocol.grid import FREE, OCCUPIED
-from kantor_protocol.machine import Envelope, Pose, State
-from kantor_protocol.messages import Array, News, RefusedError, decode_news, encode_news
-from kantor_protocol.packing import put_int, put_uint
-from kantor_protocol.replica import read_have
-from kantor_worldsim.checkers import Checker, check
-from kantor_worldsim.map_checker import MapRules
-from kantor_worldsim.records import Act, Batch, Incident, Opening, Record
-from mapping import ROOMS, explored, on_map, site_of
-from referees import listed, rules
-from replicas import read_logs
+from kantor_fleet.execution.in_process_team import play
+from kantor_protocol.base.grid import FREE, OCCUPIED
+from kantor_protocol.base.machine import Envelope, Pose, State
+from kantor_protocol.base.varint import put_int, put_uint
+from kantor_protocol.replication.occupancy_log import dead_frontier
+from kantor_protocol.replication.replica import read_have
+from kantor_protocol.wire.messages import (
+    Array,
+    GossipMessage,
+    RefusedError,
+    decode_gossip,
+    encode_gossip,
+)
+from kantor_worldsim.observers.checkers.checker import Checker, check
+from kantor_worldsim.observers.checkers.mapping import MapChecker
+from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
+from support.checkers import listed, rules
+from support.grounds import drawn
+from support.missions import ROOMS, explored, on_map, site_of
+from support.replicas import read_logs
 
 Records = Sequence[Record]
-Change = Callable[[Act], Act]
+Change = Callable[[StepRecord], StepRecord]
 
 ALONE = ("radio.range_m=0.01", "radio.beacon=state")
 """Nobody hears anybody, and everybody tells all that it knows all the time."""
@@ -47,12 +53,12 @@ def batches(records: Records) -> list[Batch]:
     return [record for record in records if isinstance(record, Batch)]
 
 
-def acts_of(records: Records, name: str) -> list[Act]:
+def acts_of(records: Records, name: str) -> list[StepRecord]:
     """What a robot did, in order."""
     return [act for batch in batches(records) for act in batch.acts if act.name == name]
 
 
-def put(records: Records, old: Act, change: Change) -> list[Record]:
+def put(records: Records, old: StepRecord, change: Change) -> list[Record]:
     """The records with one act changed."""
 
     def changed(batch: Batch) -> Batch:
@@ -74,23 +80,23 @@ def goes(x_m: float, y_m: float) -> Change:
     )
 
 
-def hurried(records: Records, act: Act, change: Change) -> list[Record]:
+def hurried(records: Records, act: StepRecord, change: Change) -> list[Record]:
     """The records with one act changed, in a world without a speed limit."""
     return put(opened(records, scenario=on_map("vehicle.speed_m_s=1000")), act, change)
 
 
-def news_of(act: Act) -> News:
+def news_of(act: StepRecord) -> GossipMessage:
     assert act.outputs is not None
-    return decode_news(act.outputs.outbox[0].body)
+    return decode_gossip(act.outputs.outbox[0].body)
 
 
-def says(change: Callable[[News], News]) -> Change:
+def says(change: Callable[[GossipMessage], GossipMessage]) -> Change:
     """A change of the message that a robot sends."""
 
-    def changed(act: Act) -> Act:
+    def changed(act: StepRecord) -> StepRecord:
         assert act.outputs is not None
         (envelope,) = act.outputs.outbox
-        body = encode_news(change(decode_news(envelope.body)))
+        body = encode_gossip(change(decode_gossip(envelope.body)))
         sent: tuple[Envelope, ...] = (msgspec.structs.replace(envelope, body=body),)
         return msgspec.structs.replace(
             act, outputs=msgspec.structs.replace(act.outputs, outbox=sent)
@@ -115,7 +121,7 @@ def suffix(origin: int, start: int, entries: Sequence[int]) -> bytes:
     return uints(origin, start, len(entries), len(entries)) + out[:at].tobytes()
 
 
-def having(news: News, **lengths: int) -> News:
+def having(news: GossipMessage, **lengths: int) -> GossipMessage:
     """The news with other lengths in its version vector; r1, r2: by how much they differ."""
     have = read_have(news.have, 2)
     assert have is not None
@@ -123,14 +129,16 @@ def having(news: News, **lengths: int) -> News:
     return msgspec.structs.replace(news, have=uints(*told))
 
 
-def own_log(act: Act, origin: int = 0) -> list[int]:
+def own_log(act: StepRecord, origin: int = 0) -> list[int]:
     """What a robot sends of its own log."""
     rows = read_logs(news_of(act).logs, valued=False)
     assert rows is not None
     return [int(entry) for who, _, entry, _ in rows if who == origin]
 
 
-def logging(log: Sequence[int], origin: int = 0, start: int = 0) -> Callable[[News], News]:
+def logging(
+    log: Sequence[int], origin: int = 0, start: int = 0
+) -> Callable[[GossipMessage], GossipMessage]:
     """A change of the logs that are sent: one suffix instead."""
     return lambda news: msgspec.structs.replace(news, logs=suffix(origin, start, log))
 
@@ -178,14 +186,14 @@ def _tells_too_much(records: Records) -> list[Record]:
 
 def _calls_far_frontier_none(records: Records) -> list[Record]:
     act = acts_of(records, "r1")[5]
-    far = void(ROOMS.frame, ROOMS.frame.cell_of(14.5, 1.5))
+    far = dead_frontier(ROOMS.frame, ROOMS.frame.cell_of(14.5, 1.5))
     change = says(lambda news: having(logging([*own_log(act), far])(news), r1=1))
     return put(records, act, change)
 
 
 def _calls_near_frontier_none(records: Records) -> list[Record]:
     act = acts_of(records, "r1")[-1]
-    near = void(ROOMS.frame, ROOMS.frame.cell_of(2.5, 2.5))
+    near = dead_frontier(ROOMS.frame, ROOMS.frame.cell_of(2.5, 2.5))
     change = says(lambda news: having(logging([*own_log(act), near])(news), r1=1))
     return put(records, act, change)
 
@@ -262,7 +270,7 @@ def _forwards_too_much(records: Records) -> list[Record]:
 def _gives_up(records: Records) -> list[Record]:
     act = acts_of(records, "r1")[3]
 
-    def change(act: Act) -> Act:
+    def change(act: StepRecord) -> StepRecord:
         assert act.outputs is not None
         rests = msgspec.structs.replace(act.outputs, state=State.FINISHED)
         return msgspec.structs.replace(act, outputs=rests)
@@ -332,7 +340,7 @@ def test_broken_rule_is_named(name: str) -> None:
 
 def test_every_rule_can_be_broken() -> None:
     """No rule is without a record that breaks it."""
-    assert listed(MapRules) == {name.partition("-")[0] for name in BROKEN}
+    assert listed(MapChecker) == {name.partition("-")[0] for name in BROKEN}
 
 
 def test_frontier_may_be_called_none_from_beside_it() -> None:
@@ -351,7 +359,7 @@ def test_frontier_may_be_called_none_after_heading_for_it_in_vain() -> None:
     assert act.outputs.goal is not None
     assert act.outputs.goal == acts[first].outputs.goal  # type: ignore[union-attr]
     cell = ROOMS.frame.cell_of(*act.outputs.goal)
-    tells = logging([*own_log(act), void(ROOMS.frame, cell)])
+    tells = logging([*own_log(act), dead_frontier(ROOMS.frame, cell)])
     given_up = put(records, act, says(lambda news: having(tells(news), r1=1)))
 
     def accused(records: Records) -> bool:
@@ -461,7 +469,7 @@ def test_robot_that_goes_on_with_its_old_log_is_named() -> None:
     """Two incarnations never share a log."""
     fault = "{kind='kill', who=['r2'], from_s=0.75, until_s=1.5}"
     records = explored(f"faults=[{fault}]")
-    start = next(r for r in records if isinstance(r, Incident) and r.what == "start")
+    start = next(r for r in records if isinstance(r, ProcessEvent) and r.what == "start")
     reborn = msgspec.structs.replace(start, epoch=1)
     told = [reborn if record is start else record for record in records]
 

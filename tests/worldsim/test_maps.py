@@ -16,10 +16,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from kantor_protocol.grid import CELLS_MAX, FREE, OCCUPIED, UNKNOWN, Frame
-from kantor_protocol.scenario import ScenarioError
-from kantor_worldsim.maps import Cells, Ground, parts, read
-from strategies import examples
+from kantor_protocol.base.grid import CELLS_MAX, FREE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_worldsim.world.maps import Cells, Ground, parts, read
+from support.strategies import examples
 
 NAV2 = {
     "image": "map.pgm",

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from kantor_fleet.catalog import find
-from kantor_fleet.run import summary
-from kantor_fleet.team import play, team
-from kantor_protocol.machine import (
+from kantor_fleet.execution.in_process_team import play, team
+from kantor_fleet.execution.mission import summary
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.base.machine import (
     EVERYBODY,
     SUPERVISOR,
     Envelope,
@@ -21,30 +21,41 @@ from kantor_protocol.machine import (
     Pose,
     State,
 )
-from kantor_protocol.packing import Pairs
-from kantor_protocol.scenario import Scenario, parse
-from kantor_protocol.weights import WeightsSubscriber
-from kantor_worldsim.channel import DROPPED, Verdict
-from kantor_worldsim.checkers import FORGED_FIRST
-from kantor_worldsim.loop import in_process, simulate
-from kantor_worldsim.metrics import Metrics, Rejoining, Result, Row
-from kantor_worldsim.recording import Recording
-from kantor_worldsim.records import Act, Batch, Ending, Incident, Opening, Record, opening_of
-from kantor_worldsim.stage import Stage
-from kantor_worldsim.world import Ruling, Site
-from strategies import mission
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.weights import WeightsSubscriber
+from kantor_worldsim.engine.event_loop import simulate
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.observers.checkers.state import FORGED_FIRST
+from kantor_worldsim.observers.metrics.density import DensityMetrics, DensityRow
+from kantor_worldsim.observers.metrics.result import Rejoining, Result
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.radio.channel import DROPPED, DeliveryDecision
+from kantor_worldsim.record.records import (
+    Batch,
+    Ending,
+    Opening,
+    ProcessEvent,
+    Record,
+    StepRecord,
+    opening_of,
+)
+from kantor_worldsim.world.world import StepVerdict, WorldSetup
+from support.strategies import mission
 
 Play = Callable[..., tuple[Record, ...]]
 PERIOD_NS = 100_000_000
 
 
-def result_of(metrics: Metrics) -> Result:
+def result_of(metrics: DensityMetrics) -> Result:
     return metrics.result(exchange="-", digest="-", wall_s=0.0, record="whole", complaints=())
 
 
-def measured(records: Iterable[Record]) -> Metrics:
+def measured(records: Iterable[Record]) -> DensityMetrics:
     """What records are measured by."""
-    metrics = Metrics()
+    metrics = DensityMetrics()
     for record in records:
         metrics.take(record)
     return metrics
@@ -79,12 +90,14 @@ class Line:
 
     def __init__(self, *overrides: str) -> None:
         scenario = parse(LINE, "line", overrides)
-        site = Site(np.array(SAMPLES_M), np.zeros((0, 2)), np.array([[0.0, 0.0], [40.0, 0.0]]))
-        self.metrics = Metrics()
+        site = WorldSetup(
+            np.array(SAMPLES_M), np.zeros((0, 2)), np.array([[0.0, 0.0], [40.0, 0.0]])
+        )
+        self.metrics = DensityMetrics()
         self.metrics.take(opening_of(scenario, 1, site, {"r1": (), "r2": ()}))
         self.tick = 0
 
-    def play(self, *acts: Act) -> None:
+    def play(self, *acts: StepRecord) -> None:
         """One period."""
         self.tick += 1
         self.metrics.take(Batch(self.tick * PERIOD_NS, acts, (), 0))
@@ -96,24 +109,24 @@ class Line:
         sample: int,
         left: int,
         violations: tuple[str, ...] = (),
-    ) -> Act:
+    ) -> StepRecord:
         """A robot goes to x and ships one unit to a sample, of which its view then holds `left`."""
         pose = Pose(x_m, 0.0)
-        return Act(
+        return StepRecord(
             name,
             self.tick * PERIOD_NS,
             Observation(self.tick, pose),
             (),
             Outputs(self.tick + 1, pose, spent=packed((sample, 1)), lowered=packed((sample, left))),
-            Ruling(pose, violations=violations),
+            StepVerdict(pose, violations=violations),
         )
 
-    def rows(self) -> list[Row]:
+    def rows(self) -> list[DensityRow]:
         self.metrics.take(Ending(self.tick * PERIOD_NS, "done"))
         return self.metrics.rows
 
 
-def bounds(rows: Sequence[Row]) -> list[tuple[float, float | None, float]]:
+def bounds(rows: Sequence[DensityRow]) -> list[tuple[float, float | None, float]]:
     return [(row.w_ub_paper, row.w_ub_tight, row.w_ub_instant) for row in rows]
 
 
@@ -210,7 +223,7 @@ def test_cost_is_taken_where_the_sample_then_is() -> None:
 def _walking_run() -> Iterable[Record]:
     scenario = mission("samples.diffusion_m=3.0", "metrics.every=1")
     records: list[Record] = []
-    site = Site.of(scenario, 1)
+    site = WorldSetup.of(scenario, 1)
     play(scenario, 1, site, [records.append])
     return records
 
@@ -257,7 +270,7 @@ def test_views_follow_the_robots(coordination: str, merge: tuple[str, ...]) -> N
         "publish.weights_every=3",
         *merge,
     )
-    site = Site.of(scenario, 1)
+    site = WorldSetup.of(scenario, 1)
     machines = team(scenario, 1, site)
     subscribers = {name: WeightsSubscriber() for name in scenario.roster}
     pairs = Pairs()
@@ -279,7 +292,7 @@ def test_views_follow_the_robots(coordination: str, merge: tuple[str, ...]) -> N
                 assert published(subscribers[act.name]) == held.tolist()
             compared += 1
 
-    stage = Stage(scenario, 1, site, [compare])
+    stage = Simulation(scenario, 1, site, [compare])
     simulate(stage, in_process(machines), 1, lambda: False)
 
     assert compared > 80
@@ -308,7 +321,7 @@ def full_runs() -> Callable[[str], Result]:
     def run(name: str) -> Result:
         if name not in results:
             scenario = find(name)
-            site = Site.of(scenario, 0)
+            site = WorldSetup.of(scenario, 0)
             recording = Recording(scenario, 0, "in-process")
             play(scenario, 0, site, [recording.take])
             results[name] = recording.finish()
@@ -379,7 +392,7 @@ def test_absences_and_refused_messages_are_counted() -> None:
     line.metrics.take(Batch(PERIOD_NS, (), (), 0, absent=("r1", "r2")))
     pose = Pose(0.0, 0.0)
     refusing = Outputs(1, pose, refused=3)
-    act = Act("r1", PERIOD_NS, Observation(0, pose), (), refusing, Ruling(pose))
+    act = StepRecord("r1", PERIOD_NS, Observation(0, pose), (), refusing, StepVerdict(pose))
     line.metrics.take(Batch(2 * PERIOD_NS, (act,), (), 0))
     line.metrics.take(Batch(3 * PERIOD_NS, (act,), (), 0))
     line.rows()
@@ -455,12 +468,12 @@ def test_times_to_rejoin_are_quantiles_that_happened() -> None:
 def test_view_of_a_new_incarnation_is_full_again(played: Play) -> None:
     """What it had learnt counts no more, until it learns it again."""
     records = played(*STRUCK, "merge=min", "claims=false")
-    metrics = Metrics()
+    metrics = DensityMetrics()
     before = after = 0
     for record in records:
-        before = int(metrics._tally.views[1].sum()) if isinstance(record, Incident) else before
+        before = int(metrics._tally.views[1].sum()) if isinstance(record, ProcessEvent) else before
         metrics.take(record)
-        if isinstance(record, Incident) and record.epoch:
+        if isinstance(record, ProcessEvent) and record.epoch:
             after = int(metrics._tally.views[1].sum())
             break
 
@@ -474,7 +487,7 @@ def test_unfinished_team_has_no_finishing_tick() -> None:
     pose = Pose(0.0, 0.0)
     for name, state in (("r1", State.FINISHED), ("r2", State.EXHAUSTED)):
         outputs = Outputs(1, pose, state=state)
-        act = Act(name, PERIOD_NS, Observation(0, pose), (), outputs, Ruling(pose))
+        act = StepRecord(name, PERIOD_NS, Observation(0, pose), (), outputs, StepVerdict(pose))
         line.metrics.take(Batch(PERIOD_NS, (act,), (), 0))
     line.rows()
 
@@ -489,7 +502,7 @@ def test_bytes_are_payload_on_the_bus() -> None:
     outbox = (Envelope("r1", 1, EVERYBODY, bytes(20)), Envelope("r1", 2, "r2", bytes(10)))
     for name in ("r1", "r2", SUPERVISOR):
         outputs = Outputs(1, pose, weights=bytes(6), outbox=outbox if name != "r2" else ())
-        act = Act(name, PERIOD_NS, Observation(0, pose), (), outputs, Ruling(pose))
+        act = StepRecord(name, PERIOD_NS, Observation(0, pose), (), outputs, StepVerdict(pose))
         line.metrics.take(Batch(PERIOD_NS, (act,), (), 0))
     line.rows()
     wire = result_of(line.metrics).bytes_per_robot_tick
@@ -536,13 +549,13 @@ def test_bound_and_mass_never_rise_in_turn(played: Play) -> None:
 
 def test_glance_before_anything_is_empty() -> None:
     """Progress can be asked for at any time."""
-    assert Metrics().glance().energy_spent == 0
+    assert DensityMetrics().glance().energy_spent == 0
 
 
 def test_glance_tells_the_rate_of_deliveries() -> None:
     """Deliveries a simulated second, over the last rows."""
     line = Line()
-    verdicts = (Verdict("r1", 1, "r2", 0), Verdict("r2", 1, "r1", DROPPED))
+    verdicts = (DeliveryDecision("r1", 1, "r2", 0), DeliveryDecision("r2", 1, "r1", DROPPED))
     for tick in range(1, 31):
         line.metrics.take(Batch(tick * PERIOD_NS, (), verdicts, 0))
     glance = line.metrics.glance()
@@ -563,22 +576,22 @@ def test_period_of_rows_is_chosen_by_size() -> None:
 
 
 def _opening_alone(scenario: Scenario) -> list[Record]:
-    site = Site.of(scenario, 1)
+    site = WorldSetup.of(scenario, 1)
     return [opening_of(scenario, 1, site, dict.fromkeys(scenario.robot_ids, ()))]
 
 
 def test_metrics_file_has_the_rows(tmp_path: Path) -> None:
     """metrics.csv is the rows, one line each, an empty cell where there is no value."""
     scenario = mission("merge=min", "claims=false", "metrics.every=1")
-    site = Site.of(scenario, 1)
+    site = WorldSetup.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process", tmp_path)
     play(scenario, 1, site, [recording.take])
     recording.finish()
     head, *lines = (tmp_path / "metrics.csv").read_text(encoding="utf-8").splitlines()
     rows = recording.metrics.rows
     cells = [line.split(",") for line in lines]
-    tight = Row._fields.index("w_ub_tight")
+    tight = DensityRow._fields.index("w_ub_tight")
 
-    assert head.split(",") == list(Row._fields)
+    assert head.split(",") == list(DensityRow._fields)
     assert [line[tight] == "" for line in cells] == [row.w_ub_tight is None for row in rows]
     assert [float(line[4]) for line in cells] == [row.w_ub_paper for row in rows]

@@ -4,9 +4,10 @@ import itertools
 
 import pytest
 
-from kantor_protocol.scenario import Scenario, parse
-from kantor_worldsim.outages import Deed, Outages, deeds_of
-from strategies import SMALL
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.engine.process_faults import ProcessFaults, ScheduledProcessFault, schedule_of
+from support.strategies import SMALL
 
 MS = 1_000_000
 
@@ -31,17 +32,17 @@ ASKS = 'kind = "impostor"; who = ["r1"]; from_s = 2.0'
 
 def test_what_ends_comes_before_what_begins() -> None:
     """In order of time, then ends, then of the list: a robot can be started and paused at once."""
-    deeds = deeds_of(troubled(PAUSE, FOR_GOOD, ASKS, KILL))
+    deeds = schedule_of(troubled(PAUSE, FOR_GOOD, ASKS, KILL))
 
     assert deeds == [
-        Deed(1000 * MS, 3, "r1", "kill", "torn", mid_step=True),
-        Deed(2000 * MS, 3, "r1", "start", "torn", mid_step=True),
-        Deed(2000 * MS, 0, "r1", "pause"),
-        Deed(2000 * MS, 0, "r3", "pause"),
-        Deed(2000 * MS, 1, "r2", "kill"),
-        Deed(2000 * MS, 2, "r1", "pretend"),
-        Deed(3000 * MS, 0, "r1", "resume"),
-        Deed(3000 * MS, 0, "r3", "resume"),
+        ScheduledProcessFault(1000 * MS, 3, "r1", "kill", "torn", mid_step=True),
+        ScheduledProcessFault(2000 * MS, 3, "r1", "start", "torn", mid_step=True),
+        ScheduledProcessFault(2000 * MS, 0, "r1", "pause"),
+        ScheduledProcessFault(2000 * MS, 0, "r3", "pause"),
+        ScheduledProcessFault(2000 * MS, 1, "r2", "kill"),
+        ScheduledProcessFault(2000 * MS, 2, "r1", "pretend"),
+        ScheduledProcessFault(3000 * MS, 0, "r1", "resume"),
+        ScheduledProcessFault(3000 * MS, 0, "r3", "resume"),
     ]
 
 
@@ -49,7 +50,7 @@ def test_world_sim_comes_first_and_goes_last() -> None:
     """Whoever starts, or stops, at the same moment is seen by it."""
     outage = 'kind = "kill"; who = ["worldsim"]; from_s = 1.0; until_s = 2.0'
     pause = 'kind = "pause"; who = ["r3"]; from_s = 1.0; until_s = 2.0'
-    deeds = deeds_of(troubled(outage, pause))
+    deeds = schedule_of(troubled(outage, pause))
 
     assert [(deed.who, deed.what) for deed in deeds] == [
         ("r3", "pause"),
@@ -83,14 +84,14 @@ def test_world_sim_comes_first_and_goes_last() -> None:
 )
 def test_who_is_idle_when(who: str, at_ms: int, idle: bool) -> None:  # noqa: FBT001
     """From the beginning of a window up to its end; everybody is while world-sim is."""
-    outages = Outages(troubled(KILL, FOR_GOOD, PAUSE, DARK, SLOW))
+    outages = ProcessFaults(troubled(KILL, FOR_GOOD, PAUSE, DARK, SLOW))
 
     assert outages.idle(who, at_ms * MS) == idle
 
 
 def test_nobody_is_idle_or_dies_while_it_is_quiet() -> None:
     """Before the first window and after the last; windows of clocks and of links do not count."""
-    outages = Outages(troubled(KILL, PAUSE, AHEAD))
+    outages = ProcessFaults(troubled(KILL, PAUSE, AHEAD))
     quiet = [outages.quiet(at_ms * MS, (at_ms + 99) * MS) for at_ms in range(0, 9000, 100)]
 
     for i, is_quiet in enumerate(quiet):
@@ -100,7 +101,7 @@ def test_nobody_is_idle_or_dies_while_it_is_quiet() -> None:
     assert quiet[0]
     assert quiet[-1]
     assert not all(quiet)
-    assert Outages(troubled(AHEAD)).quiet(0, 2**62)
+    assert ProcessFaults(troubled(AHEAD)).quiet(0, 2**62)
 
 
 @pytest.mark.parametrize(
@@ -115,19 +116,19 @@ def test_nobody_is_idle_or_dies_while_it_is_quiet() -> None:
 )
 def test_faults_of_a_clock_add_up(at_ms: int, skew_ns: int) -> None:
     """It jumps, runs wrong, and jumps back."""
-    assert Outages(troubled(AHEAD, BEHIND)).skew_ns("r3", at_ms * MS) == skew_ns
+    assert ProcessFaults(troubled(AHEAD, BEHIND)).skew_ns("r3", at_ms * MS) == skew_ns
 
 
 def test_no_clock_shows_a_time_before_the_start() -> None:
     """Messages carry times that are not negative."""
     early = 'kind = "clock"; who = ["r3"]; offset_s = -2.5'
 
-    assert Outages(troubled(early)).skew_ns("r3", 1000 * MS) == -1000 * MS
+    assert ProcessFaults(troubled(early)).skew_ns("r3", 1000 * MS) == -1000 * MS
 
 
 def test_who_dies_in_a_step() -> None:
     """A step to die in is any within the window."""
-    outages = Outages(troubled(KILL, FOR_GOOD))
+    outages = ProcessFaults(troubled(KILL, FOR_GOOD))
 
     assert [outages.dies("r1", at_ms * MS) for at_ms in (999, 1000, 2000)] == [False, True, False]
     assert not outages.dies("r2", 2500 * MS)
@@ -137,7 +138,7 @@ def test_who_dies_in_a_step() -> None:
 def test_every_deed_is_handed_out_once(done: int) -> None:
     """One by one, when it is due, from the beginning or from where somebody left off."""
     scenario = troubled(KILL, ASKS, PAUSE, DARK)
-    outages, left = Outages(scenario, done), deeds_of(scenario)[done:]
+    outages, left = ProcessFaults(scenario, done), schedule_of(scenario)[done:]
 
     for deed in left:
         assert outages.next_ns == deed.at_ns

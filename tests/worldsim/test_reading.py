@@ -10,15 +10,28 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from kantor_protocol.machine import SUPERVISOR, Envelope, Observation, Outputs, Pose
-from kantor_protocol.messages import News, RefusedError, decode_news, encode
-from kantor_protocol.packing import Pairs
-from kantor_worldsim import reading as of
-from kantor_worldsim.channel import DROPPED, Verdict
-from kantor_worldsim.reading import Reader, Reading, head_of, parts_of_news, skip
-from kantor_worldsim.records import Act, Batch, Opening, Record, decode_record, encode_record
-from kantor_worldsim.world import Ruling
-from strategies import NEWS, examples
+from kantor_protocol.base.machine import SUPERVISOR, Envelope, Observation, Outputs, Pose
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.wire.messages import GossipMessage, RefusedError, decode_gossip, encode
+from kantor_worldsim.radio.channel import DROPPED, DeliveryDecision
+from kantor_worldsim.record import columnar as of
+from kantor_worldsim.record.columnar import (
+    ColumnarBatch,
+    ColumnarDecoder,
+    head_of,
+    parts_of_news,
+    skip,
+)
+from kantor_worldsim.record.records import (
+    Batch,
+    Opening,
+    Record,
+    StepRecord,
+    decode_record,
+    encode_record,
+)
+from kantor_worldsim.world.world import StepVerdict
+from support.strategies import NEWS, examples
 
 Play = Callable[..., tuple[Record, ...]]
 
@@ -75,7 +88,7 @@ def addressed(envelope: Envelope, roster: tuple[str, ...]) -> list[Any]:
     return [place(source, roster), sequence, place(target, roster), body]
 
 
-def tabled(reading: Reading) -> list[Any]:
+def tabled(reading: ColumnarBatch) -> list[Any]:
     """The same from the tables."""
 
     def rows(table: np.ndarray, first: int, count: int) -> list[list[int]] | None:
@@ -111,23 +124,25 @@ def tabled(reading: Reading) -> list[Any]:
 def test_tables_hold_what_the_record_holds(played: Play, coordination: str) -> None:
     """Over a whole mission with loss and copies: every number of every batch, also from given bytes."""
     records = played(*LOSSY, f"coordination={coordination}")
-    opening, reader, given = records[0], Reader(), Reader()
+    opening, reader, given = records[0], ColumnarDecoder(), ColumnarDecoder()
     assert isinstance(opening, Opening)
     reader.read(opening)
     given.read(opening)
     for record in records:
         if isinstance(record, Batch):
             told = plain(record, opening.scenario.roster, 60)
-            assert tabled(Reading(*reader.read(record))) == told
+            assert tabled(ColumnarBatch(*reader.read(record))) == told
             payload = encode_record(record)
-            assert tabled(Reading(*given.read(decode_record(payload), payload))) == told
+            assert tabled(ColumnarBatch(*given.read(decode_record(payload), payload))) == told
 
 
 ODD = Batch(
     1 << 62,
     (
-        Act("r10", -5, Observation(0, Pose(0.0, 0.0)), (("", 1 << 40), ("R1", 3)), None, None, -7),
-        Act(
+        StepRecord(
+            "r10", -5, Observation(0, Pose(0.0, 0.0)), (("", 1 << 40), ("R1", 3)), None, None, -7
+        ),
+        StepRecord(
             "r2",
             -(1 << 62),
             Observation(3, Pose(0.0, 0.0), (1, 2, 3)),
@@ -141,11 +156,16 @@ ODD = Batch(
                 weights=bytes(70_000),
                 outbox=(Envelope("r01", 1, SUPERVISOR, bytes(300)), Envelope("r3", 2, "", b"")),
             ),
-            Ruling(Pose(7, -300), ((1, 2.0, 3.0),), ("speed", "units", "s" * 300), bumped=True),
+            StepVerdict(
+                Pose(7, -300), ((1, 2.0, 3.0),), ("speed", "units", "s" * 300), bumped=True
+            ),
         ),
-        Act("r1", 0, Observation(0, Pose(0.0, 0.0)), (), Outputs(1, Pose(0.0, 0.0)), None),
+        StepRecord("r1", 0, Observation(0, Pose(0.0, 0.0)), (), Outputs(1, Pose(0.0, 0.0)), None),
     ),
-    (Verdict("r1", 2, "supervisor", DROPPED), Verdict("x" * 40, 1 << 33, "r3", -40_000)),
+    (
+        DeliveryDecision("r1", 2, "supervisor", DROPPED),
+        DeliveryDecision("x" * 40, 1 << 33, "r3", -40_000),
+    ),
     out_of_range=3,
     injected=(Envelope("r1", 1 << 62, "", b"\x98"), Envelope("r1\x00", 3, "r2", bytes(70_000))),
 )
@@ -154,30 +174,32 @@ ODD = Batch(
 
 def test_odd_values_are_read_too(played: Play) -> None:
     """Whatever a record may hold, the tables hold it."""
-    reader = Reader()
+    reader = ColumnarDecoder()
     reader.read(played()[0])
 
-    assert tabled(Reading(*reader.read(ODD))) == plain(ODD, ROSTER, 60)
+    assert tabled(ColumnarBatch(*reader.read(ODD))) == plain(ODD, ROSTER, 60)
 
 
 def test_tables_grow_with_what_comes(played: Play) -> None:
     """More pairs, verdicts and deliveries in one batch than there was room for."""
-    many = tuple(Verdict("r1", sequence, "r2", sequence) for sequence in range(5000))
+    many = tuple(DeliveryDecision("r1", sequence, "r2", sequence) for sequence in range(5000))
     entries = Pairs().encode(np.arange(60).repeat(100), np.arange(6000), 6000)
     outputs = Outputs(1, Pose(0.0, 0.0), lowered=entries)
     look = Observation(0, Pose(0.0, 0.0))
-    act = Act("r1", 1, look, tuple(("r2", i) for i in range(3000)), outputs, Ruling(look.pose))
+    act = StepRecord(
+        "r1", 1, look, tuple(("r2", i) for i in range(3000)), outputs, StepVerdict(look.pose)
+    )
     batch = Batch(1, (act,), many, 0)
-    reader = Reader()
+    reader = ColumnarDecoder()
     reader.read(played()[0])
 
-    assert tabled(Reading(*reader.read(batch))) == plain(batch, ROSTER, 60)
+    assert tabled(ColumnarBatch(*reader.read(batch))) == plain(batch, ROSTER, 60)
 
 
 def test_record_is_read_once_for_all(played: Play) -> None:
     """Referees that share a reader share its work."""
     records = played()
-    reader = Reader()
+    reader = ColumnarDecoder()
     reader.read(records[0])
 
     assert reader.read(records[1]) is reader.read(records[1])
@@ -230,7 +252,7 @@ def test_noise_never_leads_outside(payload: bytes, at: int, values: int) -> None
 
 def readable(body: bytes) -> tuple[int, bytes, bytes] | None:
     try:
-        news = decode_news(body)
+        news = decode_gossip(body)
     except RefusedError:
         return None
     return news.epoch, news.have, news.logs
@@ -242,7 +264,7 @@ def parts(body: bytes) -> tuple[int, bytes, bytes] | None:
     return None if logs_end < 0 else (epoch, framed[have:have_end], framed[logs:logs_end])
 
 
-_ALL_FIELDS = News(1, 0, 0.0, 0.0, b"", b"", b"\x00", b"\x00")
+_ALL_FIELDS = GossipMessage(1, 0, 0.0, 0.0, b"", b"", b"\x00", b"\x00")
 
 
 @examples(200)
@@ -250,7 +272,7 @@ _ALL_FIELDS = News(1, 0, 0.0, 0.0, b"", b"", b"\x00", b"\x00")
     news=_ALL_FIELDS, at=len(encode(_ALL_FIELDS)) - 3, byte=0xA1, cut=0
 )  # a text for registers
 @given(news=NEWS, at=st.integers(0, 200), byte=st.integers(0, 255), cut=st.integers(0, 30))
-def test_news_is_read_as_the_codec_does(news: News, at: int, byte: int, cut: int) -> None:
+def test_news_is_read_as_the_codec_does(news: GossipMessage, at: int, byte: int, cut: int) -> None:
     """Sound messages, messages with one byte changed, cut messages: the same parts or none.
 
     The kernel may refuse what the codec still takes, such as a text in place of a number it skips;
@@ -297,7 +319,7 @@ def test_odd_news(tree: Any, *, single: bool) -> None:
 
 def test_record_holds_more_fields_some_day(played: Play) -> None:
     """Fields that are added at the end are passed over."""
-    reader = Reader()
+    reader = ColumnarDecoder()
     reader.read(played()[0])
     tree = msgspec.msgpack.decode(encode_record(ODD))
     tree.append({"new": 1})
@@ -309,13 +331,13 @@ def test_record_holds_more_fields_some_day(played: Play) -> None:
                 part.append(b"new")
     for verdict in tree[3]:
         verdict.append(1.0)
-    sizes, *tables = (table.copy() for table in Reading(*reader.read(ODD))[1:])
+    sizes, *tables = (table.copy() for table in ColumnarBatch(*reader.read(ODD))[1:])
     told = plain(ODD, ROSTER, 60)
     payload = msgspec.msgpack.encode(tree)
     bits = tables[1].view(np.int64)
 
     assert of._read_batch(payload, sizes, *tables, bits, 3, of.STRANGER, 60) > 0
-    assert tabled(Reading(payload, sizes, *tables)) == told
+    assert tabled(ColumnarBatch(payload, sizes, *tables)) == told
 
 
 @examples(300)

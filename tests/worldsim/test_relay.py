@@ -3,14 +3,14 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.machine import Envelope
-from kantor_protocol.process import INBOX_MAX
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.deeds import world_starts_ns
-from kantor_worldsim.outages import deeds_of
-from kantor_worldsim.plan import needs_hands
-from kantor_worldsim.relay import Mail
-from strategies import examples, mission
+from kantor_protocol.base.machine import Envelope
+from kantor_protocol.node.runner import INBOX_MAX
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.engine.process_faults import schedule_of
+from kantor_worldsim.exchange.config import needs_process_control
+from kantor_worldsim.exchange.fault_injector import world_starts_ns
+from kantor_worldsim.exchange.realtime import Mail
+from support.strategies import examples, mission
 
 
 def envelope(sequence: int) -> Envelope:
@@ -76,15 +76,15 @@ DROP = '{kind="drop", probability=0.5}'
 
 def test_faults_of_real_processes_need_hands() -> None:
     """Turn by turn a pause needs none; a clock is set by a message."""
-    assert needs_hands(beset(DROP, CLOCK), "wall") is None
-    assert needs_hands(beset(DROP, PAUSE), "lockstep") is None
-    assert needs_hands(beset(DROP, PAUSE), "wall") == "faults[1]: pause"
-    assert needs_hands(beset(CLOCK, DROP, KILL), "lockstep") == "faults[2]: kill"
+    assert needs_process_control(beset(DROP, CLOCK), "wall") is None
+    assert needs_process_control(beset(DROP, PAUSE), "lockstep") is None
+    assert needs_process_control(beset(DROP, PAUSE), "wall") == "faults[1]: pause"
+    assert needs_process_control(beset(CLOCK, DROP, KILL), "lockstep") == "faults[2]: kill"
 
 
 def test_a_killed_world_sim_knows_when_it_was_to_come_back() -> None:
     """Other deeds may be due before."""
-    deeds = deeds_of(
+    deeds = schedule_of(
         beset(
             '{kind="kill", who=["worldsim"], from_s=3, until_s=5}',
             '{kind="pause", who=["r2"], from_s=2, until_s=4}',

@@ -10,18 +10,18 @@ from pathlib import Path
 
 import pytest
 
-from kantor_worldsim.recording import (
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.record.records import Ending, Record
+from kantor_worldsim.record.run_folder import (
     JOURNAL,
     MANIFEST,
     METRICS,
     RESULT,
     OverError,
     Past,
-    Recording,
     ResumeError,
 )
-from kantor_worldsim.records import Ending, Record
-from strategies import mission
+from support.strategies import mission
 
 ROOMY = ("samples.count=60", "energy.points=90", "energy.steps=60", "targets.count=40")
 

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from grounds import HEADINGS, Place, drawn, grounds, places
-from kantor_protocol.evidence import CODES, NO_RETURN, beam_rad
-from kantor_protocol.grid import FREE
-from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import Pose
-from kantor_protocol.scenario import Sensor
-from kantor_worldsim.maps import Cells, Ground
-from kantor_worldsim.sensors import RangeFinder, walls_between, way_to_wall
-from plain_philox import philox_plain
-from strategies import SEEDS, examples
+from kantor_protocol.base.counter_rng import Purpose
+from kantor_protocol.base.grid import FREE
+from kantor_protocol.base.machine import Pose
+from kantor_protocol.replication.occupancy_log import CODES, NO_RETURN, beam_rad
+from kantor_protocol.scenario.schema import SensorOptions
+from kantor_worldsim.world.maps import Cells, Ground
+from kantor_worldsim.world.sensors import RangeFinder, walls_between, way_to_wall
+from support.grounds import HEADINGS, Place, drawn, grounds, places
+from support.plain_philox import philox_plain
+from support.strategies import SEEDS, examples
 
 Codes = npt.NDArray[np.uint16]
 
@@ -72,7 +72,13 @@ def in_cells(ground: Ground, pose: Pose) -> tuple[float, float]:
 
 
 def scan_of(
-    ground: Ground, sensor: Sensor, pose: Pose, *, seed: int = 1, robot: int = 0, step: int = 1
+    ground: Ground,
+    sensor: SensorOptions,
+    pose: Pose,
+    *,
+    seed: int = 1,
+    robot: int = 0,
+    step: int = 1,
 ) -> Codes:
     """(beams,) the codes of one scan."""
     return np.frombuffer(RangeFinder(sensor, ground, seed).scan(robot, step, pose), dtype="<u2")
@@ -112,7 +118,7 @@ def test_scan_tells_ranges_in_parts_of_the_range(
         angle_rad = beam_rad(pose.heading_rad, math.radians(view_deg), beams, beam)
         way = plain_way(ground.cells, u, v, angle_rad, range_cells)
         told.append(NO_RETURN if way == math.inf else round(way / range_cells * CODES))
-    sensor = Sensor(range_m=range_m, beams=beams, field_of_view_deg=view_deg)
+    sensor = SensorOptions(range_m=range_m, beams=beams, field_of_view_deg=view_deg)
 
     assert scan_of(ground, sensor, pose).tolist() == told
 
@@ -122,16 +128,18 @@ def test_range_is_inclusive() -> None:
     ground = drawn("....#")
     ahead = {"beams": 1, "field_of_view_deg": 1.0}
 
-    assert scan_of(ground, Sensor(range_m=3.5, **ahead), Pose(0.5, 0.5)).tolist() == [CODES]
-    assert scan_of(ground, Sensor(range_m=3.49, **ahead), Pose(0.5, 0.5)).tolist() == [NO_RETURN]
-    assert scan_of(ground, Sensor(range_m=1.0, **ahead), Pose(0.5, 0.5, math.pi)).tolist() == [
-        CODES // 2
+    assert scan_of(ground, SensorOptions(range_m=3.5, **ahead), Pose(0.5, 0.5)).tolist() == [CODES]
+    assert scan_of(ground, SensorOptions(range_m=3.49, **ahead), Pose(0.5, 0.5)).tolist() == [
+        NO_RETURN
     ]
+    assert scan_of(
+        ground, SensorOptions(range_m=1.0, **ahead), Pose(0.5, 0.5, math.pi)
+    ).tolist() == [CODES // 2]
 
 
 def test_unknown_cells_are_walls() -> None:
     """The truth that a map leaves open is nothing to walk or look through."""
-    ahead = Sensor(range_m=4.0, beams=1)
+    ahead = SensorOptions(range_m=4.0, beams=1)
 
     assert scan_of(drawn("..?."), ahead, Pose(0.0, 0.5)).tolist() == [CODES // 2]
 
@@ -154,7 +162,7 @@ def test_beam_ends_wherever_it_begins(ground: Ground, u: float, v: float, angle_
 def test_noise_is_keyed() -> None:
     """A draw depends on seed, robot, step and beam, and on nothing else."""
     ground = drawn(40 * ".")
-    sensor = Sensor(range_m=50.0, beams=1, noise_m=2.0)
+    sensor = SensorOptions(range_m=50.0, beams=1, noise_m=2.0)
     for seed, robot, step in [(1, 0, 1), (2, 0, 1), (1, 1, 1), (1, 0, 2), (1, 0, 0)]:
         words = philox_plain(seed, (Purpose.SCAN, robot, step, 0))
         first, second = words[1] << 32 | words[0], words[3] << 32 | words[2]
@@ -168,7 +176,7 @@ def test_noise_is_keyed() -> None:
 def test_noise_is_normal() -> None:
     """Mean, deviation and tails of many beams; neighbours are independent."""
     ground = drawn(*(101 * [101 * "."]))
-    sensor = Sensor(range_m=100.0, beams=10_000, noise_m=1.5, field_of_view_deg=1e-6)
+    sensor = SensorOptions(range_m=100.0, beams=10_000, noise_m=1.5, field_of_view_deg=1e-6)
     codes = np.concatenate(
         [scan_of(ground, sensor, Pose(50.5, 50.5), step=step) for step in range(4)]
     )
@@ -185,8 +193,8 @@ def test_noise_is_normal() -> None:
 def test_noise_stays_within_the_range(place: Place, seed: int, noise_m: float) -> None:
     """A noisy range is clamped; what found nothing still finds nothing."""
     ground, pose = place
-    exact = Sensor(range_m=2.0, beams=60)
-    noisy = Sensor(range_m=2.0, beams=60, noise_m=noise_m)
+    exact = SensorOptions(range_m=2.0, beams=60)
+    noisy = SensorOptions(range_m=2.0, beams=60, noise_m=noise_m)
     codes = scan_of(ground, noisy, pose, seed=seed)
 
     assert ((codes == NO_RETURN) == (scan_of(ground, exact, pose) == NO_RETURN)).all()

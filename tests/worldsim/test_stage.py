@@ -6,9 +6,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from grounds import drawn, exploration
-from kantor_fleet.team import play
-from kantor_protocol.machine import (
+from kantor_fleet.execution.in_process_team import play
+from kantor_protocol.base.machine import (
     EVERYBODY,
     Envelope,
     Inputs,
@@ -17,12 +16,21 @@ from kantor_protocol.machine import (
     Pose,
     State,
 )
-from kantor_protocol.messages import BODY_BYTES_MAX
-from kantor_worldsim.maps import Ground
-from kantor_worldsim.records import Act, Batch, Ending, Mailbag, Opening, Record, encode_record
-from kantor_worldsim.stage import Stage, Step
-from kantor_worldsim.world import Site
-from strategies import mission
+from kantor_protocol.wire.messages import BODY_BYTES_MAX
+from kantor_worldsim.engine.simulation import Simulation, Step
+from kantor_worldsim.record.records import (
+    Batch,
+    Ending,
+    EnvelopeIndex,
+    Opening,
+    Record,
+    StepRecord,
+    encode_record,
+)
+from kantor_worldsim.world.maps import Ground
+from kantor_worldsim.world.world import WorldSetup
+from support.grounds import drawn, exploration
+from support.strategies import mission
 
 PERIOD_NS = 100_000_000
 STARTS = {"r1": (0.0, 0.0), "r2": (24.0, 0.0), "r3": (90.0, 0.0)}
@@ -33,9 +41,11 @@ class Theatre:
 
     def __init__(self, *overrides: str) -> None:
         scenario = mission("sensor.range_m=5", *overrides)
-        site = Site(np.zeros((12, 2)), np.array([[3.0, 0.0]]), np.array(list(STARTS.values())))
+        site = WorldSetup(
+            np.zeros((12, 2)), np.array([[3.0, 0.0]]), np.array(list(STARTS.values()))
+        )
         self.records: list[Record] = []
-        self.stage = Stage(scenario, 1, site, [self.records.append])
+        self.stage = Simulation(scenario, 1, site, [self.records.append])
         self.step = 0
 
     def play(self, **acts: Outputs | None) -> Batch:
@@ -64,7 +74,7 @@ def outputs(
     return Outputs(step, Pose(*place), outbox=outbox, state=state)
 
 
-def act_of(batch: Batch, name: ParticipantId) -> Act:
+def act_of(batch: Batch, name: ParticipantId) -> StepRecord:
     return next(act for act in batch.acts if act.name == name)
 
 
@@ -110,7 +120,7 @@ def test_act_is_recorded_with_what_led_to_it() -> None:
     first = theatre.play(r1=outputs(1, (0.0, 0.0), EVERYBODY))
     second = theatre.play(r2=outputs(1, (20.0, 0.0), source="r2"))
     act = act_of(second, "r2")
-    mailbag = Mailbag()
+    mailbag = EnvelopeIndex()
     mailbag.post(first)
 
     assert act.heard == (("r1", 10),)
@@ -129,7 +139,7 @@ def test_reference_to_what_was_never_sent_is_noticed() -> None:
     second = theatre.play(r2=outputs(1, (20.0, 0.0), source="r2"))
 
     with pytest.raises(KeyError):
-        Mailbag().inputs(act_of(second, "r2"))
+        EnvelopeIndex().inputs(act_of(second, "r2"))
 
 
 # What has no place on the stage.
@@ -269,7 +279,7 @@ def explored(ground: Ground, *overrides: str) -> list[Record]:
     starts_m = np.array([[1.5, 1.5], [2.5, 1.5]])
     records: list[Record] = []
     stopped = iter(range(200))
-    site = Site(np.zeros((0, 2)), np.zeros((0, 2)), starts_m, ground)
+    site = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), starts_m, ground)
     play(scenario, 1, site, [records.append], stopped=lambda: next(stopped, None) is None)
     return records
 

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from kantor_protocol.grid import FREE, OCCUPIED, UNKNOWN, Frame
-from kantor_protocol.scenario import ScenarioError
-from kantor_worldsim.layouts import layout
-from kantor_worldsim.maps import Ground
-from kantor_worldsim.starts import observable, spots, starts_on
-from strategies import examples
+from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_worldsim.world.layouts import layout
+from kantor_worldsim.world.maps import Ground
+from kantor_worldsim.world.starts import observable, spots, starts_on
+from support.strategies import examples
 
 OFFICE = layout("office", seed=1)
 

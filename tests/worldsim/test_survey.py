@@ -12,25 +12,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from grounds import grounds
-from kantor_agent.chart import Chart
-from kantor_fleet.team import participant, play, team
-from kantor_protocol.evidence import Evidence, entries
-from kantor_protocol.grid import FREE, OCCUPIED, UNKNOWN
-from kantor_protocol.life import Mortal
-from kantor_protocol.machine import Inputs, Outputs
-from kantor_protocol.messages import decode_news
-from kantor_protocol.replica import Replica, read_have
-from kantor_worldsim.checkers import check
-from kantor_worldsim.loop import in_process, simulate
-from kantor_worldsim.maps import Ground, parts
-from kantor_worldsim.reading import Reader
-from kantor_worldsim.records import Act, Batch, Opening, Record
-from kantor_worldsim.stage import Stage
-from kantor_worldsim.survey import KIND, TOLD, Survey
-from mapping import ROOMS, explored, on_map, site_of
-from replicas import read_logs
-from strategies import examples
+from kantor_agent.mapping.fused_map import FusedMap
+from kantor_fleet.execution.in_process_team import participant, play, team
+from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN
+from kantor_protocol.base.machine import Inputs, Outputs
+from kantor_protocol.node.recovery import KillableNode
+from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
+from kantor_protocol.replication.replica import Replica, read_have
+from kantor_protocol.wire.messages import decode_gossip
+from kantor_worldsim.engine.event_loop import simulate
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.observers.checkers.checker import check
+from kantor_worldsim.observers.metrics.map_tracker import MapTracker
+from kantor_worldsim.observers.metrics.map_tracker_kernels import KIND, TOLD
+from kantor_worldsim.record.columnar import ColumnarDecoder
+from kantor_worldsim.record.records import Batch, Opening, Record, StepRecord
+from kantor_worldsim.world.maps import Ground, parts
+from support.grounds import grounds
+from support.missions import ROOMS, explored, on_map, site_of
+from support.replicas import read_logs
+from support.strategies import examples
 
 Records = Sequence[Record]
 RUNS = {
@@ -41,14 +43,14 @@ RUNS = {
 }
 
 
-def surveyed(records: Records) -> Survey:
-    survey = Survey()
+def surveyed(records: Records) -> MapTracker:
+    survey = MapTracker()
     for record in records:
         survey.take(record)
     return survey
 
 
-def acts_of(records: Records) -> list[tuple[int, Act]]:
+def acts_of(records: Records) -> list[tuple[int, StepRecord]]:
     """What robots did, each with its tick."""
     return [
         (record.now_ns // 100_000_000, act)
@@ -72,7 +74,7 @@ class Witness:
         logs: dict[str, dict[int, int]] = {name: {} for name in scenario.roster}
         have = {name: [0] * len(scenario.roster) for name in names}
         evidence = {
-            name: Evidence(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
+            name: OccupancyLog(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
             for name in names
         }
         last: dict[str, tuple[int, object]] = dict.fromkeys(names, (-1, None))
@@ -87,7 +89,7 @@ class Witness:
                         self.own[act.name].add(entry // 2)
             assert act.outputs is not None
             for envelope in act.outputs.outbox:
-                news = decode_news(envelope.body)
+                news = decode_gossip(envelope.body)
                 rows = read_logs(news.logs, valued=False)
                 told = read_have(news.have, len(scenario.roster))
                 assert rows is not None
@@ -106,7 +108,7 @@ class Witness:
         }
 
 
-def in_survey(survey: Survey) -> dict[int, int]:
+def in_survey(survey: MapTracker) -> dict[int, int]:
     ticks = survey.books.first_tick
     return {int(cell): int(ticks[cell]) for cell in np.flatnonzero(ticks >= 0)}
 
@@ -133,7 +135,7 @@ def test_robots_know_what_their_own_charts_show() -> None:
     survey = surveyed(records)
     frame = ROOMS.frame
     replica = Replica(1, 2, entries(frame), None, ledger=True, claims=False)
-    chart = Chart(frame, 2)
+    chart = FusedMap(frame, 2)
     for place in (0, 1):
         count = survey.books.written.item(place, TOLD)
         replica.store.length[place] = 0
@@ -213,8 +215,8 @@ def test_bumps_are_counted_where_they_happen() -> None:
 
 def test_referees_may_share_a_survey() -> None:
     """A record that is handed on twice counts once."""
-    reader = Reader()
-    survey = Survey(reader)
+    reader = ColumnarDecoder()
+    survey = MapTracker(reader)
     for record in explored():
         reader.read(record)
         survey.take(record)
@@ -232,9 +234,9 @@ def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
     scenario = on_map(*radio)
     site = site_of(scenario)
     records: list[Record] = []
-    stage = Stage(scenario, 1, site, [records.append])
+    stage = Simulation(scenario, 1, site, [records.append])
     build = functools.partial(participant, "r1", scenario, 1, site)
-    play_all = in_process(team(scenario, 1, site) | {"r1": Mortal(build, stage.body("r1"))})
+    play_all = in_process(team(scenario, 1, site) | {"r1": KillableNode(build, stage.body("r1"))})
     rounds = iter(range(10_000))
 
     def lossy(inputs: Mapping[str, Inputs]) -> Mapping[str, Outputs]:

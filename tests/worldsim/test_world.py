@@ -8,20 +8,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from grounds import HEADINGS, drawn, exploration, places
-from grounds import Place as Stand
-from kantor_protocol.grid import FREE, Frame, free_way
-from kantor_protocol.keyed import Purpose
-from kantor_protocol.machine import SUPERVISOR, Body, Outputs, Pose
-from kantor_protocol.messages import RefusedError
-from kantor_protocol.packing import Pairs
-from kantor_protocol.scenario import ScenarioError
-from kantor_protocol.walk import Walk
-from kantor_worldsim.maps import Ground
-from kantor_worldsim.records import Opening, decode_record, encode_record, opening_of
-from kantor_worldsim.sensors import RangeFinder
-from kantor_worldsim.world import STANDOFF_CELLS, Ruling, Site, World, stopped
-from strategies import SEEDS, examples, mission
+from kantor_protocol.base.counter_rng import Purpose
+from kantor_protocol.base.grid import FREE, Frame, free_way
+from kantor_protocol.base.machine import SUPERVISOR, Body, Outputs, Pose
+from kantor_protocol.base.random_walk import RandomWalk
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.wire.messages import RefusedError
+from kantor_worldsim.record.records import Opening, decode_record, encode_record, opening_of
+from kantor_worldsim.world.maps import Ground
+from kantor_worldsim.world.sensors import RangeFinder
+from kantor_worldsim.world.world import STANDOFF_CELLS, StepVerdict, World, WorldSetup, stopped
+from support.grounds import HEADINGS, drawn, exploration, places
+from support.grounds import Place as Stand
+from support.strategies import SEEDS, examples, mission
 
 PERIOD_NS = 100_000_000
 STEP_M = 10.0
@@ -32,9 +32,9 @@ SPENT = Pairs().encode(np.array([3, 4]), np.array([1, 1]), 2)
 """A whole point: two units."""
 
 
-def site(*targets: Place) -> Site:
+def site(*targets: Place) -> WorldSetup:
     """Twelve samples, three robots, and these targets."""
-    return Site(
+    return WorldSetup(
         np.zeros((12, 2)),
         np.array(targets, dtype=np.float64).reshape(-1, 2),
         np.array([[0.0, 0.0], [90.0, 20.0], [50.0, 80.0]]),
@@ -53,7 +53,7 @@ def act(
     spent: bytes = b"",
     name: str = "r1",
     now_ns: int | None = None,
-) -> Ruling:
+) -> StepVerdict:
     """A robot's step at its time, one a period unless told otherwise."""
     when = PERIOD_NS * step if now_ns is None else now_ns
     return there.accept(name, when, Outputs(step, Pose(*place), spent=spent))
@@ -110,7 +110,7 @@ def test_stale_step_changes_nothing(step: int, now_ns: int) -> None:
     act(there, 2, (2.0, 0.0))
     stale = act(there, step, (8.0, 0.0), SPENT, now_ns=now_ns)
 
-    assert stale == Ruling(Pose(2.0, 0.0), violations=("step",))
+    assert stale == StepVerdict(Pose(2.0, 0.0), violations=("step",))
     assert (there.observe("r1").step, there.observe("r1").pose) == (2, Pose(2.0, 0.0))
     assert act(there, 3, (8.0, 0.0), SPENT).violations == ()
 
@@ -173,7 +173,7 @@ def test_sound_parts_of_a_step_happen() -> None:
 
     assert unsound.violations == ("speed", "units")
     assert there.observe("r1").step == 1
-    assert act(there, 2, (5.0, 0.0), b"\x80") == Ruling(
+    assert act(there, 2, (5.0, 0.0), b"\x80") == StepVerdict(
         Pose(5.0, 0.0), ((0, 8.0, 0.0),), ("units",)
     )
 
@@ -241,7 +241,7 @@ def test_supervisor_sees_nothing() -> None:
 
 def walked(*targets: Place, periods: int) -> list[Place]:
     """Where targets are after so many periods, by their walk alone."""
-    walk = Walk(np.array(targets), 3.0, PERIOD_NS, 1, Purpose.TARGET_WALK)
+    walk = RandomWalk(np.array(targets), 3.0, PERIOD_NS, 1, Purpose.TARGET_WALK)
     walk.advance(periods * PERIOD_NS)
     return [(float(x), float(y)) for x, y in walk.xy_m]
 
@@ -332,7 +332,9 @@ def on(
     overrides: tuple[str, ...] = ("sensor.range_m=8",),
 ) -> World:
     """A world with this map, r1 at a start, and these targets."""
-    where = Site(np.zeros((0, 2)), np.array(targets).reshape(-1, 2), np.array([start]), ground)
+    where = WorldSetup(
+        np.zeros((0, 2)), np.array(targets).reshape(-1, 2), np.array([start]), ground
+    )
     return World(exploration("vehicle.speed_m_s=100", *overrides), 1, where)
 
 
@@ -397,7 +399,7 @@ def test_wall_stops_a_move(start: Place, wanted: Place, end: Place | None) -> No
     ruling = there.accept("r1", PERIOD_NS, Outputs(1, Pose(*wanted, 0.5, 9.0)))
     truth = Pose(*wanted, 0.5, 9.0) if end is None else Pose(*end, 0.5, 0.0)
 
-    assert ruling == Ruling(truth, bumped=end is not None)
+    assert ruling == StepVerdict(truth, bumped=end is not None)
     assert there.pose("r1") == truth
     look = there.observe("r1")
     assert (look.pose, look.bumped) == (truth, end is not None)
@@ -470,7 +472,7 @@ def test_supervisor_is_in_no_cell() -> None:
     )
     ruling = there.accept(SUPERVISOR, PERIOD_NS, Outputs(1, Pose(1.5, 1.5)))
 
-    assert ruling == Ruling(Pose(1.5, 1.5))
+    assert ruling == StepVerdict(Pose(1.5, 1.5))
     assert there.observe(SUPERVISOR).scan == b""
 
 
@@ -512,7 +514,7 @@ def test_nothing_can_be_shipped_on_a_map() -> None:
 def test_site_of_a_map() -> None:
     """The layout, starts in its free cells, no samples; targets only from a file."""
     scenario = exploration("robots.count=4", "map.size_m=[20.0, 10.0]")
-    site_of_map = Site.of(scenario, 3)
+    site_of_map = WorldSetup.of(scenario, 3)
     ground = site_of_map.ground
     assert ground is not None
     cells = [ground.frame.cell_of(x_m, y_m) for x_m, y_m in site_of_map.starts_m]
@@ -526,7 +528,7 @@ def test_site_of_a_map() -> None:
 def test_opening_holds_the_map() -> None:
     """What was recorded is what a replay stands on; without a map nothing is added."""
     scenario = exploration()
-    there = Site(np.zeros((0, 2)), np.zeros((0, 2)), np.array([[0.5, 0.5]]), ROOM)
+    there = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), np.array([[0.5, 0.5]]), ROOM)
     opening = decode_record(encode_record(opening_of(scenario, 1, there, {"r1": ()})))
     assert isinstance(opening, Opening)
     ground = opening.site.ground
@@ -542,7 +544,7 @@ def test_opening_holds_the_map() -> None:
 
 def test_map_that_does_not_fit_its_frame_is_refused() -> None:
     """A forged opening is no use, and crashes nothing."""
-    there = Site(np.zeros((0, 2)), np.zeros((0, 2)), np.array([[0.5, 0.5]]), ROOM)
+    there = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), np.array([[0.5, 0.5]]), ROOM)
     opening = opening_of(exploration(), 1, there, {"r1": ()})
     frame = Frame(1.0, (0.0, 0.0), 8, 6)
 

@@ -1,16 +1,5 @@
-"""The planners on densities by name; those on maps are in `allocators.py`. One file each, none imports another."""
+"""Planners: one file or folder each, none imports another.
 
-from collections.abc import Callable
-
-from kantor_agent.planners.base import Goal, Planner
-from kantor_agent.planners.spectral import Spectral
-from kantor_agent.planners.transport import Transport
-from kantor_protocol.scenario import Scenario
-
-PLANNERS: dict[str, Callable[[Scenario], Planner]] = {
-    "transport": lambda scenario: Transport(scenario.planner.horizon),
-    "spectral": Spectral,
-}
-"""One robot's next goal."""
-
-__all__ = ["PLANNERS", "Goal", "Planner"]
+`base.py` is the interface of planners on densities, `map_base.py` of those on maps; the registries name them.
+A planner knows neither vehicle, radio nor clock. Start with `base.py` and `transport.py`.
+"""

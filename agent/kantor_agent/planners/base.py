@@ -4,8 +4,8 @@ from typing import Protocol
 
 import msgspec
 
-from kantor_agent.belief import Belief
-from kantor_protocol.machine import Pose
+from kantor_agent.belief.belief import Belief
+from kantor_protocol.base.machine import Pose
 
 
 class Goal(msgspec.Struct, frozen=True, gc=False):

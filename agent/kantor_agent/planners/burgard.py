@@ -11,10 +11,10 @@ alone drives to its cheapest frontier, to the last bit, as every robot does with
 import numpy as np
 import numpy.typing as npt
 
-from kantor_agent.planners.team import Situation, Task
-from kantor_protocol.grid import NOWHERE, OCCUPIED
-from kantor_protocol.kernels import kernel
-from kantor_protocol.scenario import Scenario
+from kantor_agent.planners.map_base import Situation, Task
+from kantor_protocol.base.grid import NOWHERE, OCCUPIED
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.scenario.schema import Scenario
 
 
 @kernel

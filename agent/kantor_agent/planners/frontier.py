@@ -8,8 +8,8 @@ Nobody coordinates with anybody. Robots side by side choose the same target, and
 
 import numpy as np
 
-from kantor_agent.planners.team import Member, Situation, Task
-from kantor_protocol.scenario import Scenario
+from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_protocol.scenario.schema import Scenario
 
 
 class Frontier:

@@ -7,10 +7,10 @@ are therefore assigned to frontiers that lie half a sensor range apart, and from
 import numpy as np
 import numpy.typing as npt
 
-from kantor_agent.planners.team import Situation, Task
-from kantor_protocol.grid import NOWHERE
-from kantor_protocol.kernels import kernel
-from kantor_protocol.scenario import Scenario
+from kantor_agent.planners.map_base import Situation, Task
+from kantor_protocol.base.grid import NOWHERE
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.scenario.schema import Scenario
 
 _APART = 0.5
 """Of the sensor's range, from one frontier to choose from to the next."""

@@ -16,13 +16,13 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from kantor_agent.chart import Chart
-from kantor_agent.planners.team import Member, Situation, Task
-from kantor_agent.terrain import Terrain
-from kantor_protocol.grid import NOWHERE, OCCUPIED, UNKNOWN, Frame
-from kantor_protocol.kernels import kernel
-from kantor_protocol.keyed import Purpose, uniform
-from kantor_protocol.scenario import Scenario
+from kantor_agent.mapping.cost_map import CostMap
+from kantor_agent.mapping.fused_map import FusedMap
+from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_protocol.base.counter_rng import Purpose, uniform
+from kantor_protocol.base.grid import NOWHERE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.scenario.schema import Scenario
 
 PARTS = 16
 """Of a cell, in which centroids are told."""
@@ -417,7 +417,7 @@ class Regions:
     """A partition of what is unknown, and whose each part is (sections IV.A and IV.B)."""
 
     def __init__(
-        self, terrain: Terrain, frontiers: Ints, robots: Ints, starts: Ints, travel: Floats
+        self, terrain: CostMap, frontiers: Ints, robots: Ints, starts: Ints, travel: Floats
     ) -> None:
         """robots: (n,) their cells. starts: (n, 2) centroids. travel: (n, frontiers)."""
         frame, cells = terrain.frame, terrain.chart.cells
@@ -452,7 +452,7 @@ class Regions:
         """(n, 2) the centroid of each one's region, or where it began."""
 
 
-def _points(chart: Chart, frontiers: Ints, region: Ints) -> Ints:
+def _points(chart: FusedMap, frontiers: Ints, region: Ints) -> Ints:
     """The cells that are to be divided, rising."""
     stack, points = np.empty_like(region), np.empty_like(region)
     count = gather(chart.cells, chart.frame.columns, frontiers, region, stack, points)

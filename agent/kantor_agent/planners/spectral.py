@@ -14,13 +14,13 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from kantor_agent.belief import Belief
+from kantor_agent.belief.belief import Belief
 from kantor_agent.planners.base import Goal
-from kantor_protocol.kernels import kernel
-from kantor_protocol.machine import Pose
-from kantor_protocol.modes import harmonics, phase, rectangle_of, visit
-from kantor_protocol.registers import add
-from kantor_protocol.scenario import Domain, Gaussian, Scenario
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.machine import Pose
+from kantor_protocol.replication.cosine_basis import harmonics, phase, rectangle_of, visit
+from kantor_protocol.replication.registers import add
+from kantor_protocol.scenario.schema import Domain, Gaussian, Scenario
 
 _CELLS = 400
 """Midpoints along each axis by which a mixture is integrated over the domain."""

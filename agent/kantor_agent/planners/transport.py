@@ -9,12 +9,12 @@ import math
 
 import numpy as np
 
-from kantor_agent.belief import Belief
-from kantor_agent.field import Grid, nearest
+from kantor_agent.belief.belief import Belief
+from kantor_agent.belief.sample_index import SampleIndex, nearest
 from kantor_agent.planners.base import Goal
-from kantor_protocol.kernels import kernel
-from kantor_protocol.machine import Pose
-from kantor_protocol.replica import NOBODY, claim, taken
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.machine import Pose
+from kantor_protocol.replication.replica_kernels import NOBODY, claim, taken
 
 
 @kernel
@@ -58,7 +58,7 @@ def first_of_best_order(
 
 @kernel
 def choose_sample(
-    grid: Grid,
+    grid: SampleIndex,
     weights: np.ndarray,
     x: float,
     y: float,
@@ -99,7 +99,7 @@ def _choose(
 
     held: room for the samples that others hold. me: NOBODY in a mission without claims.
     """
-    grid = Grid(xy_m, order, cell, first, alive, frame, levels)
+    grid = SampleIndex(xy_m, order, cell, first, alive, frame, levels)
     skip = held[: taken(claims, counters, me, held) if me != NOBODY else 0]
     sample = choose_sample(grid, weights, x, y, skip, best, near, cost_to_go)
     if sample == NOBODY and skip.shape[0] > 0:

@@ -12,12 +12,16 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from kantor_fleet.campaign.dice import Dice, short
-from kantor_protocol import faults as of_faults
-from kantor_protocol.faults import KINDS, Fault, Kill
-from kantor_protocol.machine import SUPERVISOR, WORLD_SIM, ParticipantId
-from kantor_protocol.scenario import Scenario, from_tree, to_tree
-from kantor_worldsim.liveness import settling_ns
+from kantor_fleet.campaign.keyed_draws import KeyedDraws, short
+from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM, ParticipantId
+from kantor_protocol.scenario.dump import to_tree
+from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.processes import Kill
+from kantor_protocol.scenario.faults.schedule import KINDS
+from kantor_protocol.scenario.load import from_tree
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.scenario.validate_faults import complaints_of_faults
+from kantor_worldsim.observers.checkers.liveness import settling_ns
 
 Tree = dict[str, Any]
 
@@ -61,7 +65,7 @@ def sort_of(scenario: Scenario) -> str:
 
 def draw(seed: int) -> Scenario:
     """The scenario of a seed; the mission is then run with the same seed."""
-    sort = Dice(seed, _MISSION).one_of(list(SORTS), list(SORTS.values()))
+    sort = KeyedDraws(seed, _MISSION).one_of(list(SORTS), list(SORTS.values()))
     tree = _map(seed) if sort == "map" else _density(seed, sort)
     calm_s = tree.pop("calm_s")
     tree |= {
@@ -80,14 +84,14 @@ def draw(seed: int) -> Scenario:
 def _lingering(seed: int, scenario: Scenario) -> Scenario:
     """Half of the missions, where it is no long time, go on until news could be everywhere."""
     linger_ns = settling_ns(scenario, len(scenario.roster)) + 2 * scenario.period_ns
-    if linger_ns > _LINGER_PERIODS * scenario.period_ns or not Dice(seed, _LINGER).coin():
+    if linger_ns > _LINGER_PERIODS * scenario.period_ns or not KeyedDraws(seed, _LINGER).coin():
         return scenario
     linger_s, limit_s = short(1.01e-9 * linger_ns), scenario.limit_s or 0.0
     return msgspec.structs.replace(scenario, linger_s=linger_s, limit_s=limit_s + 2.0 * linger_s)
 
 
 def _density(seed: int, sort: str) -> Tree:
-    dice = Dice(seed, _TEAM)
+    dice = KeyedDraws(seed, _TEAM)
     robots = dice.whole(2, 8)
     points = robots * max(30, round(dice.scale(300, 6000) / robots))
     period_s = dice.scale(0.25, 2.5)
@@ -131,7 +135,7 @@ def _density(seed: int, sort: str) -> Tree:
 
 
 def _map(seed: int) -> Tree:
-    dice = Dice(seed, _TEAM)
+    dice = KeyedDraws(seed, _TEAM)
     period_s = dice.scale(0.3, 1.0)
     layout, side_m, resolution_m = dice.one_of(
         [("blank", 14.0, 1.0), ("office", 12.0, 0.25), ("unstructured", 24.0, 1.0)]
@@ -163,7 +167,7 @@ def _map(seed: int) -> Tree:
     }
 
 
-def _vehicle(dice: Dice, stride_m: float, period_s: float) -> Tree:
+def _vehicle(dice: KeyedDraws, stride_m: float, period_s: float) -> Tree:
     speed_m_s = short(stride_m / period_s)
     return {
         "name": dice.one_of(["first-order", "second-order", "unicycle", "dubins"], [6, 1, 1, 1]),
@@ -174,7 +178,7 @@ def _vehicle(dice: Dice, stride_m: float, period_s: float) -> Tree:
     }
 
 
-def _gaussian(dice: Dice, side_m: float) -> Tree:
+def _gaussian(dice: KeyedDraws, side_m: float) -> Tree:
     spread_m = side_m * dice.between(0.05, 0.3)
     return {
         "mean_m": [dice.between(0.1 * side_m, 0.9 * side_m) for _ in "xy"],
@@ -185,7 +189,7 @@ def _gaussian(dice: Dice, side_m: float) -> Tree:
 
 def _clock(seed: int, period_s: float) -> Tree:
     """Most teams step all at once; the others show what clocks do to them."""
-    dice = Dice(seed, _CLOCK)
+    dice = KeyedDraws(seed, _CLOCK)
     if dice.coin(0.7):
         return {"period_s": period_s, "spread": 0.0}
     spread = dice.between(0.0, 0.4) if dice.coin(0.4) else 0.0
@@ -201,13 +205,13 @@ def _clock(seed: int, period_s: float) -> Tree:
 
 
 def _publish(seed: int) -> Tree:
-    dice = Dice(seed, _PUBLISH)
+    dice = KeyedDraws(seed, _PUBLISH)
     return {"weights_every": dice.whole(1, 20), "keyframe_every": dice.whole(1, 30)}
 
 
 def _radio(seed: int, tree: Tree) -> Tree:
     """Ranges from nobody near to everybody; imperfections that stay when the faults are over."""
-    dice = Dice(seed, _RADIO)
+    dice = KeyedDraws(seed, _RADIO)
     reach_m, period_s = tree.pop("reach_m"), tree["clock"]["period_s"]
     if tree["coordination"] == "centralized" and dice.coin(0.6):
         middle = 0.5 * reach_m
@@ -237,7 +241,7 @@ class Setting(NamedTuple):
     scenario: Scenario
     calm_s: float
     """All is over then."""
-    dice: Dice
+    dice: KeyedDraws
 
     @property
     def roster(self) -> tuple[ParticipantId, ...]:
@@ -386,10 +390,10 @@ _MANY = {"kill": 6, "pause": 4, "partition": 3, "clock": 3}
 
 def _faults(seed: int, scenario: Scenario, calm_s: float) -> Iterable[Fault]:
     """Each class is in or out; of what is in, as much as can be there together."""
-    bias = Dice(seed, _FAULTS).between(0.05, 0.5)
+    bias = KeyedDraws(seed, _FAULTS).between(0.05, 0.5)
     taken: list[Fault] = []
     for number, kind in enumerate(KINDS):
-        at = Setting(scenario, calm_s, Dice(seed, _A_CLASS + number))
+        at = Setting(scenario, calm_s, KeyedDraws(seed, _A_CLASS + number))
         if not at.dice.coin(bias):
             continue
         for _ in range(at.dice.whole(1, _MANY.get(kind, 2))):
@@ -406,7 +410,7 @@ def candidates(at: Setting, kind: str, taken: list[Fault]) -> Iterator[Fault]:
             tree |= at.window(at.calm_s)
         fault = msgspec.convert(tree, KINDS[kind])
         if not _too_many_lost(at.scenario, [*taken, fault]) and not any(
-            of_faults.complaints([fault], at.scenario, taken)
+            complaints_of_faults([fault], at.scenario, taken)
         ):
             yield fault
 

@@ -8,21 +8,22 @@ from typing import Any
 
 import msgspec
 
-from kantor_fleet.campaign.dice import Dice
 from kantor_fleet.campaign.draw import sort_of
-from kantor_fleet.campaign.joins import differing
-from kantor_fleet.campaign.sightings import Sightings
-from kantor_fleet.campaign.struck import Struck
-from kantor_fleet.experiment import Case, Outcome, reason
-from kantor_fleet.team import play
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.checkers import Checker
-from kantor_worldsim.journal import Digest, Journal, read
-from kantor_worldsim.liveness import Liveness
-from kantor_worldsim.reading import Reader
-from kantor_worldsim.recording import JOURNAL, Recording
-from kantor_worldsim.records import Record, decode_record, encode_record
-from kantor_worldsim.world import Site
+from kantor_fleet.campaign.fault_coverage import FaultCoverage
+from kantor_fleet.campaign.keyed_draws import KeyedDraws
+from kantor_fleet.campaign.merge_convergence import differing
+from kantor_fleet.campaign.rare_events import RareEvents
+from kantor_fleet.execution.experiment import Case, Outcome, reason
+from kantor_fleet.execution.in_process_team import play
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.observers.checkers.checker import Checker
+from kantor_worldsim.observers.checkers.liveness import LivenessChecker
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.record.columnar import ColumnarDecoder
+from kantor_worldsim.record.journal import Digest, Journal, read
+from kantor_worldsim.record.records import Record, decode_record, encode_record
+from kantor_worldsim.record.run_folder import JOURNAL
+from kantor_worldsim.world.world import WorldSetup
 
 TWICE_EVERY = 20
 """One seed in so many is executed twice, for the same digest."""
@@ -104,7 +105,7 @@ class Follower:
         """folder: for the run's files, as `kantor run` leaves them; None keeps nothing."""
         self.recording = Recording(scenario, seed, "in-process", folder)
         self.payloads: list[bytes] = []
-        self.struck, self.sightings = Struck(), Sightings()
+        self.struck, self.sightings = FaultCoverage(), RareEvents()
         self.judged: frozenset[str] = frozenset()
         """Rules of liveness that the record could have broken."""
 
@@ -132,7 +133,7 @@ class Follower:
 
     def _judged(self) -> list[str]:
         """What referees find who have nothing but the bytes of the record."""
-        reader, liveness = Reader(), Liveness()
+        reader, liveness = ColumnarDecoder(), LivenessChecker()
         checker = Checker(reader)
         for payload in self.payloads:
             record = decode_record(payload)
@@ -145,7 +146,7 @@ class Follower:
 
 def _attempt(case: Case) -> dict[str, Any]:
     scenario, seed = case.scenario, case.seed
-    site = Site.of(scenario, seed)
+    site = WorldSetup.of(scenario, seed)
     follower = Follower(scenario, seed)
     ended = play(scenario, seed, site, [follower.take], stopped=lambda: follower.broken)
     result = follower.recording.finish()
@@ -175,7 +176,7 @@ def _attempt(case: Case) -> dict[str, Any]:
 def _differing(scenario: Scenario, seed: int, digest: str) -> Iterable[str]:
     """The mission once more, from its scenario and seed."""
     again = Digest()
-    site = Site.of(scenario, seed)
+    site = WorldSetup.of(scenario, seed)
     play(scenario, seed, site, [lambda record: again.add(encode_record(record))])
     if again.hex != digest:
         yield f"digest: executed twice, and {again.hex} is not {digest}"
@@ -183,7 +184,7 @@ def _differing(scenario: Scenario, seed: int, digest: str) -> Iterable[str]:
 
 def _cut_open(seed: int, payloads: list[bytes]) -> Iterable[str]:
     """The journal as a killed recorder leaves it: every record up to the cut, and nothing wrong in them."""
-    dice = Dice(seed, _SUBJECT)
+    dice = KeyedDraws(seed, _SUBJECT)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / JOURNAL
         journal = Journal(path)
@@ -196,7 +197,7 @@ def _cut_open(seed: int, payloads: list[bytes]) -> Iterable[str]:
             found = list(read(path))
             if [payload for payload, _ in found] != payloads[: len(found)]:
                 yield "prefix: what is left of a journal that was cut is not what was written"
-            reader = Reader()
+            reader = ColumnarDecoder()
             checker = Checker(reader)
             for payload, record in found:
                 reader.read(record, payload)

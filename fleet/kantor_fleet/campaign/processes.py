@@ -18,35 +18,36 @@ from multiprocessing.util import get_temp_dir
 from pathlib import Path
 from typing import NamedTuple
 
-from kantor_fleet.campaign.memory import (
+from kantor_fleet.campaign.fault_coverage import CLASSES, FaultCoverage
+from kantor_fleet.campaign.process_scenarios import is_lockstep, process_scenario
+from kantor_fleet.campaign.rss_monitor import (
     FLAT_LASTING_MB,
     FLAT_MB,
     Grown,
     Lasting,
-    Watch,
+    RssMonitor,
     grandchildren,
 )
 from kantor_fleet.campaign.run import commit
-from kantor_fleet.campaign.storms import is_lockstep, storm
-from kantor_fleet.campaign.struck import CLASSES, Struck
-from kantor_fleet.exits import Exit
-from kantor_fleet.experiment import code
-from kantor_fleet.interrupts import Interrupts
-from kantor_fleet.local import Fleet, Order, local_fleet, watch_progress
-from kantor_fleet.preload import warm_up
-from kantor_fleet.progress import printable
-from kantor_fleet.run import read_result
-from kantor_fleet.team import play
-from kantor_fleet.verify import verdicts
-from kantor_protocol.bus import BusError
-from kantor_protocol.machine import WORLD_SIM, ParticipantId
-from kantor_protocol.scenario import Scenario, to_toml
-from kantor_worldsim.journal import Digest, read
-from kantor_worldsim.liveness import Liveness
-from kantor_worldsim.outages import deeds_of
-from kantor_worldsim.recording import JOURNAL, SCENARIO
-from kantor_worldsim.records import Batch, Incident, Record, encode_record
-from kantor_worldsim.world import Site
+from kantor_fleet.cli.exits import Exit
+from kantor_fleet.cli.interrupts import Interrupts
+from kantor_fleet.execution.experiment import code
+from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.execution.mission import read_result
+from kantor_fleet.execution.verify import verdicts
+from kantor_fleet.processes.local import Fleet, FleetConfig, local_fleet, watch_progress
+from kantor_fleet.processes.preload import warm_up
+from kantor_fleet.report.progress import printable
+from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
+from kantor_protocol.scenario.dump import to_toml
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.transport.session import BusError
+from kantor_worldsim.engine.process_faults import schedule_of
+from kantor_worldsim.observers.checkers.liveness import LivenessChecker
+from kantor_worldsim.record.journal import Digest, read
+from kantor_worldsim.record.records import Batch, ProcessEvent, Record, encode_record
+from kantor_worldsim.record.run_folder import JOURNAL, SCENARIO
+from kantor_worldsim.world.world import WorldSetup
 
 FOLDER = "processes"
 REJOIN_S = 2.0
@@ -76,7 +77,7 @@ class Soak(NamedTuple):
     """Real time after which no further mission begins."""
 
 
-class Flight(NamedTuple):
+class ProcessMission(NamedTuple):
     """What came of a mission."""
 
     seed: int
@@ -109,7 +110,7 @@ def soak(order: Soak) -> Exit:
             if order.minutes is not None and spent_s >= 60.0 * order.minutes:
                 break
             place = order.folder / FOLDER / f"seed-{seed}"
-            flight = fly(seed, order.terms, place, interrupts, temporary)
+            flight = run_mission(seed, order.terms, place, interrupts, temporary)
             if interrupts():
                 break
             totals.add(flight)
@@ -129,7 +130,7 @@ def replay(seed: int, folder: Path, terms: Terms) -> Exit:
     with Interrupts() as interrupts, _own_temporary_folder() as temporary:
         warm_up()
         place = folder / FOLDER / f"seed-{seed}"
-        flight = fly(seed, terms, place, interrupts, temporary)
+        flight = run_mission(seed, terms, place, interrupts, temporary)
     totals = Totals()
     totals.add(flight)
     print(_line(flight, totals, flight.wall_s))
@@ -139,30 +140,32 @@ def replay(seed: int, folder: Path, terms: Terms) -> Exit:
     return interrupts.code or (Exit.NOT_MET if flight.complaints else Exit.DONE)
 
 
-def fly(seed: int, terms: Terms, folder: Path, stopped: Interrupts, temporary: Path) -> Flight:
+def run_mission(
+    seed: int, terms: Terms, folder: Path, stopped: Interrupts, temporary: Path
+) -> ProcessMission:
     """One mission, judged. folder: for its files, made anew. temporary: where nothing may be left."""
     started_s = time.monotonic()
-    scenario = storm(seed, terms.speed, terms.storm_s)
+    scenario = process_scenario(seed, terms.speed, terms.storm_s)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     exchange = "lockstep" if is_lockstep(seed) else "wall"
-    order = Order(scenario, seed, exchange, terms.speed, folder)
+    order = FleetConfig(scenario, seed, exchange, terms.speed, folder)
     before = _entries(temporary)
     failures, grown = _run(order, stopped)
     failures += [f"orphan: process {pid} is there yet" for pid in _orphans()]
     failures += [f"leftover: {name} in {temporary}" for name in _entries(temporary) - before]
     if stopped():
-        return Flight(seed, exchange, "interrupted", 0.0, (), Counter())
+        return ProcessMission(seed, exchange, "interrupted", 0.0, (), Counter())
     return _judged_apart(order, failures)._replace(wall_s=time.monotonic() - started_s, grown=grown)
 
 
-def _run(order: Order, stopped: Interrupts) -> tuple[list[str], dict[str, Grown]]:
+def _run(order: FleetConfig, stopped: Interrupts) -> tuple[list[str], dict[str, Grown]]:
     """Run the fleet to its end; what failed, and how it has grown."""
     scenario = order.scenario
     give_up_s = time.monotonic() + scenario.limit_ns * 1e-9 / order.speed + _GRACE_S
     failures: list[str] = []
     with local_fleet(order) as fleet:
-        watch = Watch(fleet)
+        watch = RssMonitor(fleet)
         periods = 0
         try:
             for progress in watch_progress(fleet):
@@ -198,23 +201,25 @@ def _orphans() -> list[int]:
     return left
 
 
-def _judged_apart(order: Order, failures: list[str]) -> Flight:
+def _judged_apart(order: FleetConfig, failures: list[str]) -> ProcessMission:
     """Judged in a process of its own: a whole record in memory would leave this one as large for ever."""
     context = multiprocessing.get_context("forkserver")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         return pool.submit(_judged, order, failures).result()
 
 
-def _judged(order: Order, failures: list[str]) -> Flight:
+def _judged(order: FleetConfig, failures: list[str]) -> ProcessMission:
     """A mission by what it has left on file."""
     folder, scenario = order.folder, order.scenario
     result = read_result(folder)
     if result is None:
         failures.append("result: there is none")
-        return Flight(order.seed, order.exchange, "crashed", 0.0, tuple(failures), Counter())
+        return ProcessMission(
+            order.seed, order.exchange, "crashed", 0.0, tuple(failures), Counter()
+        )
     journal = list(read(folder / JOURNAL))
     records = [record for _, record in journal]
-    struck, liveness = Struck(), Liveness()
+    struck, liveness = FaultCoverage(), LivenessChecker()
     for record in records:
         struck.take(record)
         liveness.take(record)
@@ -230,7 +235,7 @@ def _judged(order: Order, failures: list[str]) -> Flight:
         complaints += _differing(scenario, order.seed, result.digest)
     else:
         rejoined_s, resumed_s = _back_s(scenario, records, order.speed)
-    return Flight(
+    return ProcessMission(
         order.seed,
         order.exchange,
         result.ended,
@@ -245,8 +250,8 @@ def _judged(order: Order, failures: list[str]) -> Flight:
     )
 
 
-def _incidents(records: Sequence[Record]) -> list[Incident]:
-    return [record for record in records if isinstance(record, Incident)]
+def _incidents(records: Sequence[Record]) -> list[ProcessEvent]:
+    return [record for record in records if isinstance(record, ProcessEvent)]
 
 
 def _differing(scenario: Scenario, seed: int, digest: str) -> Iterator[str]:
@@ -255,7 +260,7 @@ def _differing(scenario: Scenario, seed: int, digest: str) -> Iterator[str]:
     play(
         scenario,
         seed,
-        Site.of(scenario, seed),
+        WorldSetup.of(scenario, seed),
         [lambda record: alone.add(encode_record(record))],
     )
     if alone.hex != digest:
@@ -271,14 +276,14 @@ def _back_s(
     before is done. Clocks of participants run on while world-sim is down, and it goes on by them.
     """
     due_ns = {
-        (deed.fault, deed.who): deed.at_ns for deed in deeds_of(scenario) if deed.what == "start"
+        (deed.fault, deed.who): deed.at_ns for deed in schedule_of(scenario) if deed.what == "start"
     }
     killed: set[ParticipantId] = set()
     ordered_ns: dict[ParticipantId, int] = {}
     back_s: dict[bool, list[float]] = {False: [], True: []}
     before_ns = 0
     for record in records:
-        if isinstance(record, Incident) and record.fault >= 0:
+        if isinstance(record, ProcessEvent) and record.fault >= 0:
             who = record.who
             if record.what == "kill":
                 killed.add(who)
@@ -298,7 +303,7 @@ class Totals:
     """Sums over missions."""
 
     def __init__(self) -> None:
-        self.broken: Flight | None = None
+        self.broken: ProcessMission | None = None
         self.struck: Counter[str] = Counter()
         """On the wall, and in lockstep where that is a signal as well."""
         self._missions: Counter[str] = Counter()
@@ -309,7 +314,7 @@ class Totals:
         self._lasting = Lasting()
         self._steps = self._incarnations = 0
 
-    def add(self, flight: Flight) -> None:
+    def add(self, flight: ProcessMission) -> None:
         """One more mission."""
         self.broken = flight if flight.complaints else self.broken
         real = dict(flight.struck)
@@ -408,7 +413,7 @@ def _told(times_s: list[float], bound_s: float | None = None) -> str:
     return f"{told}; {'below' if p99 < bound_s else 'NOT BELOW'} {bound_s:g} s"
 
 
-def _line(flight: Flight, totals: Totals, spent_s: float) -> str:
+def _line(flight: ProcessMission, totals: Totals, spent_s: float) -> str:
     """A mission in one line, and how far the campaign is."""
     minutes, seconds = divmod(round(spent_s), 60)
     verdict = "all rules held" if not flight.complaints else "VIOLATION"
@@ -419,11 +424,11 @@ def _line(flight: Flight, totals: Totals, spent_s: float) -> str:
     )
 
 
-def _report(flight: Flight, order: Soak) -> None:
+def _report(flight: ProcessMission, order: Soak) -> None:
     """Everything that is needed to see it again."""
     terms = order.terms
     place = order.folder / FOLDER / f"seed-{flight.seed}"
-    (place / SCENARIO).write_text(to_toml(storm(flight.seed, *terms)), encoding="utf-8")
+    (place / SCENARIO).write_text(to_toml(process_scenario(flight.seed, *terms)), encoding="utf-8")
     print(f"VIOLATION  seed {flight.seed} ({flight.exchange})")
     for complaint in flight.complaints:
         print(f"  {printable(complaint)}")

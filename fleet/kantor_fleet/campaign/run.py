@@ -14,24 +14,25 @@ from kantor_fleet.campaign.draw import draw, sort_of
 from kantor_fleet.campaign.mission import Follower, Trial
 from kantor_fleet.campaign.shrink import shrink
 from kantor_fleet.campaign.totals import ENOUGH, Totals
-from kantor_fleet.counting import RunsView, table_console
-from kantor_fleet.exits import Exit
-from kantor_fleet.experiment import Case, Outcome, code
-from kantor_fleet.interrupts import Interrupts
-from kantor_fleet.pools import Pool
-from kantor_fleet.progress import printable
+from kantor_fleet.cli.exits import Exit
+from kantor_fleet.cli.interrupts import Interrupts
+from kantor_fleet.execution.experiment import Case, Outcome, code
+from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.execution.pools import Pool
+from kantor_fleet.report.progress import printable
+from kantor_fleet.report.run_progress import RunsView, table_console
 from kantor_fleet.sweep.journal import Journal
 from kantor_fleet.sweep.plan import Key, parse_seeds
-from kantor_fleet.team import play
-from kantor_protocol.scenario import Scenario, to_toml
-from kantor_worldsim.world import Site
+from kantor_protocol.scenario.dump import to_toml
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.world.world import WorldSetup
 
 RUNS = "campaign.jsonl"
 SMALLEST = "smallest.toml"
 _SHRINK_S = 60.0
 
 
-class Order(NamedTuple):
+class CampaignConfig(NamedTuple):
     """A campaign, and what is wanted of it."""
 
     seeds: Sequence[int]
@@ -52,7 +53,7 @@ def numbered(text: str) -> tuple[int, ...]:
     return parse_seeds(f"0:{text}" if text.strip().isdecimal() else text)
 
 
-def campaign(order: Order, start: Callable[[Iterable[Case]], Pool]) -> Exit:
+def campaign(order: CampaignConfig, start: Callable[[Iterable[Case]], Pool]) -> Exit:
     """Run what is not yet done, up to the first violation; what to exit with.
 
     start: the pool, whose work is `attempt`. Raises SweepError, OSError.
@@ -84,7 +85,7 @@ def replay(seed: int, folder: Path) -> Exit:
     play(
         scenario,
         seed,
-        Site.of(scenario, seed),
+        WorldSetup.of(scenario, seed),
         [follower.take],
         stopped=lambda: follower.broken,
     )
@@ -98,7 +99,7 @@ def replay(seed: int, folder: Path) -> Exit:
     return Exit.NOT_MET if complaints else Exit.DONE
 
 
-def _known(order: Order, journal: Journal, totals: Totals) -> Broken | None:
+def _known(order: CampaignConfig, journal: Journal, totals: Totals) -> Broken | None:
     """Count what was run before; the first of it that broke."""
     first = None
     for seed in order.seeds:
@@ -113,7 +114,7 @@ def _known(order: Order, journal: Journal, totals: Totals) -> Broken | None:
 
 
 def _run(
-    order: Order,
+    order: CampaignConfig,
     journal: Journal,
     totals: Totals,
     start: Callable[[Iterable[Case]], Pool],
@@ -174,7 +175,7 @@ def _report(folder: Path, broken: Broken) -> None:
     print(f"             {_command(place / SMALLEST, seed)}")
 
 
-def _verdict(order: Order, totals: Totals) -> Exit:
+def _verdict(order: CampaignConfig, totals: Totals) -> Exit:
     if totals.missions < len(order.seeds):
         print(
             f"kantor: {totals.missions} of {len(order.seeds)} missions are done; the same command goes on"

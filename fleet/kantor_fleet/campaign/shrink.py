@@ -10,10 +10,13 @@ from typing import Any
 
 import msgspec
 
-from kantor_fleet.campaign.dice import short
+from kantor_fleet.campaign.keyed_draws import short
 from kantor_fleet.campaign.mission import Trial, attempt
-from kantor_fleet.experiment import Case
-from kantor_protocol.scenario import Scenario, ScenarioError, from_tree, to_tree
+from kantor_fleet.execution.experiment import Case
+from kantor_protocol.scenario.dump import to_tree
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.load import from_tree
+from kantor_protocol.scenario.schema import Scenario
 
 Tree = dict[str, Any]
 

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from rich.table import Table
 
 from kantor_fleet.campaign.draw import SORTS
+from kantor_fleet.campaign.fault_coverage import CLASSES, is_of_processes
 from kantor_fleet.campaign.mission import Trial
-from kantor_fleet.campaign.sightings import SIGHTS
-from kantor_fleet.campaign.struck import CLASSES, is_of_processes
+from kantor_fleet.campaign.rare_events import RARE_EVENTS
 
 ENOUGH = 500
 """Missions after which every class of faults must have struck, and every rare situation been seen."""
@@ -59,7 +59,7 @@ class Totals:
         """Classes of faults that never struck, and situations that were never seen."""
         return tuple(
             [name for name in CLASSES if not self.struck[name]]
-            + [name for name in SIGHTS if not self.seen[name]]
+            + [name for name in RARE_EVENTS if not self.seen[name]]
         )
 
     def lines(self, wall_s: float) -> Iterator[str]:
@@ -88,7 +88,7 @@ class Totals:
     def tables(self) -> Iterator[Table]:
         """Classes of faults, and what was seen."""
         yield self._table("class of faults", "copies or processes", CLASSES, self.struck)
-        yield self._table("sometimes", "times", SIGHTS, self.seen)
+        yield self._table("sometimes", "times", RARE_EVENTS, self.seen)
 
     def _table(self, title: str, unit: str, names: tuple[str, ...], counts: Counter[str]) -> Table:
         table = Table(title, "missions", unit, box=None, pad_edge=False)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from kantor_fleet.reproduce import explored
 from kantor_fleet.reproduce.claims import Claim, MeanRatio, Same
 from kantor_fleet.reproduce.figure import Figure
-from kantor_fleet.reproduce.flights import Setting
+from kantor_fleet.reproduce.measured_runs import Setting
 from kantor_fleet.reproduce.measures import distance_m, finished, map_row
 
 TEAMS = (1, 2, 3)

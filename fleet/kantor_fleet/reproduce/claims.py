@@ -8,9 +8,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.stats import t as student
 
-from kantor_fleet.reproduce.flights import Flight, Flights, Setting
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, Setting
 
-Measure = Callable[[Flight], float]
+Measure = Callable[[MeasuredRun], float]
 
 OK, MISS = "ok", "MISS"
 UNMATCHED = "ok, not the paper's"
@@ -41,7 +41,7 @@ class Claim(Protocol):
         """The settings that it needs flown."""
         ...
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """The line of the table."""
         ...
 
@@ -64,7 +64,7 @@ class Median(NamedTuple):
         """One."""
         return (self.setting,)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """Median [quartiles] against the band."""
         values = [self.measure(flight) for flight in flights[self.setting]]
         first, median, third = quartiles(values)
@@ -97,7 +97,7 @@ class Spread(NamedTuple):
         """The narrow one first."""
         return (self.narrow, *self.others)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """Interquartile ranges."""
         ranges = []
         for setting in self.settings:
@@ -129,7 +129,7 @@ class Ahead(NamedTuple):
         """Upper, lower."""
         return (self.upper, self.lower)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """Means with 95 % intervals by Student's t, and the paired gap."""
         upper, lower = (
             [self.measure(flight) for flight in flights[setting]] for setting in self.settings
@@ -157,7 +157,7 @@ class Range(NamedTuple):
     measure: Measure
     unit: str
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """From the lowest to the highest."""
         values = [self.measure(flights[setting][0]) for setting in self.settings]
         low, high = min(values), max(values)
@@ -182,7 +182,7 @@ class Ratio(NamedTuple):
         """Over, under."""
         return (self.over, self.under)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """Medians, and one over the other."""
         over, under = (
             statistics.median(self.measure(flight) for flight in flights[setting])
@@ -199,14 +199,14 @@ class Share(NamedTuple):
     setting: Setting
     published: str
     most: float
-    happens: Callable[[Flight], bool]
+    happens: Callable[[MeasuredRun], bool]
 
     @property
     def settings(self) -> tuple[Setting, ...]:
         """One."""
         return (self.setting,)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """Runs among all."""
         runs = flights[self.setting]
         count = sum(self.happens(flight) for flight in runs)
@@ -234,7 +234,7 @@ class MeanRatio(NamedTuple):
         """Over, under."""
         return (self.over, self.under)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """The ratio with its 95 % bootstrap interval, whole starts drawn again."""
         over, under = (
             [self.measure(flight) for flight in flights[setting]] for setting in self.settings
@@ -267,7 +267,7 @@ class Same(NamedTuple):
         """Both."""
         return (self.one, self.other)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """Runs that agree in every measure, among all."""
         pairs = list(zip(*(flights[setting] for setting in self.settings), strict=True))
         same = sum(
@@ -295,7 +295,7 @@ class Lowest(NamedTuple):
         """The first is the one in question."""
         return tuple(setting for _, setting in self.named)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """The means in order."""
         means = {
             name: statistics.fmean(self.measure(flight) for flight in flights[setting])
@@ -340,7 +340,7 @@ class GeometricRatio(NamedTuple):
         """All of over, all of under."""
         return (*self.over, *self.under)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """The mean with its 95 % factor by Student's t on logarithms."""
         ratios = list(paired_ratios(flights, self.over, self.under, self.measure))
         if not ratios:
@@ -366,7 +366,7 @@ class Lower(NamedTuple):
         """Of all pairs."""
         return tuple(s for _, lower, upper in self.named for s in (*lower, *upper))
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """Lower over upper; missed if one lies above, beyond its interval if it has one."""
         ratios = {
             name: geometric(found)
@@ -380,7 +380,7 @@ class Lower(NamedTuple):
         reading = "each below 1, or not clearly above"
         return Verdict(figure, self.text, self.published, reading, ours, MISS if missed else OK)
 
-    def _ratios(self, flights: Flights, lower: Group, upper: Group) -> Iterator[float]:
+    def _ratios(self, flights: MeasuredRuns, lower: Group, upper: Group) -> Iterator[float]:
         """Of geometric means, of settings that have runs: their starts are not the same ones."""
         for one, other in zip(lower, upper, strict=True):
             if flights.get(one) and flights.get(other):
@@ -402,7 +402,9 @@ def mean_ratio(
     return ratio, low, high
 
 
-def paired_ratios(flights: Flights, over: Group, under: Group, measure: Measure) -> Iterator[float]:
+def paired_ratios(
+    flights: MeasuredRuns, over: Group, under: Group, measure: Measure
+) -> Iterator[float]:
     """Of all runs that both of a pair of settings have, and whose measures are above 0."""
     for one, other in zip(over, under, strict=True):
         for upper, lower in zip(flights.get(one, ()), flights.get(other, ()), strict=True):

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from kantor_fleet.picture import (
+from kantor_fleet.report.picture import (
     Run,
     draw_domain,
     draw_radio,
@@ -16,9 +16,7 @@ from kantor_fleet.picture import (
     draw_targets,
     draw_trails,
 )
-from kantor_fleet.reproduce.claims import Measure, interval
-from kantor_fleet.reproduce.flights import Flight, Setting, records_of
-from kantor_fleet.style import (
+from kantor_fleet.report.style import (
     FAINT,
     FIRST,
     FOUND,
@@ -31,14 +29,16 @@ from kantor_fleet.style import (
     add_caption,
     tidy,
 )
-from kantor_worldsim.metrics import Row
-from kantor_worldsim.records import Batch, Opening
+from kantor_fleet.reproduce.claims import Measure, interval
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, Setting, records_of
+from kantor_worldsim.observers.metrics.density import DensityRow
+from kantor_worldsim.record.records import Batch, Opening
 
 _MAP_IN = 4.4
 """Width of one map."""
 
 
-def centralized(setting: Setting, flight: Flight) -> Figure:
+def centralized(setting: Setting, flight: MeasuredRun) -> Figure:
     """Figure 4: snapshots (a)-(e) and the bound (f)."""
     figure, axes = _panels(2, 3)
     ticks = (0, 300, 600, 800, 1000)
@@ -47,7 +47,7 @@ def centralized(setting: Setting, flight: Flight) -> Figure:
     return figure
 
 
-def decentralized(setting: Setting, flights: Sequence[Flight], ended: Measure) -> Figure:
+def decentralized(setting: Setting, flights: Sequence[MeasuredRun], ended: Measure) -> Figure:
     """Figure 7: the same for two robots that meet, in the run whose end is nearest to the median."""
     figure, axes = _panels(2, 3)
     ends = np.array([ended(flight) for flight in flights])
@@ -88,7 +88,7 @@ def moving(settings: Mapping[str, Setting]) -> Figure:
 
 
 def comparison(
-    methods: Mapping[str, Sequence[Flight]], detected: Measure, robots_s: Measure
+    methods: Mapping[str, Sequence[MeasuredRun]], detected: Measure, robots_s: Measure
 ) -> Figure:
     """Figure 6: box plots of detection and bars of execution time."""
     figure = Figure(figsize=(10.5, 4.4), layout=new_layout())
@@ -115,8 +115,8 @@ def comparison(
 
 
 def diffusion(
-    varying: Mapping[int, Sequence[Flight]],
-    invariant: Mapping[int, Sequence[Flight]],
+    varying: Mapping[int, Sequence[MeasuredRun]],
+    invariant: Mapping[int, Sequence[MeasuredRun]],
     detected: Measure,
 ) -> Figure:
     """Figure 9: means with 95 % intervals against the diffusion rate v."""
@@ -256,9 +256,9 @@ def legend_below(figure: FigureBase, axes: Axes) -> None:
     )
 
 
-def _bounds(axes: Axes, flight: Flight) -> None:
+def _bounds(axes: Axes, flight: MeasuredRun) -> None:
     ticks = [row.tick for row in flight.rows]
-    lines: tuple[tuple[str, Callable[[Row], float | None], str, float], ...] = (
+    lines: tuple[tuple[str, Callable[[DensityRow], float | None], str, float], ...] = (
         ("bound", lambda row: row.w_ub_paper, FIRST, 2.2),
         ("tight bound", lambda row: row.w_ub_tight, SECOND, 1.4),
         ("last tick's shipping and pending", lambda row: row.w_ub_instant, THIRD, 1.1),

@@ -10,13 +10,13 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, MultipleLocator, NullLocator
 
+from kantor_fleet.report.style import FAINT, INK, TEAM, TEXT_PT, tidy
 from kantor_fleet.reproduce.claims import Measure, interval
 from kantor_fleet.reproduce.drawing import legend_below, new_layout, write_title
-from kantor_fleet.reproduce.flights import Flight, Moment
-from kantor_fleet.style import FAINT, INK, TEAM, TEXT_PT, tidy
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, Moment
 from kantor_fleet.sweep.table import Row
-from kantor_protocol.scenario import Scenario
-from kantor_worldsim.world import Site
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.world.world import WorldSetup
 
 _EVERY = 10
 """Ticks from one point of a curve to the next."""
@@ -36,7 +36,7 @@ _CURVES = {
     "epv": "variance of the explored share, %²",
 }
 
-Runs = Mapping[int, Sequence[Flight]]
+Runs = Mapping[int, Sequence[MeasuredRun]]
 """By number of robots."""
 
 
@@ -60,7 +60,7 @@ def bars(
     return figure
 
 
-def curves(panels: Mapping[int, Mapping[str, Sequence[Flight]]], name: str) -> Figure:
+def curves(panels: Mapping[int, Mapping[str, Sequence[MeasuredRun]]], name: str) -> Figure:
     """The mean over the runs of `wtv` or `epv` over time, a panel for each number of robots."""
     figure = Figure(figsize=(11.6, 8.2), layout=new_layout())
     places = figure.subplots(2, 2)
@@ -125,7 +125,7 @@ def mean_curve(
 
 def _draw_map(axes: Axes, scenario: Scenario) -> None:
     """What is true of it: white is free."""
-    ground = Site.of(scenario, 0).ground
+    ground = WorldSetup.of(scenario, 0).ground
     assert ground is not None
     colours = ListedColormap([FAINT, "white", INK])
     extent_m = ground.frame.extent_m

@@ -6,15 +6,15 @@ from typing import NamedTuple
 from matplotlib.figure import Figure as Picture
 
 from kantor_fleet.reproduce.claims import Claim
-from kantor_fleet.reproduce.flights import Flights, Setting
+from kantor_fleet.reproduce.measured_runs import MeasuredRuns, Setting
 from kantor_fleet.sweep.table import Row
-from kantor_worldsim.metrics import Result
+from kantor_worldsim.observers.metrics.result import Result
 
-Orders = Mapping[Setting, Sequence[int]]
+RunRequests = Mapping[Setting, Sequence[int]]
 """The seeds that each setting is flown with."""
 
 
-class Table(NamedTuple):
+class ResultTable(NamedTuple):
     """Numbers that a figure tells beside its claims."""
 
     title: str
@@ -31,18 +31,18 @@ class Figure(NamedTuple):
     runs: int
     """For each setting, as in the paper where it says so."""
     claims: tuple[Claim, ...]
-    draw: Callable[[Flights], Picture]
+    draw: Callable[[MeasuredRuns], Picture]
     row: Callable[[Result], Row]
     """What the CSV says of a run."""
     drawn: tuple[Setting, ...] = ()
     """Settings that are drawn, though nothing is claimed of them."""
-    part: Callable[[int], Orders] | None = None
+    part: Callable[[int], RunRequests] | None = None
     """What is flown if `runs` counts something else than the runs for each setting."""
-    table: Callable[[Flights], Table] | None = None
+    table: Callable[[MeasuredRuns], ResultTable] | None = None
     kept: bool = False
     """Finished runs are kept in the folder, so that the same command goes on from there."""
 
-    def orders(self) -> Orders:
+    def orders(self) -> RunRequests:
         """What it needs flown."""
         if self.part is not None:
             return self.part(self.runs)

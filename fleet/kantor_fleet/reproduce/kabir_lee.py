@@ -7,19 +7,12 @@ robots one after another within a tick, a step of 10 m, three samples in a plan.
 import math
 
 from kantor_fleet.reproduce import drawing
-from kantor_fleet.reproduce.claims import (
-    Ahead,
-    Median,
-    Range,
-    Ratio,
-    Share,
-    Spread,
-)
+from kantor_fleet.reproduce.claims import Ahead, Median, Range, Ratio, Share, Spread
 from kantor_fleet.reproduce.figure import Figure
-from kantor_fleet.reproduce.flights import Flight, Setting
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, Setting
 from kantor_fleet.reproduce.measures import finished
 from kantor_fleet.sweep.table import Row
-from kantor_worldsim.metrics import Result
+from kantor_worldsim.observers.metrics.result import Result
 
 _CONCURRENT = ("clock.order=concurrent",)
 _LEDGER = ("merge=ledger", "claims=true")
@@ -87,20 +80,20 @@ _D_READING = {
 }
 
 
-def detected(flight: Flight) -> float:
+def detected(flight: MeasuredRun) -> float:
     """Per cent of the targets."""
     assert flight.result is not None
     return 100.0 * (flight.result.detection_rate or 0.0)
 
 
-def first_contact(flight: Flight) -> float:
+def first_contact(flight: MeasuredRun) -> float:
     """The tick in which a robot first heard another."""
     assert flight.result is not None
     contact = flight.result.first_contact_tick
     return math.inf if contact is None else float(contact)
 
 
-def drop_at_contact(flight: Flight) -> float:
+def drop_at_contact(flight: MeasuredRun) -> float:
     """Fall of the bound's current part from before the first contact until both have heard, per cent.
 
     The paper merges both vectors in one tick; here each robot's message takes its own step.
@@ -112,7 +105,7 @@ def drop_at_contact(flight: Flight) -> float:
     return 100.0 * (1.0 - by_tick[int(contact) + 1] / by_tick[int(contact) - 1])
 
 
-def loosest(flight: Flight) -> float:
+def loosest(flight: MeasuredRun) -> float:
     """The tight bound over the exact distance, at its loosest over the mission."""
     return max(
         row.w_ub_tight / row.w1_exact
@@ -121,19 +114,19 @@ def loosest(flight: Flight) -> float:
     )
 
 
-def _bound_at_start(flight: Flight) -> float:
+def _bound_at_start(flight: MeasuredRun) -> float:
     return flight.rows[0].w_ub_paper
 
 
-def _bound_at_end(flight: Flight) -> float:
+def _bound_at_end(flight: MeasuredRun) -> float:
     return flight.rows[-1].w_ub_paper
 
 
-def _instant_at_end(flight: Flight) -> float:
+def _instant_at_end(flight: MeasuredRun) -> float:
     return flight.rows[-1].w_ub_instant
 
 
-def _robots_s(flight: Flight) -> float:
+def _robots_s(flight: MeasuredRun) -> float:
     return flight.robots_s
 
 

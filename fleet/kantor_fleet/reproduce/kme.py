@@ -25,8 +25,8 @@ from kantor_fleet.reproduce.claims import (
     paired_ratios,
     times,
 )
-from kantor_fleet.reproduce.figure import Figure, Orders, Table
-from kantor_fleet.reproduce.flights import Flights, Setting
+from kantor_fleet.reproduce.figure import Figure, ResultTable, RunRequests
+from kantor_fleet.reproduce.measured_runs import MeasuredRuns, Setting
 from kantor_fleet.reproduce.measures import epv_mean, finished, map_row, wtv_final, wtv_mean
 from kantor_fleet.sweep.table import Row
 
@@ -90,7 +90,7 @@ def configurations() -> tuple[Configuration, ...]:
     )
 
 
-def part(runs: int) -> Orders:
+def part(runs: int) -> RunRequests:
     """The first configurations, under all four planners."""
     orders: dict[Setting, list[int]] = {}
     for place, starts, robots, spot in configurations()[:runs]:
@@ -219,7 +219,7 @@ def _wtv_claims(starts: str, planners: tuple[str, ...]) -> Iterator[Claim]:
     yield _more_robots(starts)
 
 
-def _ratio_rows(flights: Flights) -> Iterator[Row]:
+def _ratio_rows(flights: MeasuredRuns) -> Iterator[Row]:
     teams = {str(team): (team,) for team in TEAMS} | {"4 to 8": _MANY}
     for (name, measure), (text, team) in itertools.product(MEASURES.items(), teams.items()):
         for other in OTHERS:
@@ -248,7 +248,7 @@ def _ratio_rows(flights: Flights) -> Iterator[Row]:
             }
 
 
-def _lows(flights: Flights, team: tuple[int, ...], measure: Measure) -> Iterator[bool]:
+def _lows(flights: MeasuredRuns, team: tuple[int, ...], measure: Measure) -> Iterator[bool]:
     """Whether KME is below all others, configuration by configuration."""
     for settings in zip(*(group(planner, team) for planner in PLANNERS), strict=True):
         for runs in zip(*(flights.get(one, ()) for one in settings), strict=True):
@@ -256,7 +256,7 @@ def _lows(flights: Flights, team: tuple[int, ...], measure: Measure) -> Iterator
             yield kme < min(others)
 
 
-def ratios(flights: Flights) -> Table:
+def ratios(flights: MeasuredRuns) -> ResultTable:
     """KME beside the others, by number of robots."""
     rows = list(_ratio_rows(flights))
     columns = [*map(str, TEAMS), "4 to 8"]
@@ -277,7 +277,7 @@ def ratios(flights: Flights) -> Table:
         f"KME over the others, geometric mean x÷ 95 % by number of robots; "
         f"{sum(len(runs) for runs in flights.values()) // len(PLANNERS)} of {CONFIGURATIONS} configurations"
     )
-    return Table(title, rows, list(shown.values()))
+    return ResultTable(title, rows, list(shown.values()))
 
 
 FIG_6 = _curves(

@@ -2,41 +2,41 @@
 
 import msgspec
 
-from kantor_fleet.reproduce.flights import Flight
+from kantor_fleet.reproduce.measured_runs import MeasuredRun
 from kantor_fleet.sweep.table import Row
-from kantor_worldsim.metrics import MapResult, Result
+from kantor_worldsim.observers.metrics.result import MapResult, Result
 
 
-def finished(flight: Flight) -> float:
+def finished(flight: MeasuredRun) -> float:
     """The tick at which the team finished; the last one for a run that was cut."""
     assert flight.result is not None
     done = flight.result.finished_tick
     return float(flight.result.ticks if done is None else done)
 
 
-def surveyed(flight: Flight) -> MapResult:
+def surveyed(flight: MeasuredRun) -> MapResult:
     """What a flight over a map came to."""
     assert flight.result is not None
     assert flight.result.map is not None
     return flight.result.map
 
 
-def distance_m(flight: Flight) -> float:
+def distance_m(flight: MeasuredRun) -> float:
     """Driven by all robots together."""
     return surveyed(flight).distance_m
 
 
-def wtv_final(flight: Flight) -> float:
+def wtv_final(flight: MeasuredRun) -> float:
     """Variance of the waiting times of eight regions at the end, squared ticks."""
     return surveyed(flight).wtv_final.r8
 
 
-def wtv_mean(flight: Flight) -> float:
+def wtv_mean(flight: MeasuredRun) -> float:
     """The same over the run, with the waits that are expected of unknown cells."""
     return surveyed(flight).wtv_mean.r8
 
 
-def epv_mean(flight: Flight) -> float:
+def epv_mean(flight: MeasuredRun) -> float:
     """Variance of the explored share of eight regions over the run, squared per cent."""
     return surveyed(flight).epv_mean.r8
 

@@ -17,12 +17,12 @@ from matplotlib.figure import Figure as Picture
 from kantor_fleet.reproduce import drawing
 from kantor_fleet.reproduce.claims import MISS, OK, TOLD, Measure, Verdict
 from kantor_fleet.reproduce.drawing import Course, Panel
-from kantor_fleet.reproduce.figure import Figure, Orders, Table
-from kantor_fleet.reproduce.flights import Flight, Flights, Setting
+from kantor_fleet.reproduce.figure import Figure, ResultTable, RunRequests
 from kantor_fleet.reproduce.kabir_lee import detected
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, Setting
 from kantor_fleet.reproduce.measures import finished
 from kantor_fleet.sweep.table import Row
-from kantor_worldsim.metrics import Result
+from kantor_worldsim.observers.metrics.result import Result
 
 ROBOTS, POINTS, SAMPLES = 10, 4000, 800
 SHARE_S = POINTS / ROBOTS * 0.1
@@ -104,7 +104,7 @@ def setting(merge: str, aim: Aim, scourge: Scourge, degree: float, seed: int) ->
     )  # fmt: skip
 
 
-def part(runs: int) -> Orders:
+def part(runs: int) -> RunRequests:
     """Every condition with every seed."""
     orders: dict[Setting, set[int]] = {}
     for aim in AIMS:
@@ -118,11 +118,11 @@ def part(runs: int) -> Orders:
 
 
 def values(
-    flights: Flights, merge: str, aim: Aim, scourge: Scourge, degree: float
+    flights: MeasuredRuns, merge: str, aim: Aim, scourge: Scourge, degree: float
 ) -> npt.NDArray[np.float64]:
     """(runs,) what was measured, in the order of the seeds."""
     runs = len(flights[setting(merge, aim, scourge, 0, 0)])
-    found: list[Flight] = []
+    found: list[MeasuredRun] = []
     for seed in range(runs):
         flown = flights[setting(merge, aim, scourge, degree, seed)]
         found.append(flown[0 if scourge.seeded and degree else seed])
@@ -161,7 +161,7 @@ class Better(NamedTuple):
         """Of no fault; the figure knows the others."""
         return tuple(setting(merge, self.aim, self.scourge, 0, 0) for merge in MERGES)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """The smallest gap, with its interval; ahead if every interval lies above 0."""
         sign = 1.0 if self.aim is DETECTION else -1.0
         gaps = {
@@ -180,7 +180,7 @@ class Better(NamedTuple):
             OK if met else MISS,
         )
 
-    def _values(self, flights: Flights, merge: str, degree: float) -> npt.NDArray[np.float64]:
+    def _values(self, flights: MeasuredRuns, merge: str, degree: float) -> npt.NDArray[np.float64]:
         return values(flights, merge, self.aim, self.scourge, degree)
 
 
@@ -196,7 +196,7 @@ class Price(NamedTuple):
         """Of no fault; the figure knows the others."""
         return (setting(self.merge, self.aim, self.scourge, 0, 0),)
 
-    def judge(self, figure: str, flights: Flights) -> Verdict:
+    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
         """The paired change."""
         worst = self.scourge.degrees[-1]
         none, much = (
@@ -207,12 +207,12 @@ class Price(NamedTuple):
         return Verdict(figure, text, "", "as measured", ours, TOLD)
 
 
-def _estimates(flights: Flights, merge: str, aim: Aim, scourge: Scourge) -> Iterator[Estimate]:
+def _estimates(flights: MeasuredRuns, merge: str, aim: Aim, scourge: Scourge) -> Iterator[Estimate]:
     for degree in scourge.degrees:
         yield Estimate.of(values(flights, merge, aim, scourge, degree))
 
 
-def _draw(flights: Flights) -> Picture:
+def _draw(flights: MeasuredRuns) -> Picture:
     panels = [
         Panel(
             f"{scourge.name}, {scourge.unit}",
@@ -228,7 +228,7 @@ def _draw(flights: Flights) -> Picture:
     return drawing.resilience(panels, len(SCOURGES))
 
 
-def _table(flights: Flights) -> Table:
+def _table(flights: MeasuredRuns) -> ResultTable:
     rows = list(_rows(flights))
     shown: list[Row] = []
     columns = [f"{merge}: {aim.name}" for aim in AIMS for merge in MERGES]
@@ -240,10 +240,10 @@ def _table(flights: Flights) -> Table:
             shown.append({"fault": fault} | dict(zip(columns, cells, strict=True)))
     runs = rows[0]["runs"]
     title = f"{ROBOTS} robots, N = {SAMPLES}, M = {POINTS}, mean [95 %] over {runs} seeds: detected, %; finished, tick"
-    return Table(title, rows, shown)
+    return ResultTable(title, rows, shown)
 
 
-def _rows(flights: Flights) -> Iterator[Row]:
+def _rows(flights: MeasuredRuns) -> Iterator[Row]:
     for scourge in SCOURGES:
         for degree in scourge.degrees:
             for aim in AIMS:

@@ -12,7 +12,7 @@ from typing import Self
 
 import msgspec
 
-from kantor_fleet.experiment import Outcome
+from kantor_fleet.execution.experiment import Outcome
 from kantor_fleet.sweep.plan import Key, SweepError
 
 _FORMAT = 1

@@ -10,9 +10,11 @@ from typing import NamedTuple
 
 import msgspec
 
-from kantor_fleet.catalog import find
-from kantor_fleet.experiment import Case, code
-from kantor_protocol.scenario import Scenario, ScenarioError, to_tree
+from kantor_fleet.execution.experiment import Case, code
+from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.scenario.dump import to_tree
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.schema import Scenario
 
 Value = bool | int | float | str
 
@@ -47,7 +49,7 @@ class Variant(NamedTuple):
         return dict(zip(keys, map(text_of, self.values), strict=True))
 
 
-class Plan(NamedTuple):
+class SweepPlan(NamedTuple):
     """A sweep before it runs."""
 
     keys: tuple[str, ...]
@@ -82,7 +84,7 @@ def plan(
     chaos: Path | None = None,
     *,
     exact: bool = False,
-) -> Plan:
+) -> SweepPlan:
     """A sweep in which every variant is known to be a scenario.
 
     scenario: as `catalog.find` takes it. vary: each `key.sub=value,value`. seeds: see `parse_seeds`.
@@ -101,7 +103,7 @@ def plan(
         for texts in itertools.product(*varied.values())
     ]
     _refuse_twins(variants, tuple(varied))
-    return Plan(tuple(varied), tuple(variants), parse_seeds(seeds), exact)
+    return SweepPlan(tuple(varied), tuple(variants), parse_seeds(seeds), exact)
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

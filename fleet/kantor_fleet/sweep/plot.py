@@ -14,8 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from kantor_fleet.style import FAINT, INK, TEXT_PT, TITLE_PT, add_caption, team_colours, tidy
-from kantor_fleet.sweep.plan import Plan, Variant
+from kantor_fleet.report.style import FAINT, INK, TEXT_PT, TITLE_PT, add_caption, team_colours, tidy
+from kantor_fleet.sweep.plan import SweepPlan, Variant
 from kantor_fleet.sweep.summary import Line
 from kantor_fleet.sweep.table import Run, measures, replace
 
@@ -45,7 +45,9 @@ _NAMES = {
 }
 
 
-def draw(plan: Plan, runs: Sequence[Run], lines: Sequence[Line], measure: str, path: Path) -> None:
+def draw(
+    plan: SweepPlan, runs: Sequence[Run], lines: Sequence[Line], measure: str, path: Path
+) -> None:
     """Write the picture of a measure as PNG; no file if no run has it."""
     ours = [line for line in lines if line.measure == measure and line.runs.n]
     if not ours:
@@ -66,7 +68,7 @@ def draw(plan: Plan, runs: Sequence[Run], lines: Sequence[Line], measure: str, p
     replace(path, lambda draft: figure.savefig(draft, format="png", dpi=DPI))
 
 
-def _axis(plan: Plan) -> int | None:
+def _axis(plan: SweepPlan) -> int | None:
     """Which key lies on x: the first that takes several values, all of them numbers."""
     for index in range(len(plan.keys)):
         values = {variant.values[index] for variant in plan.variants}
@@ -75,7 +77,7 @@ def _axis(plan: Plan) -> int | None:
     return None
 
 
-def _draw_lines(axes: Axes, plan: Plan, lines: Sequence[Line], axis: int) -> None:
+def _draw_lines(axes: Axes, plan: SweepPlan, lines: Sequence[Line], axis: int) -> None:
     places = _place_values(axes, sorted({_number(line.variant, axis) for line in lines}))
     groups: dict[str, list[Line]] = {}
     for line in lines:
@@ -113,7 +115,7 @@ def _number(variant: Variant, axis: int) -> float:
     return float(variant.values[axis])
 
 
-def _draw_boxes(axes: Axes, plan: Plan, runs: Sequence[Run], lines: Sequence[Line]) -> None:
+def _draw_boxes(axes: Axes, plan: SweepPlan, runs: Sequence[Run], lines: Sequence[Line]) -> None:
     measure = lines[0].measure
     scale = _scale(measure)
     for place, (line, colour) in enumerate(zip(lines, team_colours(len(lines)), strict=True)):
@@ -138,7 +140,7 @@ def _draw_boxes(axes: Axes, plan: Plan, runs: Sequence[Run], lines: Sequence[Lin
     axes.grid(axis="y", color=FAINT, alpha=0.25, lw=0.6)
 
 
-def _label(plan: Plan, variant: Variant, axis: int | None) -> str:
+def _label(plan: SweepPlan, variant: Variant, axis: int | None) -> str:
     """What a variant is, without what lies on x and what does not vary."""
     words = [
         f"{key} {text}"
@@ -148,7 +150,7 @@ def _label(plan: Plan, variant: Variant, axis: int | None) -> str:
     return _GAP.join(words)
 
 
-def _write_title(place: SubFigure, plan: Plan, runs: Sequence[Run], *, lines: bool) -> None:
+def _write_title(place: SubFigure, plan: SweepPlan, runs: Sequence[Run], *, lines: bool) -> None:
     """What was run, and what the marks are."""
     seeds = len({run.seed for run in runs})
     marks = "median of the runs, in a band of their quartiles" if lines else "every dot a run"

@@ -11,17 +11,17 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from kantor_fleet.counting import RunsView, table_console
-from kantor_fleet.exits import Exit
-from kantor_fleet.experiment import Case
-from kantor_fleet.interrupts import Interrupts
-from kantor_fleet.pools import ClusterError, Pool
-from kantor_fleet.progress import printable
+from kantor_fleet.cli.exits import Exit
+from kantor_fleet.cli.interrupts import Interrupts
+from kantor_fleet.execution.experiment import Case
+from kantor_fleet.execution.pools import ClusterError, Pool
+from kantor_fleet.report.progress import printable
+from kantor_fleet.report.run_progress import RunsView, table_console
 from kantor_fleet.sweep import summary, table
 from kantor_fleet.sweep.journal import Journal
-from kantor_fleet.sweep.plan import Key, Plan, SweepError
+from kantor_fleet.sweep.plan import Key, SweepError, SweepPlan
 from kantor_fleet.sweep.table import Run
-from kantor_protocol.scenario import to_tree
+from kantor_protocol.scenario.dump import to_tree
 
 RUNS = "runs.jsonl"
 PLAN = "sweep.json"
@@ -32,10 +32,10 @@ PLOT = "plot.png"
 Format = Literal["csv", "parquet"]
 
 
-class Order(NamedTuple):
+class SweepConfig(NamedTuple):
     """A sweep, and what is wanted of it."""
 
-    plan: Plan
+    plan: SweepPlan
     folder: Path
     format: Format = "csv"
     plot: str | None = None
@@ -43,7 +43,7 @@ class Order(NamedTuple):
     retry_failed: bool = False
 
 
-def sweep(order: Order, start: Callable[[Iterable[Case]], Pool]) -> Exit:
+def sweep(order: SweepConfig, start: Callable[[Iterable[Case]], Pool]) -> Exit:
     """Run what is not yet done, write what there is; what to exit with.
 
     start: the pool. Raises SweepError before anything is written; OSError.
@@ -63,7 +63,7 @@ def sweep(order: Order, start: Callable[[Iterable[Case]], Pool]) -> Exit:
     return code or _verdict(runs)
 
 
-def _check(order: Order) -> None:
+def _check(order: SweepConfig) -> None:
     if order.plot is not None and order.plot not in table.MEASURES:
         near = difflib.get_close_matches(order.plot, table.MEASURES, 1)
         known = f"did you mean {near[0]}?" if near else f"known: {', '.join(table.MEASURES)}"
@@ -72,7 +72,7 @@ def _check(order: Order) -> None:
         raise SweepError("--format parquet: needs PyArrow; pip install 'kantor[parquet]'")
 
 
-def _is_due(order: Order, journal: Journal, key: Key) -> bool:
+def _is_due(order: SweepConfig, journal: Journal, key: Key) -> bool:
     outcome = journal.outcomes.get(key)
     return outcome is None or (outcome.failed is not None and order.retry_failed)
 
@@ -107,7 +107,7 @@ def _verdict(runs: Iterable[Run]) -> Exit:
     return Exit.DONE if sound else Exit.NOT_MET
 
 
-def _conclude(order: Order, runs: Sequence[Run]) -> None:
+def _conclude(order: SweepConfig, runs: Sequence[Run]) -> None:
     """Write the tables and the picture, and print the main measures."""
     from kantor_fleet.sweep.plot import draw  # noqa: PLC0415  matplotlib is slow to import
 
@@ -124,7 +124,7 @@ def _conclude(order: Order, runs: Sequence[Run]) -> None:
     print(f"  {folder}/  ({', '.join(sorted(path.name for path in folder.iterdir()))})")
 
 
-def _write_tables(order: Order, runs: Sequence[Run], lines: Sequence[summary.Line]) -> None:
+def _write_tables(order: SweepConfig, runs: Sequence[Run], lines: Sequence[summary.Line]) -> None:
     plan, folder = order.plan, order.folder
     whole = table.rows(plan, runs)
     if order.format == "parquet":
@@ -138,7 +138,7 @@ def _write_tables(order: Order, runs: Sequence[Run], lines: Sequence[summary.Lin
     table.write_csv(folder / SUMMARY, summary.columns(plan), summary.rows(plan, lines))
 
 
-def _write_plan(order: Order) -> None:
+def _write_plan(order: SweepConfig) -> None:
     """What was asked for, every scenario resolved."""
     plan = order.plan
     tree = {

@@ -13,7 +13,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from scipy.stats import bootstrap
 
-from kantor_fleet.sweep.plan import Plan, Variant
+from kantor_fleet.sweep.plan import SweepPlan, Variant
 from kantor_fleet.sweep.table import MEASURES, Row, Run, applies, measures
 
 MAIN = (
@@ -60,7 +60,7 @@ class Line(NamedTuple):
     """Of the runs to those of the first variant with the same seeds."""
 
 
-def summarize(plan: Plan, runs: Iterable[Run]) -> list[Line]:
+def summarize(plan: SweepPlan, runs: Iterable[Run]) -> list[Line]:
     """A line for every variant and measure."""
     by_variant: dict[str, dict[int, Row]] = {variant.digest: {} for variant in plan.variants}
     for run in runs:
@@ -74,7 +74,7 @@ def summarize(plan: Plan, runs: Iterable[Run]) -> list[Line]:
     ]
 
 
-def rows(plan: Plan, lines: Iterable[Line]) -> list[Row]:
+def rows(plan: SweepPlan, lines: Iterable[Line]) -> list[Row]:
     """summary.csv."""
     return [
         dict(zip(plan.keys, line.variant.values, strict=True))
@@ -85,7 +85,7 @@ def rows(plan: Plan, lines: Iterable[Line]) -> list[Row]:
     ]
 
 
-def columns(plan: Plan) -> list[str]:
+def columns(plan: SweepPlan) -> list[str]:
     """Of summary.csv."""
     differences = [f"difference_{name}" for name in Spread._fields]
     return [*plan.keys, "measure", "failed", *Spread._fields, *differences]
@@ -97,7 +97,7 @@ def varying(runs: Iterable[Run], names: Sequence[str]) -> list[str]:
     return [name for name in names if len({row[name] for row in found if row} - {None}) > 1]
 
 
-def table_of(plan: Plan, lines: Iterable[Line], measure: str) -> Table:
+def table_of(plan: SweepPlan, lines: Iterable[Line], measure: str) -> Table:
     """One measure for a person; in brackets 95 % intervals."""
     table = Table(
         title=measure,
@@ -124,7 +124,7 @@ def _shown(value: float | None) -> str:
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
-def _cells(plan: Plan, line: Line) -> list[str]:
+def _cells(plan: SweepPlan, line: Line) -> list[str]:
     first = line.variant is plan.variants[0]
     return [
         *line.variant.settings(plan.keys).values(),

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import msgspec
 
-from kantor_fleet.experiment import Outcome
-from kantor_fleet.sweep.plan import Key, Plan, Value, Variant, text_of
-from kantor_worldsim.metrics import Result
+from kantor_fleet.execution.experiment import Outcome
+from kantor_fleet.sweep.plan import Key, SweepPlan, Value, Variant, text_of
+from kantor_worldsim.observers.metrics.result import Result
 
 Row = dict[str, Any]
 """A value for each column, None where there is none."""
@@ -28,7 +28,7 @@ class Run(NamedTuple):
     outcome: Outcome
 
 
-def finished(plan: Plan, outcomes: Mapping[Key, Outcome]) -> list[Run]:
+def finished(plan: SweepPlan, outcomes: Mapping[Key, Outcome]) -> list[Run]:
     """What is there of a plan, in its order."""
     return [
         Run(variant, seed, outcomes[plan.key(variant, seed)])
@@ -60,12 +60,12 @@ MEASURES = tuple(name for name, kind in RESULT.items() if kind in {int, float})
 _OF_MAPS = "map_"
 
 
-def applies(plan: Plan, name: str) -> bool:
+def applies(plan: SweepPlan, name: str) -> bool:
     """Whether a column of a result says anything in a plan: those of maps need a mission with one."""
     return not name.startswith(_OF_MAPS) or any(v.scenario.mapping for v in plan.variants)
 
 
-def columns(plan: Plan) -> dict[str, type]:
+def columns(plan: SweepPlan) -> dict[str, type]:
     """The table's, and what is in them. A varied key that the result has too stands once, in front."""
     axes = zip(*(variant.values for variant in plan.variants), strict=True)
     varied = {key: _kind(values) for key, values in zip(plan.keys, axes, strict=True)}
@@ -75,7 +75,7 @@ def columns(plan: Plan) -> dict[str, type]:
     return {**varied, "seed": int, **found, "failed": str}
 
 
-def rows(plan: Plan, runs: Iterable[Run]) -> list[Row]:
+def rows(plan: SweepPlan, runs: Iterable[Run]) -> list[Row]:
     """The table's."""
     blank = dict.fromkeys(columns(plan))
     return [
@@ -95,7 +95,7 @@ def measures(result: Result | None) -> Row:
     return {name: flat.get(name) for name in RESULT}
 
 
-def timings(plan: Plan, runs: Iterable[Run]) -> list[Row]:
+def timings(plan: SweepPlan, runs: Iterable[Run]) -> list[Row]:
     """Who ran what, and for how long."""
     return [
         dict(zip(plan.keys, run.variant.values, strict=True))
@@ -113,7 +113,7 @@ def write_csv(path: Path, names: Sequence[str], table: Iterable[Row]) -> None:
     replace(path, lambda draft: draft.write_text(text.getvalue(), encoding="utf-8"))
 
 
-def write_parquet(path: Path, plan: Plan, table: list[Row]) -> None:
+def write_parquet(path: Path, plan: SweepPlan, table: list[Row]) -> None:
     """Replace a file whole; a column has one type, whatever is in it."""
     import pyarrow as pa  # noqa: PLC0415  an extra
     from pyarrow import parquet  # noqa: PLC0415

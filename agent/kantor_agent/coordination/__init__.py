@@ -1,0 +1,5 @@
+"""When robots on a map get new targets, and from whom.
+
+The same rules run in the supervisor and in a robot without one. How targets are distributed is a planner's
+choice. Start with `assignment.py`.
+"""

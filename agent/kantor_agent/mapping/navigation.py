@@ -1,0 +1,85 @@
+"""From a target cell to the next place to head for, round the walls that are known."""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from kantor_agent.mapping.cost_map import CostMap
+from kantor_protocol.base.grid import FREE, NOWHERE, free_way
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.machine import Pose
+
+_MARGIN_CELLS = 1e-3
+"""How far a way keeps from corners: rounding must not make a wall of one."""
+_AHEAD_CELLS = 64
+"""How far along its way a robot looks for a shortcut."""
+
+
+@kernel
+def _farthest_in_sight(
+    cells: np.ndarray, way: np.ndarray, first: int, u: float, v: float, margin: float
+) -> int:
+    """The last place along the way to which a straight line is free, or -1; cells: (rows, columns)."""
+    columns = cells.shape[1]
+    last = -1
+    for i in range(first, min(way.shape[0], first + _AHEAD_CELLS)):
+        row, column = way[i] // columns, way[i] % columns
+        if free_way(cells, FREE, u, v, column + 0.5, row + 0.5, margin) < 1.0:
+            break
+        last = i
+    return last
+
+
+class Navigator:
+    """Keeps the way to the target, and cuts its corners where nothing stands in between."""
+
+    def __init__(self, terrain: CostMap) -> None:
+        self._terrain = terrain
+        self._frame = terrain.frame
+        self._target = NOWHERE
+        self._way: npt.NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self._beyond: npt.NDArray[np.float64] = np.zeros(0)
+        self._passed = 0
+        self.left_cells = math.inf
+        """How far it still is; never rises while the robot keeps to a way."""
+
+    def head(self, pose: Pose, target: int) -> tuple[float, float] | None:
+        """Where to head for, world frame; None if no way is known."""
+        cell = self._frame.cell_of(pose.x_m, pose.y_m)
+        if cell == NOWHERE:
+            return None
+        ahead = self._look_ahead(pose) if target == self._target else -1
+        if ahead < 0:
+            self._target, self._passed = target, 0
+            self._way = self._terrain.way(cell, target)
+            self._beyond = self._to_the_end()
+            ahead = self._look_ahead(pose)
+        if ahead < 0:  # it stands beside a corner
+            ahead = self._look_ahead(pose, 0.0)
+        if ahead < 0:
+            self._target = NOWHERE
+            return None
+        self._passed = ahead
+        place_m = self._frame.centre_of(int(self._way[ahead]))
+        away_m = math.dist(place_m, (pose.x_m, pose.y_m))
+        self.left_cells = away_m / self._frame.resolution_m + float(self._beyond[ahead])
+        return place_m
+
+    def _to_the_end(self) -> npt.NDArray[np.float64]:
+        """How far it is from every cell of the way to its last, in cells."""
+        rows, columns = np.divmod(self._way, self._frame.columns)
+        steps = np.hypot(np.diff(rows), np.diff(columns))
+        return np.append(steps[::-1].cumsum()[::-1], 0.0)
+
+    def _look_ahead(self, pose: Pose, margin_cells: float = _MARGIN_CELLS) -> int:
+        frame = self._frame
+        return int(
+            _farthest_in_sight(
+                self._terrain.chart.cells.reshape(frame.rows, frame.columns),
+                self._way,
+                self._passed,
+                *frame.uv(pose.x_m, pose.y_m),
+                margin_cells,
+            )
+        )

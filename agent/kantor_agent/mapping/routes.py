@@ -1,0 +1,356 @@
+"""Ways over an occupancy map: what it costs to get from one cell to every other, and the way itself.
+
+The value function of Burgard et al. (2000), section 2.2.1, over the eight neighbours n of a cell x:
+
+    V(source) = 0,  V(x) = min over n of V(n) + |x - n| cost(n)
+
+A step is charged by the cell that it leaves. A cell is passable if its cost is finite and above 0. Only
+passable cells are entered, and a diagonal step needs both cells beside it, so that no way cuts a
+corner. With cost 1 everywhere V is the length of the way, in cells.
+
+The paper iterates until nothing changes. Here every cell is settled once, by buckets (Dial 1969) hardly
+narrower than the shortest step: nothing in the lowest bucket can improve anything else in it, so that a
+bucket needs no order. Both end in the same numbers, to the last bit. Where costs differ by more than
+the ring of buckets holds, a binary heap settles the cells, with the same numbers again.
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter
+
+from kantor_protocol.base.grid import CELLS_MAX
+from kantor_protocol.base.kernels import kernel
+
+UNKNOWN = 0.5
+"""The probability of occupancy of a cell that nobody has seen."""
+COST_MIN = 0.05
+"""Of a passable cell: at 0 there would be plateaus."""
+TRUNCATE = 3.0
+"""Standard deviations after which the smoothing kernel ends."""
+
+_SLANT = math.sqrt(2.0)
+_SLANTED = 0b10100101
+"""Which of the eight steps are diagonal. Steps are numbered as the cells that they lead to."""
+_RING = 256
+"""Buckets: a power of two."""
+_RATIO_MAX = _RING / _SLANT - 2.0
+"""Highest to lowest cost for which the ring is wide enough."""
+_LEAST, _MOST = 1e-200, 1e200
+"""Costs in between can be divided by one another."""
+_NARROWER = 1.0 - 2.0**-16
+"""A bucket's width in shortest steps: rounding lets no step end in the bucket where it began, on no map
+of `CELLS_MAX` cells."""
+_ENTRIES = 8
+"""Of one cell in all buckets: every neighbour improves it once at most."""
+_LOWEST_BIT = np.array([0] + [(byte & -byte).bit_length() - 1 for byte in range(1, 256)])
+"""Of a byte."""
+
+
+@kernel
+def survey(
+    cost: np.ndarray,
+    rows: int,
+    columns: int,
+    price: np.ndarray,
+    passable: np.ndarray,
+    moves: np.ndarray,
+) -> tuple[float, float]:
+    """Which of the eight steps can be taken from every cell; the lowest and the highest cost.
+
+    cost: (rows * columns,) float64; price: a copy of it. passable: (rows + 2, columns + 2) bytes, with a
+    margin of zeros. moves: (rows * columns,) bytes, a bit for every step.
+    """
+    least, most = math.inf, 0.0
+    for row in range(rows):
+        for column in range(columns):
+            here = cost[row * columns + column]
+            good = 0.0 < here < math.inf
+            price[row * columns + column] = here
+            passable[row + 1, column + 1] = good
+            least = min(least, here if good else math.inf)
+            most = max(most, here if good else 0.0)
+    for row in range(rows):
+        for column in range(columns):
+            down, up = passable[row, column + 1], passable[row + 2, column + 1]
+            left, right = passable[row + 1, column], passable[row + 1, column + 2]
+            moves[row * columns + column] = (
+                (down & left & passable[row, column])
+                | down << 1
+                | (down & right & passable[row, column + 2]) << 2
+                | left << 3
+                | right << 4
+                | (up & left & passable[row + 2, column]) << 5
+                | up << 6
+                | (up & right & passable[row + 2, column + 2]) << 7
+            )
+    return least, most
+
+
+@kernel
+def spread_by_buckets(
+    price: np.ndarray,
+    moves: np.ndarray,
+    offsets: np.ndarray,
+    source: int,
+    until: int,
+    least: float,
+    value: np.ndarray,
+    around: np.ndarray,
+    heads: np.ndarray,
+    links: np.ndarray,
+    members: np.ndarray,
+) -> None:
+    """Settle all cells, or those up to `until`. `value` is infinite before, and the source passable.
+
+    around: the memory of `value` with a margin at both ends, columns + 1 wide, so that all eight
+    neighbours can be compared without asking first which of them there are: one jump that is hard to
+    foresee instead of sixteen.
+
+    A bucket is a chain of entries: `heads` has its first, `links` what follows an entry, `members` an
+    entry's cell. When a cell moves to a lower bucket its entry stays in the higher one, and is passed
+    over there.
+    """
+    per = 1.0 / (least * _NARROWER)
+    margin = (around.shape[0] - value.shape[0]) >> 1
+    heads[:] = -1
+    heads[0], links[0], members[0] = 0, -1, source
+    value[source] = 0.0
+    waiting, used, spare, bucket = 1, 1, -1, 0
+    while waiting > 0:
+        entry = heads[bucket & (_RING - 1)]
+        if entry < 0:
+            bucket += 1
+            continue
+        heads[bucket & (_RING - 1)] = links[entry]
+        links[entry] = spare
+        spare = entry
+        waiting -= 1
+        cell = int(members[entry])
+        if int(value[cell] * per) != bucket:
+            continue
+        if cell == until:
+            return
+        straight, slant = value[cell] + price[cell], value[cell] + _SLANT * price[cell]
+        better = 0
+        for step in range(8):
+            offer = slant if (_SLANTED >> step) & 1 else straight
+            better |= int(offer < around[margin + cell + offsets[step]]) << step
+        better &= int(moves[cell])
+        while better != 0:
+            step = _LOWEST_BIT[better]
+            better &= better - 1
+            n = cell + offsets[step]
+            offer = slant if (_SLANTED >> step) & 1 else straight
+            had = value[n]
+            value[n] = offer
+            its = int(offer * per)
+            if had < math.inf and int(had * per) == its:
+                continue
+            if spare >= 0:
+                entry, spare = spare, links[spare]
+            else:
+                entry, used = used, used + 1
+            members[entry] = n
+            links[entry] = heads[its & (_RING - 1)]
+            heads[its & (_RING - 1)] = entry
+            waiting += 1
+
+
+@kernel
+def _rise(value: np.ndarray, heap: np.ndarray, place: np.ndarray, cell: int, at: int) -> None:
+    """Put a cell where it belongs between the heap's top and a place that is free for it."""
+    while at > 0 and value[cell] < value[heap[(at - 1) >> 1]]:
+        above = (at - 1) >> 1
+        heap[at] = heap[above]
+        place[heap[at]] = at
+        at = above
+    heap[at] = cell
+    place[cell] = at
+
+
+@kernel
+def _take(value: np.ndarray, heap: np.ndarray, place: np.ndarray, size: int) -> int:
+    """Take the cell of the lowest value from a heap of so many."""
+    first, last = heap[0], heap[size - 1]
+    at, below, end = 0, 1, size - 1
+    while below < end:
+        if below + 1 < end and value[heap[below + 1]] < value[heap[below]]:
+            below += 1
+        if value[last] <= value[heap[below]]:
+            break
+        heap[at] = heap[below]
+        place[heap[at]] = at
+        at, below = below, 2 * below + 1
+    heap[at] = last
+    place[last] = at
+    return int(first)
+
+
+@kernel
+def spread_by_heap(
+    price: np.ndarray,
+    moves: np.ndarray,
+    offsets: np.ndarray,
+    source: int,
+    until: int,
+    value: np.ndarray,
+    heap: np.ndarray,
+    place: np.ndarray,
+) -> None:
+    """The same for any costs. heap, place: (cells,) room: which cell is where, and where a cell is."""
+    value[source] = 0.0
+    heap[0], place[source], size = source, 0, 1
+    while size > 0:
+        cell = _take(value, heap, place, size)
+        size -= 1
+        if cell == until:
+            return
+        straight, slant = value[cell] + price[cell], value[cell] + _SLANT * price[cell]
+        for step in range(8):
+            if not (moves[cell] >> step) & 1:
+                continue
+            n = cell + offsets[step]
+            offer = slant if (_SLANTED >> step) & 1 else straight
+            if offer >= value[n]:
+                continue
+            if value[n] == math.inf:
+                place[n] = size
+                size += 1
+            value[n] = offer
+            _rise(value, heap, place, n, place[n])
+
+
+@kernel
+def trace(
+    price: np.ndarray,
+    moves: np.ndarray,
+    offsets: np.ndarray,
+    source: int,
+    target: int,
+    value: np.ndarray,
+    way: np.ndarray,
+) -> int:
+    """The cells from the target back to the source; how many, 0 if there is no way.
+
+    The predecessor of a cell is the neighbour that gave it its value; of several the one of the lowest
+    value, then of the lowest index. way: (cells,) room.
+    """
+    if not (0 <= target < value.shape[0] and value[target] < math.inf):
+        return 0
+    cell = target
+    for count in range(way.shape[0]):
+        way[count] = cell
+        if cell == source:
+            return count + 1
+        best, lowest = -1, value[cell]
+        for step in range(8):
+            if not (moves[cell] >> step) & 1:
+                continue
+            n = cell + offsets[step]
+            length = _SLANT if (_SLANTED >> step) & 1 else 1.0
+            if value[n] < lowest and value[n] + length * price[n] == value[cell]:
+                best, lowest = n, value[n]
+        if best < 0:
+            return 0
+        cell = best
+    return 0
+
+
+class Routes:
+    """The value function over one grid, with room for it: a call allocates nothing but a way."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        """Raises ValueError if there is no cell, or more than `CELLS_MAX`."""
+        if rows < 1 or columns < 1 or rows * columns > CELLS_MAX:
+            raise ValueError(f"a grid of {rows} x {columns} cells: 1 to {CELLS_MAX} are possible")
+        self.rows, self.columns, self.cells = rows, columns, rows * columns
+        self._around = np.full(self.cells + 2 * (columns + 1), np.inf)
+        self._value = self._around[columns + 1 : -(columns + 1)]
+        self._source = -1
+        self._price = np.empty(self.cells)
+        self._passable = np.zeros((rows + 2, columns + 2), dtype=np.uint8)
+        self._moves = np.zeros(self.cells, dtype=np.uint8)
+        across = (-1, 0, 1)
+        steps = [columns * i + j for i in across for j in across if (i, j) != (0, 0)]
+        self._offsets = np.array(steps, dtype=np.int64)
+        self._heads = np.empty(_RING, dtype=np.int32)
+        # Few entries are ever in use: the memory of the others is not touched.
+        self._links = np.empty(_ENTRIES * self.cells, dtype=np.int32)
+        self._members = np.empty(_ENTRIES * self.cells, dtype=np.int32)
+        self._way = np.empty(self.cells, dtype=np.int64)
+
+    def spread(
+        self, cost: npt.NDArray[np.float64], source: int, *, until: int = -1
+    ) -> npt.NDArray[np.float64]:
+        """(cells,) what it costs to get from the source to every cell; infinite where there is no way.
+
+        cost: (cells,) of crossing a cell, row by row; not passable unless it is finite and above 0.
+        until: stop as soon as the value of this cell is final; others may be too high. If the source is
+        no passable cell nothing is reached, not even itself.
+
+        The array is this object's own, to be read, and the next call overwrites it. Raises ValueError if
+        the costs are not as many as the cells.
+        """
+        if cost.shape != (self.cells,):
+            raise ValueError(f"costs of shape {cost.shape} for {self.cells} cells")
+        cost = np.ascontiguousarray(cost, dtype=np.float64)
+        least, most = survey(
+            cost, self.rows, self.columns, self._price, self._passable, self._moves
+        )
+        self._source = int(source)
+        self._value.fill(np.inf)
+        if not (0 <= source < self.cells and 0.0 < cost[source] < math.inf):
+            return self._value
+        walk = (self._price, self._moves, self._offsets, int(source), int(until))
+        if most <= _RATIO_MAX * least and least >= _LEAST and most <= _MOST:
+            room = (self._heads, self._links, self._members)
+            spread_by_buckets(*walk, least, self._value, self._around, *room)
+        else:
+            spread_by_heap(*walk, self._value, self._links, self._members)
+        return self._value
+
+    def way(self, target: int) -> npt.NDArray[np.int64]:
+        """The cells of the way from the source of the last `spread` to the target, with both ends.
+
+        It is empty if the target was not reached, and also where costs are so small beside the value that
+        their sum does not grow. Of ways that cost the same it is, seen from the target, the one whose
+        last cells have the lowest value, then the lowest index.
+        """
+        count = trace(
+            self._price,
+            self._moves,
+            self._offsets,
+            self._source,
+            target,
+            self._value,
+            self._way,
+        )
+        return self._way[:count][::-1].copy()
+
+
+def length_cost(passable: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
+    """(cells,) costs by which V is the length of the way in cells. passable: (rows, columns)."""
+    return np.where(passable, 1.0, np.inf).ravel()
+
+
+def smoothed_cost(
+    p_occ: npt.NDArray[np.float64],
+    explored: npt.NDArray[np.bool_],
+    *,
+    sigma_cells: float,
+    p_max: float,
+) -> npt.NDArray[np.float64]:
+    """(cells,) costs of Burgard et al. (2000), section 2.2.1: the occupancy, smoothed by a Gaussian.
+
+    p_occ: (rows, columns) probability that a cell is occupied; explored: the same shape. What is not
+    explored counts as `UNKNOWN`, the map goes on beyond its border as it is there, the Gaussian ends after
+    `TRUNCATE` standard deviations, and the costs are at least `COST_MIN`. Passable is what is explored and
+    below `p_max` before it is smoothed: a step is charged by the cell that it leaves, so that it
+    would be cheap to step into a wall.
+    """
+    known = np.where(explored, p_occ, UNKNOWN)
+    smooth = gaussian_filter(known, sigma_cells, mode="nearest", truncate=TRUNCATE)
+    passable = explored & (p_occ < p_max)
+    return np.where(passable, np.maximum(smooth, COST_MIN), np.inf).ravel()

@@ -1,0 +1,77 @@
+"""The market of a supervisor: all tours are known, and goals are sold until no sale pays."""
+
+from collections.abc import Sequence
+
+from kantor_agent.mapping.cost_map import CostMap
+from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_agent.planners.market.costs import Costs, DistanceField, price_of
+from kantor_agent.planners.market.rules import MarketRules, is_open, is_reachable
+from kantor_protocol.base.grid import NOWHERE
+
+# All tours in one place.
+
+
+class CentralMarket:
+    """The supervisor's market."""
+
+    def __init__(self, rules: MarketRules) -> None:
+        self._rules = rules
+        self._tours: dict[int, list[int]] = {}
+
+    def assign(self, situation: Situation) -> list[Task]:
+        """Give up goals, propose goals, sell goals, then a target for each member."""
+        team = sorted(situation.members + situation.others)
+        fields = [situation.terrain.optimistic(member.cell) for member in team]
+        self._tours = {member.robot: self._tours.get(member.robot, []) for member in team}
+        self._give_up(situation.terrain, team, fields)
+        self._propose(situation, team, fields)
+        self._sell(Costs(situation.terrain, fields, self._held), [m.robot for m in team])
+        heading = self._rules.heading
+        return [
+            Task(heading(situation, m, next(iter(self._tours[m.robot]), NOWHERE)))
+            for m in situation.members
+        ]
+
+    @property
+    def _held(self) -> list[int]:
+        return [goal for tour in self._tours.values() for goal in tour]
+
+    def _give_up(
+        self, terrain: CostMap, team: Sequence[Member], fields: Sequence[DistanceField]
+    ) -> None:
+        for member, field in zip(team, fields, strict=True):
+            self._tours[member.robot] = [
+                goal
+                for goal in self._tours[member.robot]
+                if is_open(terrain, goal) and is_reachable(field, goal)
+            ]
+
+    def _propose(
+        self, situation: Situation, team: Sequence[Member], fields: Sequence[DistanceField]
+    ) -> None:
+        for member, field in zip(team, fields, strict=True):
+            tour = self._tours[member.robot]
+            if tour:
+                continue
+            goals = self._rules.propose(
+                situation.terrain, field, member.robot, situation.tick, self._held
+            )
+            costs = Costs(situation.terrain, [field], goals)
+            for goal in goals:
+                tour.insert(costs.insertion(0, tour, goal)[1], goal)
+
+    def _sell(self, costs: Costs, team: Sequence[int]) -> None:
+        """One pass: the lowest place first, its goals in the order of its tour."""
+        for seller, robot in enumerate(team):
+            for goal in list(self._tours[robot]):
+                price = price_of(costs.saving(seller, self._tours[robot], goal))
+                bids = [
+                    (price_of(cost), bidder, slot)
+                    for bidder, other in enumerate(team)
+                    if bidder != seller and len(self._tours[other]) < self._rules.capacity
+                    for cost, slot in [costs.insertion(bidder, self._tours[other], goal)]
+                ]
+                if bids and min(bids)[0] < price:
+                    _, winner, slot = min(bids)
+                    self._tours[robot].remove(goal)
+                    self._tours[team[winner]].insert(slot, goal)

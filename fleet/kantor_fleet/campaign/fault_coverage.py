@@ -1,0 +1,100 @@
+"""How often each class of faults struck, from the record of a mission."""
+
+from collections import Counter
+from collections.abc import Iterable
+
+from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM, ParticipantId
+from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.links import Hostile, Partition
+from kantor_protocol.scenario.faults.processes import Kill, OnProcesses, Pause
+from kantor_protocol.scenario.faults.schedule import KINDS, kind_of
+from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record
+
+CLASSES: tuple[str, ...] = (
+    "drop",
+    "burst",
+    "delay",
+    "duplicate",
+    "replay",
+    "reorder",
+    "one-way",
+    "partition halves",
+    "partition ring",
+    "partition bridge",
+    "partition isolate",
+    "partition groups",
+    "partition flapping",
+    "clog",
+    "bandwidth",
+    "range",
+    "hostile",
+    "kill",
+    "kill torn",
+    "kill lost",
+    "kill mid-step",
+    "kill for good",
+    "kill supervisor",
+    "kill worldsim",
+    "pause",
+    "pause supervisor",
+    "pause worldsim",
+    "late",
+    "slow",
+    "full-disk",
+    "clock",
+    "impostor",
+)
+"""All of them. A fault may count for several: a torn snapshot of the supervisor, say."""
+
+_STRIKES = frozenset({"kill", "pause", "fill", "slow", "skew", "pretend"})
+
+
+class FaultCoverage:
+    """Counts, over the records of one mission, copies that link faults touched and processes that were hit."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        self._faults: tuple[Fault, ...] = ()
+
+    def take(self, record: Record) -> None:
+        """Follow one record."""
+        if isinstance(record, Batch):
+            for toll in record.tolls:
+                fault = self._faults[toll.fault]
+                if not isinstance(fault, Hostile):
+                    hit = toll.dropped + toll.delayed + toll.doubled + toll.replayed
+                    self._count(fault, "", hit)
+            if record.injected:
+                self.counts["hostile"] += len(record.injected)
+        elif isinstance(record, ProcessEvent) and record.fault >= 0:
+            fault = self._faults[record.fault]
+            if record.what in _STRIKES or (record.what == "start" and kind_of(fault) == "late"):
+                self._count(fault, record.who, 1)
+        elif isinstance(record, Opening):
+            self._faults = record.scenario.faults
+
+    def _count(self, fault: Fault, who: ParticipantId, times: int) -> None:
+        for name in _classes_of(fault, who):
+            self.counts[name] += times
+
+
+def _classes_of(fault: Fault, who: ParticipantId) -> Iterable[str]:
+    kind = kind_of(fault)
+    if isinstance(fault, Partition):
+        yield f"{kind} {fault.shape}"
+        if fault.flap_s is not None:
+            yield f"{kind} flapping"
+        return
+    if isinstance(fault, Kill | Pause) and who in {SUPERVISOR, WORLD_SIM}:
+        yield f"{kind} {who}"
+    else:
+        yield kind
+    if isinstance(fault, Kill):
+        yield from (f"{kind} {fault.disk}",) if fault.disk != "kept" else ()
+        yield from (f"{kind} mid-step",) if fault.mid_step else ()
+        yield from (f"{kind} for good",) if fault.until_s is None else ()
+
+
+def is_of_processes(name: str) -> bool:
+    """Whether a class is about processes, and not about links."""
+    return issubclass(KINDS[name.split(maxsplit=1)[0]], OnProcesses)

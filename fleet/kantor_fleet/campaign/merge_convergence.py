@@ -1,0 +1,74 @@
+"""All that was ever said in a mission, learned in another order and twice, comes to the same.
+
+A replica is a join of deltas (Almeida, Shoker & Baquero, 2018): idempotent, commutative, associative. Here
+somebody who was not there learns every message of a record, in the order in which they were sent and in one
+that is drawn, until there is nothing new in them.
+"""
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from kantor_fleet.campaign.keyed_draws import KeyedDraws
+from kantor_protocol.base.incarnations import EPOCHS_MAX
+from kantor_protocol.replication.gossip import build_replica
+from kantor_protocol.replication.replica import Replica
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import GossipMessage, decode_gossip
+from kantor_protocol.wire.weights import Units
+from kantor_worldsim.record.records import Batch, Record
+
+_SUBJECT = 1001
+_LATE = 40
+"""A message is learned after at most so many that were sent later."""
+_PASSES = 1000
+
+
+class _Said(NamedTuple):
+    slot: int
+    """Of who said it."""
+    news: GossipMessage
+
+
+def differing(scenario: Scenario, seed: int, records: Iterable[Record]) -> Iterable[str]:
+    """What is wrong with that, if anything; nothing for a mission with a map, which has no weights."""
+    said = list(_said(scenario, records)) if not scenario.mapping else []
+    epoch = 1 + max((each.news.epoch for each in said), default=0)
+    if not said or epoch > EPOCHS_MAX:
+        return
+    dice = KeyedDraws(seed, _SUBJECT)
+    twice = said + said
+    late = [i + dice.unit() * _LATE for i in range(len(twice))]
+    shuffled = [twice[i] for i in sorted(range(len(twice)), key=late.__getitem__)]
+    one, other = (_learned(scenario, epoch, order) for order in (said, shuffled))
+    if one.manner.ledger and not np.array_equal(one.store.length, other.store.length):
+        yield "join: logs have other lengths when they are learned in another order"
+    elif not np.array_equal(one.weights, other.weights):
+        yield "join: weights are others when messages are learned in another order, and twice"
+
+
+def _said(scenario: Scenario, records: Iterable[Record]) -> Iterable[_Said]:
+    places = {name: i for i, name in enumerate(scenario.roster)}
+    for record in records:
+        for act in record.acts if isinstance(record, Batch) else ():
+            for envelope in act.outputs.outbox if act.outputs else ():
+                news = decode_gossip(envelope.body)
+                yield _Said(places[act.name] + news.epoch * len(places), news)
+
+
+def _learned(scenario: Scenario, epoch: int, said: Sequence[_Said]) -> Replica:
+    """Somebody who has learned it all."""
+    samples = scenario.samples.count or 0
+    units = Units.of(scenario.energy.points, samples)
+    replica = build_replica(scenario.roster[0], scenario, units, samples, epoch)
+    before = -1
+    for _ in range(_PASSES):
+        for slot, news in said:
+            replica.learn(slot, news.have, news.logs, news.claims, news.registers)
+        replica.end_step()
+        held = int(replica.store.length.sum())
+        if held == before:
+            break
+        before = held
+    return replica

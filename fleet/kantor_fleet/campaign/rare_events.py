@@ -1,0 +1,395 @@
+"""Rare situations, looked for in the record of a mission.
+
+A campaign in which nothing broke proves little unless what is hard has happened in it. So there is a list of
+what must have been seen, after the "sometimes" assertions of Antithesis and of FoundationDB's tests.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import ClassVar
+
+from kantor_protocol.base.machine import (
+    EVERYBODY,
+    SUPERVISOR,
+    WORLD_SIM,
+    Outputs,
+    ParticipantId,
+    State,
+)
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.replication.replica import read_have
+from kantor_protocol.scenario.faults.links import OneWay, Partition
+from kantor_protocol.scenario.faults.processes import ClockFault, Kill, Late
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import RefusedError, decode_gossip
+from kantor_protocol.wire.version_vector import slots_told
+from kantor_worldsim.radio.channel import DROPPED
+from kantor_worldsim.radio.forgeries import FIRST_SEQUENCE
+from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
+
+Pair = tuple[float, float]
+
+
+class _RareEvent:
+    """Looks for situations of one subject, and counts them under their names."""
+
+    names: ClassVar[tuple[str, ...]] = ()
+
+    def __init__(self, opening: Opening) -> None:
+        self.scenario: Scenario = opening.scenario
+        self.seen: Counter[str] = Counter()
+
+    @classmethod
+    def can_be(cls, _scenario: Scenario) -> bool:
+        """Whether there is anything to look for in a mission."""
+        return True
+
+    def act(self, act: StepRecord, outputs: Outputs) -> None:
+        """Somebody stepped."""
+
+    def batch(self, batch: Batch) -> None:
+        """After the acts of a batch."""
+
+    def incident(self, incident: ProcessEvent) -> None:
+        """Something befell a process."""
+
+
+class _Ears(_RareEvent):
+    """What comes twice, late, from the dead, or from nobody."""
+
+    names = (
+        "heard twice",
+        "heard out of order",
+        "stale word after a restart",
+        "word of a former incarnation",
+        "hostile message refused",
+    )
+
+    def __init__(self, opening: Opening) -> None:
+        super().__init__(opening)
+        self._newest: dict[ParticipantId, dict[ParticipantId, int]] = {
+            name: {} for name in self.scenario.roster
+        }
+        """For each hearer, by source."""
+        self._missing: dict[tuple[ParticipantId, ParticipantId], set[int]] = {}
+        """Numbers below the newest of a link that were not heard."""
+        self._restarted: set[ParticipantId] = set()
+        self._born: dict[ParticipantId, int] = {}
+        self._refused: dict[ParticipantId, int] = {}
+
+    def act(self, act: StepRecord, outputs: Outputs) -> None:
+        name, born = act.name, self._born
+        newest = self._newest[name]
+        for source, sequence in act.heard:
+            if sequence >= FIRST_SEQUENCE:
+                continue
+            last = newest.get(source, -1)
+            if sequence > last:
+                newest[source] = sequence
+                if sequence > last + 1:
+                    skipped = range(last + 1, sequence)
+                    self._missing.setdefault((name, source), set()).update(skipped)
+            else:
+                self._note_old((name, source), sequence, last)
+            if born and sequence <= born.get(source, -1):
+                self.seen["word of a former incarnation"] += 1
+        if outputs.refused != self._refused.get(name, 0):
+            self._note_refused(act, outputs.refused)
+
+    def _note_refused(self, act: StepRecord, refused: int) -> None:
+        if refused > self._refused.get(act.name, 0) and act.heard:
+            forged = any(sequence >= FIRST_SEQUENCE for _, sequence in act.heard)
+            self.seen["hostile message refused"] += forged
+        self._refused[act.name] = refused
+
+    def _note_old(
+        self, link: tuple[ParticipantId, ParticipantId], sequence: int, newest: int
+    ) -> None:
+        missing = self._missing.get(link, set())
+        self.seen["heard out of order" if sequence in missing else "heard twice"] += 1
+        missing.discard(sequence)
+        if sequence < newest and link[0] in self._restarted:
+            self.seen["stale word after a restart"] += 1
+
+    def incident(self, incident: ProcessEvent) -> None:
+        if incident.what == "start" and incident.step > 0:
+            self._restarted.add(incident.who)
+            self._refused[incident.who] = 0
+            if incident.epoch:
+                self._born[incident.who] = incident.step
+
+
+class _Lives(_RareEvent):
+    """Deaths and births at awkward moments."""
+
+    names = (
+        "death between note and answer",
+        "restart during a partition",
+        "two dead at once",
+        "supervisor killed with its word under way",
+        "world-sim restarted with messages under way",
+    )
+
+    def __init__(self, opening: Opening) -> None:
+        super().__init__(opening)
+        self._dead: set[ParticipantId] = set()
+        self._due_ns: dict[bool, int] = {True: -1, False: -1}
+        faults = self.scenario.faults
+        killed = {name for fault in faults if isinstance(fault, Kill) for name in fault.who}
+        self._looks = bool(killed & {SUPERVISOR, WORLD_SIM})
+        self._cuts = [fault for fault in faults if isinstance(fault, Partition | OneWay)]
+
+    def batch(self, batch: Batch) -> None:
+        if not self._looks:
+            return
+        for verdict in batch.verdicts:
+            if verdict.due_ns != DROPPED:
+                by_supervisor = verdict.source == SUPERVISOR
+                self._due_ns[by_supervisor] = max(self._due_ns[by_supervisor], verdict.due_ns)
+
+    def incident(self, incident: ProcessEvent) -> None:
+        who, now_ns = incident.who, incident.now_ns
+        if incident.what == "kill":
+            fault = self.scenario.faults[incident.fault]
+            if isinstance(fault, Kill) and fault.mid_step:
+                self.seen["death between note and answer"] += 1
+            self.seen["two dead at once"] += bool(self._dead - {who})
+            if who == SUPERVISOR and self._due_ns[True] > now_ns:
+                self.seen["supervisor killed with its word under way"] += 1
+            if who == WORLD_SIM and max(self._due_ns.values()) > now_ns:
+                self.seen["world-sim restarted with messages under way"] += 1
+            self._dead.add(who)
+        elif incident.what == "start":
+            self._dead.discard(who)
+            if any(cut.from_ns <= now_ns < (cut.until_ns or 2**63) for cut in self._cuts):
+                self.seen["restart during a partition"] += 1
+
+
+class _Memory(_RareEvent):
+    """Who was away, or forgot all, and learns it from the others."""
+
+    names = ("late joiner knows all that was known", "log of a former incarnation came back")
+
+    @classmethod
+    def can_be(cls, scenario: Scenario) -> bool:
+        return any(isinstance(fault, Kill | Late) for fault in scenario.faults)
+
+    def __init__(self, opening: Opening) -> None:
+        super().__init__(opening)
+        self._bodies: dict[ParticipantId, bytes] = {}
+        self._wanted: dict[ParticipantId, list[int]] = {}
+        self._lost: dict[ParticipantId, int] = {}
+        self._names = self.scenario.roster
+
+    def act(self, act: StepRecord, outputs: Outputs) -> None:
+        if not outputs.outbox:
+            return
+        name, body = act.name, outputs.outbox[-1].body
+        self._bodies[name] = body
+        if name in self._wanted and _covers(self._have(body), self._wanted[name]):
+            self.seen["late joiner knows all that was known"] += 1
+            del self._wanted[name]
+        if name in self._lost and any(self._have(body)[self._lost[name] :][:1]):
+            self.seen["log of a former incarnation came back"] += 1
+            del self._lost[name]
+
+    def incident(self, incident: ProcessEvent) -> None:
+        if incident.what != "start":
+            return
+        who = incident.who
+        if incident.fault >= 0 and isinstance(self.scenario.faults[incident.fault], Late):
+            known = [self._have(body) for name, body in self._bodies.items() if name != who]
+            width = max(map(len, known), default=0)
+            most = [max(have[i] for have in known if i < len(have)) for i in range(width)]
+            if any(most):
+                self._wanted[who] = most
+        elif incident.epoch and who in self._bodies:
+            count = len(self._names)
+            self._lost[who] = (incident.epoch - 1) * count + self._names.index(who)
+
+    def _have(self, body: bytes) -> list[int]:
+        """How many entries of every log its sender says that it holds."""
+        try:
+            have = decode_gossip(body).have
+        except RefusedError:
+            return []
+        slots = slots_told(have, len(self._names), claims=self.scenario.claiming)
+        return (slots and read_have(have, slots)) or []
+
+
+class _Goals(_RareEvent):
+    """Goals that others take away."""
+
+    names = ("merge that removes the current goal", "one goal of two, left to one by a claim")
+
+    @classmethod
+    def can_be(cls, scenario: Scenario) -> bool:
+        return scenario.planner.name == "transport" and scenario.samples.diffusion_m == 0.0
+
+    def __init__(self, opening: Opening) -> None:
+        super().__init__(opening)
+        places = opening.site.samples_m.tolist()
+        self._samples = {(x, y): i for i, (x, y) in enumerate(places)}
+        self._goals: dict[ParticipantId, Pair | None] = {}
+        self._pairs = Pairs()
+
+    def act(self, act: StepRecord, outputs: Outputs) -> None:
+        before, now = self._goals.get(act.name), outputs.goal
+        self._goals[act.name] = now
+        if before is None or before == now or not act.heard:
+            return
+        sample = self._samples.get(before)
+        if sample is None:
+            return
+        left = dict(self._decoded(outputs.lowered))
+        if left.get(sample) == 0 and sample not in dict(self._decoded(outputs.spent)):
+            self.seen["merge that removes the current goal"] += 1
+        elif now is not None and sample not in left and self.scenario.claiming:
+            shared = any(goal == before for name, goal in self._goals.items() if name != act.name)
+            self.seen["one goal of two, left to one by a claim"] += shared
+
+    def _decoded(self, content: bytes) -> Iterator[tuple[int, int]]:
+        pairs = self._pairs.decode(content, len(self._samples)) if content else None
+        if pairs is not None:
+            yield from zip(pairs[0].tolist(), pairs[1].tolist(), strict=True)
+
+
+class _Sides(_RareEvent):
+    """What two sides of a partition did without knowing of each other."""
+
+    names = ("partition healed after both sides consumed one sample",)
+
+    @classmethod
+    def can_be(cls, scenario: Scenario) -> bool:
+        return any(isinstance(fault, Partition) for fault in scenario.faults)
+
+    def __init__(self, opening: Opening) -> None:
+        super().__init__(opening)
+        roster = self.scenario.roster
+        self._samples = opening.samples_m.shape[0]
+        self._open = [
+            (fault.from_ns, fault.until_ns, fault.severs(roster))
+            for fault in self.scenario.faults
+            if isinstance(fault, Partition) and fault.until_ns is not None
+        ]
+        self._open.sort(key=lambda window: window[1] or 0)
+        self._from_ns = min((window[0] for window in self._open), default=2**63)
+        self._consumed: dict[ParticipantId, dict[int, int]] = {}
+        self._pairs = Pairs()
+
+    def act(self, act: StepRecord, outputs: Outputs) -> None:
+        if not outputs.spent or act.now_ns < self._from_ns or not self._open:
+            return
+        pairs = self._pairs.decode(outputs.spent, self._samples)
+        if pairs is not None:
+            latest = dict.fromkeys(pairs[0].tolist(), act.now_ns)
+            self._consumed.setdefault(act.name, {}).update(latest)
+
+    def batch(self, batch: Batch) -> None:
+        while self._open and batch.now_ns >= (self._open[0][1] or 0):
+            from_ns, _, severs = self._open.pop(0)
+            within = {
+                name: {sample for sample, at_ns in consumed.items() if at_ns >= from_ns}
+                for name, consumed in self._consumed.items()
+            }
+            if any(
+                one < other and severs(one, other) and within[one] & within[other]
+                for one in within
+                for other in within
+            ):
+                self.seen["partition healed after both sides consumed one sample"] += 1
+
+
+class _Ends(_RareEvent):
+    """Energy, clocks and a supervisor that come to an end."""
+
+    names = (
+        "energy ended in contact",
+        "clock jumped back",
+        "supervisor given up",
+        "supervisor heard again after it was given up",
+    )
+
+    def __init__(self, opening: Opening) -> None:
+        super().__init__(opening)
+        self._exhausted: set[ParticipantId] = set()
+        self._read_ns: dict[ParticipantId, int] = {}
+        self._alone: set[ParticipantId] = set()
+        self._centralized = self.scenario.centralized
+        self._misled = any(isinstance(fault, ClockFault) for fault in self.scenario.faults)
+
+    def act(self, act: StepRecord, outputs: Outputs) -> None:
+        name = act.name
+        if outputs.state is State.EXHAUSTED and name not in self._exhausted:
+            self._exhausted.add(name)
+            self.seen["energy ended in contact"] += bool(act.heard)
+        if self._misled:
+            self._read_clock(act)
+        if self._centralized and name != SUPERVISOR and outputs.outbox:
+            alone = outputs.outbox[-1].target == EVERYBODY
+            if alone and name not in self._alone:
+                self._alone.add(name)
+                self.seen["supervisor given up"] += 1
+            elif not alone and name in self._alone:
+                self._alone.discard(name)
+                self.seen["supervisor heard again after it was given up"] += 1
+
+    def _read_clock(self, act: StepRecord) -> None:
+        read_ns = act.now_ns + act.skew_ns
+        if read_ns < self._read_ns.get(act.name, 0):
+            self.seen["clock jumped back"] += 1
+        self._read_ns[act.name] = read_ns
+
+
+_RARE_EVENTS = (_Goals, _Sides, _Lives, _Ears, _Memory, _Ends)
+
+JUDGED = ("L1 judged", "L2 judged", "L3 judged", "I8 judged")
+"""Missions in which a rule of liveness could have been broken; see `kantor_worldsim.liveness`."""
+
+RARE_EVENTS: tuple[str, ...] = (*(name for sight in _RARE_EVENTS for name in sight.names), *JUDGED)
+"""What a campaign has to see."""
+
+
+class RareEvents:
+    """Follows the records of one mission."""
+
+    def __init__(self) -> None:
+        self._sights: list[_RareEvent] = []
+        self._acting: list[Callable[[StepRecord, Outputs], None]] = []
+        self._batching: list[Callable[[Batch], None]] = []
+
+    def take(self, record: Record) -> None:
+        """Follow one record."""
+        if isinstance(record, Batch):
+            for act in record.acts:
+                if act.outputs is not None:
+                    for look in self._acting:
+                        look(act, act.outputs)
+            for follow in self._batching:
+                follow(record)
+        elif isinstance(record, ProcessEvent):
+            for sight in self._sights:
+                sight.incident(record)
+        elif isinstance(record, Opening):
+            self._sights = [
+                sight(record) for sight in _RARE_EVENTS if sight.can_be(record.scenario)
+            ]
+            self._acting = [s.act for s in self._sights if type(s).act is not _RareEvent.act]
+            self._batching = [
+                s.batch for s in self._sights if type(s).batch is not _RareEvent.batch
+            ]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How often each situation was seen; those that were not are left out."""
+        return {
+            name: sight.seen[name]
+            for sight in self._sights
+            for name in sight.names
+            if sight.seen[name]
+        }
+
+
+def _covers(have: list[int], wanted: list[int]) -> bool:
+    padded = have + [0] * (len(wanted) - len(have))
+    return all(held >= entries for held, entries in zip(padded, wanted, strict=False))

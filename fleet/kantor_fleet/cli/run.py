@@ -1,0 +1,45 @@
+"""`kantor run`: its options and their checks."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from kantor_fleet.cli.options import check_seed, check_speed, exact_period
+
+
+def run(
+    scenario: Annotated[str, tyro.conf.Positional] = "fleet",
+    /,
+    *,
+    seed: int = 0,
+    exchange: Literal["in-process", "lockstep", "wall"] = "lockstep",
+    speed: float = 1.0,
+    out: Path = Path("runs"),
+    exact: bool = False,
+    exact_every: int = 0,
+    chaos: Path | None = None,
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002  the flag is --set
+) -> int:
+    """Run a mission, with live progress, and leave its record and its picture.
+
+    Args:
+        scenario: A packaged name (see `kantor scenarios`) or a TOML file.
+        seed: Decides every draw.
+        exchange: in-process: one process, as fast as possible. lockstep: a process each, the same
+            result. wall: a process each, every robot on its own clock.
+        speed: wall only: simulated seconds in a real one.
+        out: Where the run folder is made.
+        exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
+        exact_every: Periods from one exact distance to the next, seconds of work each; not on the wall.
+        chaos: A TOML file of [[faults]] that are added to the scenario's own.
+        set: Override a key of the scenario, such as radio.range_m=150; any number of times.
+    """
+    from kantor_fleet.execution.mission import run as run_mission  # noqa: PLC0415
+    from kantor_fleet.scenarios.catalog import find  # noqa: PLC0415  each verb imports what it needs
+
+    check_seed(seed)
+    check_speed(speed)
+    mission = find(scenario, set, chaos)
+    every = exact_period(mission, exact_every, exchange, exact=exact)
+    return run_mission(mission, seed, exchange, speed, out, every)

@@ -1,0 +1,20 @@
+"""`kantor verify`: its options and their checks."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+def verify(run: Annotated[Path, tyro.conf.Positional], /) -> int:
+    """Execute a recorded run again and compare; exit code 1 if anything differs.
+
+    A deterministic run is executed anew from its scenario and seed. A wall run is replayed robot by
+    robot from the inboxes that it recorded.
+
+    Args:
+        run: A run folder.
+    """
+    from kantor_fleet.execution.verify import verify as verify_run  # noqa: PLC0415
+
+    return verify_run(run)

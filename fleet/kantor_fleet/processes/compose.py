@@ -1,0 +1,200 @@
+"""`kantor compose`: a compose file for a fleet, a container and an identity for each.
+
+The text is written as it is to be read. It keeps to what both Compose v2 and docker-compose 1.29 understand.
+"""
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from kantor_fleet.cli.exits import Exit, fail
+from kantor_protocol.transport.endpoint import check_endpoint
+
+ROBOTS_MAX = 500
+NETWORKS_MAX = 25
+"""Docker's own address pools have room for about thirty networks."""
+_PORT = 7447
+_USER = 10001
+"""Who runs the containers if the one who prepares them is root."""
+_ID = "r{}"
+
+_HEAD = """\
+# {title}
+#
+#   {command}
+#
+# KANTOR_SCENARIO   a packaged name, or /runs/FILE.toml for a file in the run folder
+# KANTOR_SET        overrides, such as KANTOR_SET='radio.range_m=300 radio.drop=0.2'
+# KANTOR_SEED, KANTOR_SPEED, KANTOR_RUNS (folder of the runs), KANTOR_KEYS (folder of the identities),
+# KANTOR_USER (uid:gid who owns both), KANTOR_IMAGE
+
+x-kantor: &kantor
+  image: ${{KANTOR_IMAGE:-kantor}}
+  user: ${{KANTOR_USER:-1000:1000}}
+  read_only: true
+  tmpfs: [/tmp]
+  cap_drop: [ALL]
+  security_opt: ["no-new-privileges:true"]
+  restart: on-failure:10
+
+x-robot: &robot
+  <<: *kantor
+  mem_limit: ${{KANTOR_MEMORY:-256m}}
+  cpus: 1.0
+  pids_limit: 64
+  environment:
+    KANTOR_PORT: {port}
+    ZENOH_RUNTIME: "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), rx: (handover: app), net: (handover: app))"
+"""
+_WORLDSIM = """\
+  worldsim:
+    <<: *kantor
+    command: >-
+      worldsim ${{KANTOR_SCENARIO:-{scenario}}} --listen {protocol}/0.0.0.0:{port} --credentials /run/secrets/worldsim.toml
+      --seed ${{KANTOR_SEED:-0}} --speed ${{KANTOR_SPEED:-1}} --out /runs --state /state
+      --set robots.count={robots} ${{KANTOR_SET:-{overrides}}}
+    mem_limit: 2g
+    cpus: 2.0
+    pids_limit: 256
+    stop_grace_period: 30s
+    networks: [{networks}]
+    secrets: [{{source: worldsim, target: worldsim.toml}}]
+    volumes: ["${{KANTOR_RUNS:-./runs}}:/runs", "worldsim:/state"]
+"""
+_KEYS = """\
+  keys:  # makes the identities: docker-compose run --rm keys
+    <<: *kantor
+    command: keys kantor --robots {robots}{people} --host worldsim --out /keys
+    restart: "no"
+    network_mode: none
+    volumes: ["${{KANTOR_KEYS:-./keys}}:/keys"]
+    profiles: [keys]
+"""
+_PARTICIPANT = """\
+  {name}:
+    <<: *robot
+    command: {verb} --connect {connect} --credentials /run/secrets/{name}.toml --state /state
+    networks: [{network}]
+    secrets: [{{source: {name}, target: {name}.toml}}]
+    volumes: ["{name}:/state"]
+"""
+
+
+class ComposeConfig(NamedTuple):
+    """Which fleet. hub: an endpoint where a world-sim listens; without one, world-sim is in the file."""
+
+    robots: int
+    supervisor: bool = False
+    isolated: bool = False
+    scenario: str = "fleet"
+    overrides: tuple[str, ...] = ()
+    hub: str | None = None
+
+
+def compose(order: ComposeConfig, file: Path) -> Exit:
+    """Write a fleet's compose file, and beside it what it needs. Raises BusError, ScenarioError, OSError."""
+    _check(order)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text(order), encoding="utf-8")
+    user = prepare(file.parent)
+    print(f"{file}: {order.robots} robots, run by {user}; next, in {file.parent}/:")
+    if order.hub is None:
+        print("  docker-compose run --rm keys")
+    else:
+        print("  put each robot's identity into keys/")
+    print(f"  {_up(order)}")
+    return Exit.DONE
+
+
+def _check(order: ComposeConfig) -> None:
+    if not 1 <= order.robots <= ROBOTS_MAX:
+        fail(Exit.USAGE, f"--robots {order.robots}: give 1 to {ROBOTS_MAX}")
+    if order.isolated and order.robots > NETWORKS_MAX:
+        fail(
+            Exit.USAGE,
+            f"--isolated: a network for each robot, and Docker has room for {NETWORKS_MAX}",
+        )
+    if order.hub is not None:
+        check_endpoint(order.hub)
+        return
+    from kantor_fleet.scenarios.catalog import find  # noqa: PLC0415
+
+    if not order.scenario.startswith("/"):  # a file in the run folder
+        scenario = find(order.scenario, (f"robots.count={order.robots}", *order.overrides))
+        if scenario.centralized and not order.supervisor:
+            fail(Exit.USAGE, f"--scenario {order.scenario}: centralized; add --supervisor")
+
+
+def text(order: ComposeConfig) -> str:
+    """The file. The supervisor stands in a profile of its own, `centralized`."""
+    connect = order.hub or f"tls/worldsim:{_PORT}"
+    protocol, _, place = connect.partition("/")
+    port = place.rpartition(":")[2]
+    robots = [_ID.format(i) for i in range(1, order.robots + 1)]
+    people = [*robots, *(["supervisor"] if order.supervisor else [])]
+    networks = people if order.isolated else ["fleet"]
+    parts = [_HEAD.format(title=_title(order), command=_up(order), port=port), "\nservices:\n"]
+    if order.hub is None:
+        overrides = " ".join(order.overrides)
+        parts.append(
+            _WORLDSIM.format(
+                scenario=order.scenario,
+                protocol=protocol,
+                port=port,
+                robots=order.robots,
+                overrides=overrides,
+                networks=", ".join(networks),
+            )
+        )
+        parts.append(_KEYS.format(robots=order.robots, people=_people(order)))
+    for name in people:
+        verb = name if name == "supervisor" else f"agent {name}"
+        network = name if order.isolated else "fleet"
+        parts.append(_PARTICIPANT.format(name=name, verb=verb, connect=connect, network=network))
+        if order.hub is None:
+            parts.append("    depends_on: [worldsim]\n")
+            if name == "supervisor":
+                parts.append("    profiles: [centralized]\n")
+    owners = people if order.hub else ["worldsim", *people]
+    # Nobody in a fleet has any business beyond it, unless its hub is there.
+    inside = "internal: false" if order.hub else "internal: true"
+    secrets = "".join(
+        f'  {who}: {{file: "${{KANTOR_KEYS:-./keys}}/{who}.toml"}}\n' for who in owners
+    )
+    parts += ["\nnetworks:\n", *(f"  {name}: {{{inside}}}\n" for name in networks)]
+    parts += ["\nsecrets:\n", secrets, "\nvolumes:\n", *(f"  {who}: {{}}\n" for who in owners)]
+    return "".join(parts)
+
+
+def _title(order: ComposeConfig) -> str:
+    whose = "" if order.hub is None else f", which world-sim at {order.hub} awaits"
+    apart = ", each on a network of its own with world-sim" if order.isolated else ""
+    return f"{order.robots} robots in containers{apart}{whose}. Written by `kantor compose`."
+
+
+def _people(order: ComposeConfig) -> str:
+    return " --supervisor" if order.supervisor else ""
+
+
+def _up(order: ComposeConfig) -> str:
+    if order.hub is not None:
+        return "docker-compose up --detach"
+    return "docker-compose up --exit-code-from worldsim"
+
+
+def prepare(folder: Path) -> str:
+    """Make the folders of the runs and of the identities, and `.env`, which says who runs the containers; who that is.
+
+    Identities are for their owner's eyes only and the run folder is the user's, so containers run as the user; never
+    as root.
+    """
+    root = os.getuid() == 0
+    user = f"{_USER}:{_USER}" if root else f"{os.getuid()}:{os.getgid()}"
+    for name in ("runs", "keys"):
+        (folder / name).mkdir(exist_ok=True)
+        if root:
+            os.chown(folder / name, _USER, _USER)
+    env = folder / ".env"
+    if not env.exists():
+        env.write_text(f"COMPOSE_PROJECT_NAME=kantor\nKANTOR_USER={user}\n", encoding="utf-8")
+    return user

@@ -1,0 +1,428 @@
+"""A fleet on this machine: world-sim and every participant as a process of its own.
+
+All children come from one fork server that has imported and compiled everything and opened nothing. This
+process is also the hands by which world-sim carries out a scenario's faults of processes, itself included: it
+kills, stops and starts them, and starts world-sim again from its journal whoever has killed it.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerProcess
+from pathlib import Path
+from typing import NamedTuple
+
+from kantor_fleet.cli.exits import Exit
+from kantor_fleet.cli.interrupts import Interrupts
+from kantor_fleet.processes.log import log_to
+from kantor_protocol.base.machine import SUPERVISOR, ParticipantId
+from kantor_protocol.node import wal
+from kantor_protocol.node.runner import RejectedError, StateError
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.transport import credentials
+from kantor_protocol.transport.client import observer_session
+from kantor_protocol.transport.credentials import Identity
+from kantor_protocol.transport.endpoint import free_endpoint
+from kantor_protocol.transport.router import HubRouter
+from kantor_protocol.transport.session import BusError
+from kantor_protocol.transport.zenoh_log import init_log
+from kantor_protocol.wire import keys
+from kantor_protocol.wire.messages import Progress, RefusedError, decode_progress
+from kantor_worldsim.exchange.config import MissionConfig, late
+from kantor_worldsim.exchange.process_control import ProcessCommand as Deed
+from kantor_worldsim.exchange.process_control import ProcessController
+from kantor_worldsim.record.run_folder import RESULT
+
+FLEET = "kantor"
+_START_S = 60.0
+_GOODBYE_S = 5.0
+_LISTEN_S = 5.0
+"""How long the endpoint of a world-sim that was killed may be taken yet."""
+_IMPOSTOR_S = 15.0
+"""Whoever has not been sent away by then has been let in."""
+_REVIVALS = 20
+"""How often world-sim is started again when nobody ordered its death."""
+_SPARE_BYTES = 7
+"""A full disk has room for a part of a page."""
+STATE = "state"
+"""Where the diaries are in a run folder."""
+# One worker serves all of Zenoh in a participant: fewer threads, fewer wake-ups.
+_LIGHT_RUNTIME = (
+    "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), "
+    "rx: (handover: app), net: (handover: app))"
+)
+
+
+class FleetConfig(NamedTuple):
+    """What a local fleet is to run."""
+
+    scenario: Scenario
+    seed: int
+    exchange: str
+    speed: float
+    folder: Path
+    exact_every: int | None = None
+
+
+class Fleet:
+    """The processes of a local fleet."""
+
+    def __init__(self, order: FleetConfig, connect: str, secrets: Path) -> None:
+        """Use `local_fleet` to start one."""
+        self.connect = connect
+        self.observer = credentials.find(secrets, credentials.OBSERVER)
+        self._order = order
+        self._secrets = secrets
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(["kantor_fleet.processes.preloaded"])
+        self._logs, self._state = order.folder / "logs", order.folder / STATE
+        self._logs.mkdir()
+        self._lock = threading.RLock()
+        """Around every start, and every look at an exit code: that can be read only once."""
+        self._stopping = threading.Event()
+        self._revivals = 0
+        self._down = False
+        """World-sim is not there, and will be."""
+        self._mourned: set[ParticipantId] = set()
+        self._excused: set[ParticipantId] = set()
+        """Whose end says nothing, since they were killed or stopped on order."""
+        self._frozen: set[ParticipantId] = set()
+        self._impostors: dict[ParticipantId, tuple[ForkServerProcess, float]] = {}
+        self.world_sim = self._start_world_sim(resume=False)
+        absent = set(late(order.scenario))
+        self.participants: dict[ParticipantId, ForkServerProcess] = {
+            name: self._start_participant(name, name)
+            for name in order.scenario.roster
+            if name not in absent
+        }
+
+    def _start(self, name: str, target: object, *arguments: object) -> ForkServerProcess:
+        process = self._context.Process(target=target, args=arguments, name=f"kantor-{name}")  # type: ignore[arg-type]
+        with self._lock:
+            process.start()
+        return process
+
+    def _start_world_sim(self, *, resume: bool) -> ForkServerProcess:
+        ours, theirs = self._context.Pipe()
+        process = self._start(
+            "worldsim",
+            _be_world_sim,
+            self._order,
+            self.connect,
+            self._secrets,
+            self._logs / "worldsim.log",
+            theirs,
+            resume,
+            self._stopping.is_set(),
+        )
+        theirs.close()
+        threading.Thread(target=self._serve, args=(ours, process), daemon=True).start()
+        return process
+
+    def _start_participant(self, name: ParticipantId, log: str) -> ForkServerProcess:
+        return self._start(
+            log,
+            _be_participant,
+            self.connect,
+            self._secrets,
+            name,
+            self._logs / f"{log}.log",
+            self._state,
+        )
+
+    def newly_failed(self) -> list[tuple[ParticipantId, int]]:
+        """Participants that have ended badly of themselves since the last call, with their exit codes."""
+        with self._lock:
+            failed = [(name, code) for name, code in self._failed() if name not in self._mourned]
+        self._mourned |= {name for name, _ in failed}
+        return failed
+
+    @property
+    def any_failed(self) -> bool:
+        """Whether a participant has ended badly of itself."""
+        with self._lock:
+            return any(self._failed())
+
+    def _failed(self) -> Iterator[tuple[ParticipantId, int]]:
+        for name, process in self.participants.items():
+            if process.exitcode and name not in self._excused:
+                yield name, process.exitcode
+
+    def revive(self) -> str | None:
+        """Start world-sim again if somebody has killed it; how it ended."""
+        with self._lock:
+            code = self.world_sim.exitcode
+            dead = code is not None and code < 0 and not self._down
+            if not dead or self._stopping.is_set() or self._revivals == _REVIVALS:
+                return None
+            self._revivals += 1
+            self.world_sim = self._start_world_sim(resume=True)
+            return f"signal {-(code or 0)}"
+
+    @property
+    def runs(self) -> bool:
+        """Whether world-sim is there, or will be."""
+        with self._lock:
+            return self._down or self.world_sim.exitcode is None
+
+    @property
+    def deserted(self) -> bool:
+        """Whether nobody is left who could take part, before anything has happened."""
+        with self._lock:
+            return all(process.exitcode is not None for process in self.participants.values())
+
+    def stop(self) -> None:
+        """Ask world-sim to end the mission and close the record."""
+        self._stopping.set()
+        with self._lock:
+            if not self._down and self.world_sim.exitcode is None:
+                os.kill(self.world_sim.pid or 0, signal.SIGCONT)
+                os.kill(self.world_sim.pid or 0, signal.SIGINT)
+
+    def disband(self) -> None:
+        """Wait for everybody to go, and make them."""
+        with self._lock:
+            for name in self._frozen:
+                self.participants[name].kill()
+            processes = [self.world_sim, *self.participants.values()]
+            processes += [process for process, _ in self._impostors.values()]
+            for act in (None, "terminate", "kill"):
+                for process in processes:
+                    if act is not None and process.exitcode is None:
+                        getattr(process, act)()
+                give_up = time.monotonic() + _GOODBYE_S
+                for process in processes:
+                    process.join(max(0.0, give_up - time.monotonic()))
+        if (self._order.folder / RESULT).exists():
+            shutil.rmtree(self._state, ignore_errors=True)
+
+    # Hands.
+
+    def _serve(self, pipe: Connection, process: ForkServerProcess) -> None:
+        """Carry out what a world-sim process orders, as long as it lives."""
+        with contextlib.suppress(EOFError, OSError), pipe:
+            while True:
+                deed: Deed = pipe.recv()
+                if deed.what == "restart":
+                    self._restart(process, deed.after_s)
+                    return
+                if deed.what == "rest":
+                    self._rest(process, deed.after_s)
+                    pipe.send(None)
+                else:
+                    pipe.send(self._carry_out(deed))
+
+    def _restart(self, process: ForkServerProcess, after_s: float) -> None:
+        with self._lock:
+            self._down = True
+            process.kill()
+            process.join()
+        self._stopping.wait(after_s)
+        with self._lock:
+            self.world_sim = self._start_world_sim(resume=True)
+            self._down = False
+
+    def _rest(self, process: ForkServerProcess, after_s: float) -> None:
+        os.kill(process.pid or 0, signal.SIGSTOP)
+        self._stopping.wait(after_s)
+        os.kill(process.pid or 0, signal.SIGCONT)
+
+    def _carry_out(self, deed: Deed) -> bool | None:
+        name = deed.who
+        with self._lock:
+            if deed.what == "refused":
+                return self._impostor_refused(name)
+            if deed.what == "pretend":
+                impostor = self._start_participant(name, f"{name}-impostor")
+                self._impostors[name] = impostor, time.monotonic()
+                return None
+            if deed.what in {"kill", "start"}:
+                self._kill(name)
+            if deed.what == "start":
+                self._see_to_disk(deed)
+                self.participants[name] = self._start_participant(name, name)
+                self._excused.discard(name)
+            process = self.participants.get(name)
+            if process is not None and process.exitcode is None:
+                self._act_on(process.pid or 0, deed)
+        return None
+
+    def _kill(self, name: ParticipantId) -> None:
+        process = self.participants.get(name)
+        self._excused.add(name)
+        self._frozen.discard(name)
+        if process is not None:
+            process.kill()
+            process.join()
+
+    def _see_to_disk(self, deed: Deed) -> None:
+        path = self._state / f"{deed.who}.diary"
+        with contextlib.suppress(FileNotFoundError):
+            if deed.disk == "lost":
+                path.unlink()
+            elif deed.disk == "torn":
+                wal.tear(path, deed.step)
+
+    def _act_on(self, pid: int, deed: Deed) -> None:
+        """What can be done to a process that lives."""
+        if deed.what == "freeze":
+            os.kill(pid, signal.SIGSTOP)
+            self._frozen.add(deed.who)
+        elif deed.what == "thaw":
+            os.kill(pid, signal.SIGCONT)
+            self._frozen.discard(deed.who)
+        elif deed.what in {"fill", "free"}:
+            _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+            path = self._state / f"{deed.who}.diary"
+            size = path.stat().st_size if path.exists() else 0
+            room = hard if deed.what == "free" else size + _SPARE_BYTES
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (room, hard))
+
+    def _impostor_refused(self, name: ParticipantId) -> bool | None:
+        impostor, since_s = self._impostors[name]
+        if impostor.exitcode is not None:
+            return impostor.exitcode == Exit.USAGE
+        if time.monotonic() - since_s < _IMPOSTOR_S:
+            return None
+        impostor.kill()
+        return False
+
+
+@contextmanager
+def local_fleet(order: FleetConfig) -> Iterator[Fleet]:
+    """Start a fleet; on leaving, no process of it is left."""
+    with tempfile.TemporaryDirectory(prefix="kantor-") as folder:
+        secrets = Path(folder)
+        credentials.issue(secrets, FLEET, order.scenario.roster)
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+        fleet = Fleet(order, free_endpoint(), secrets)
+        try:
+            yield fleet
+        finally:
+            fleet.stop()
+            fleet.disband()
+
+
+def watch_progress(fleet: Fleet) -> Iterator[Progress | None]:
+    """What world-sim tells, as long as it runs; None when there was nothing for a while.
+
+    Raises BusError if world-sim does not come up.
+    """
+    key = keys.progress(FLEET)
+    with observer_session(fleet.connect, fleet.observer, key, _START_S) as watch:
+        while fleet.runs:
+            message = watch.next(0.1)
+            try:
+                yield decode_progress(message[1]) if message is not None else None
+            except RefusedError:
+                yield None
+
+
+def _be_world_sim(
+    order: FleetConfig,
+    listen: str,
+    secrets: Path,
+    log: Path,
+    pipe: Connection,
+    resume: bool,  # noqa: FBT001  a target of a process
+    stopping: bool,  # noqa: FBT001
+) -> None:
+    from kantor_worldsim.exchange.main import run  # noqa: PLC0415  the fork server has it
+    from kantor_worldsim.observers.recording import Recording
+    from kantor_worldsim.record.run_folder import OverError, Past, ResumeError
+    from kantor_worldsim.world.world import WorldSetup  # noqa: PLC0415
+
+    say = log_to(log, "worldsim")
+    init_log()
+    scenario, seed = order.scenario, order.seed
+    past = None
+    if resume:
+        try:
+            past = Past.of(order.folder)
+        except OverError as error:  # it was killed on its way out
+            say(str(error))
+            return
+        except ResumeError:  # nothing has happened yet
+            past = None
+    site = WorldSetup.of(scenario, seed) if past is None else past.opening.site
+    plan = MissionConfig(scenario, seed, site, order.exchange, order.speed)
+    identity = credentials.find(secrets, credentials.HOST)
+    users = credentials.users_file(secrets)
+    # The terminal and the parent may both say so: one Ctrl-C must not count as two.
+    with Interrupts(patient=True) as interrupts:
+        if stopping:
+            interrupts.code = Exit.INTERRUPTED
+        try:
+            with _host(identity, listen, users, scenario) as host:
+                recording = Recording(
+                    scenario,
+                    seed,
+                    order.exchange,
+                    order.folder,
+                    order.exact_every,
+                    speed=order.speed,
+                    past=past,
+                )
+                say(f"run {recording.run}" + (", resumed" if past is not None else ""))
+                result = run(
+                    host, plan, recording, interrupts, past=past, hands=_hands(pipe), say=say
+                )
+        except BusError as error:
+            say(str(error))
+            sys.exit(Exit.UNREACHABLE)
+    say(f"{result.ended}, digest {result.digest}")
+
+
+def _host(identity: Identity, listen: str, users: Path, scenario: Scenario) -> HubRouter:
+    """The router, once its endpoint is free. Raises BusError."""
+    give_up = time.monotonic() + _LISTEN_S
+    while True:
+        try:
+            return HubRouter(identity, listen, users, scenario.roster)
+        except BusError:
+            if time.monotonic() >= give_up:
+                raise
+            time.sleep(0.02)
+
+
+def _hands(pipe: Connection) -> ProcessController:
+    """World-sim's end of the hands."""
+
+    def order(deed: Deed) -> bool | None:
+        pipe.send(deed)
+        answer: bool | None = pipe.recv()
+        return answer
+
+    return order
+
+
+def _be_participant(
+    connect: str, secrets: Path, name: ParticipantId, log: Path, state: Path
+) -> None:
+    from kantor_agent.process import run as run_agent  # noqa: PLC0415  the fork server has it
+    from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
+
+    # The terminal's Ctrl-C reaches everybody; a participant goes when world-sim says so.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
+    say = log_to(log, name)
+    init_log()
+    run = run_supervisor if name == SUPERVISOR else run_agent
+    try:
+        say(run(connect, credentials.find(secrets, name), _START_S, say, state))
+    except BusError as error:
+        say(str(error))
+        sys.exit(Exit.UNREACHABLE)
+    except (RejectedError, StateError) as error:
+        say(str(error))
+        sys.exit(Exit.USAGE)

@@ -1,0 +1,55 @@
+"""What every process of a local fleet shares: imported and compiled once, in the fork server.
+
+It opens nothing. Zenoh must not be open in a process that forks.
+"""
+
+import kantor_worldsim.exchange.main  # noqa: F401
+from kantor_fleet.execution.in_process_team import play
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import MAP_PLANNERS
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.world.world import WorldSetup
+
+_TINY = """
+name = "warm-up"
+coordination = "centralized"
+domain = { min_m = [0, 0], max_m = [10, 10] }
+robots = { count = 2 }
+energy = { points = 8 }
+samples = { count = 8 }
+targets = { count = 2 }
+starts = { random = true }
+clock = { jitter_s = 0.01 }
+radio = { drop = 0.1, duplicate = 0.1, jitter_s = 0.01, reorder = 0.1 }
+density = [{ mean_m = [5, 5], variance_m2 = [4, 4] }]
+"""
+_TINY_MAP = """
+name = "warm-up"
+coordination = "centralized"
+map = { layout = "blank", size_m = [16, 16] }
+robots = { count = 2 }
+starts = { random = true }
+sensor = { range_m = 4, beams = 64, noise_m = 0.01 }
+clock = { jitter_s = 0.01 }
+vehicle = { speed_m_s = 20 }
+radio = { drop = 0.1, duplicate = 0.1, jitter_s = 0.01, reorder = 0.1, line_of_sight = true }
+"""
+_MANNERS = (
+    ("merge='ledger'", "samples.diffusion_m=0"),
+    ("merge='min'", "samples.diffusion_m=1"),
+    ("planner='spectral'", "samples.diffusion_m=1"),
+)
+
+
+def warm_up() -> None:
+    """Compile every kernel, or load it from the cache, by tiny missions."""
+    for manner in _MANNERS:
+        _play(_TINY, [*manner, "targets.diffusion_m=1"])
+    for planner in sorted(MAP_PLANNERS):
+        _play(_TINY_MAP, [f"planner='{planner}'"])
+
+
+def _play(text: str, overrides: list[str]) -> None:
+    scenario = parse(text, "warm-up", overrides)
+    recording = Recording(scenario, 0, "in-process")
+    play(scenario, 0, WorldSetup.of(scenario, 0), [recording.take])

@@ -1,0 +1,45 @@
+"""A site: the router of the robots of one place."""
+
+from pathlib import Path
+
+from kantor_fleet.cli.exits import Exit, fail
+from kantor_fleet.cli.interrupts import Interrupts
+from kantor_protocol.transport import credentials
+from kantor_protocol.transport.credentials import Certificate
+from kantor_protocol.transport.endpoint import check_endpoint
+from kantor_protocol.transport.events import Joined, Left
+from kantor_protocol.transport.router import SiteRouter
+from kantor_protocol.transport.zenoh_log import host_log
+
+_LOOK_S = 0.2
+"""From one look at the connection to the next."""
+
+
+def serve(name: str, connect: str, listen: str, place: Path, patience_s: float) -> Exit:
+    """Serve the site until a signal comes. Raises BusError, CredentialsError."""
+    identity = credentials.find(place, f"site-{name}")
+    for endpoint in (connect, listen):
+        check_endpoint(endpoint, identity)
+    if not isinstance(identity, Certificate):
+        fail(Exit.USAGE, f"{place}: a password; a site needs a certificate of `kantor keys --site`")
+    with (
+        host_log(identity, _say),
+        Interrupts() as interrupts,
+        SiteRouter(identity, connect, listen, patience_s, _say) as site,
+    ):
+        _say(f"site {name} at {listen}, for {', '.join(site.members)}")
+        connected = False
+        while not interrupts():
+            if site.connected is not connected:
+                connected = not connected
+                _say(f"{connect}: {'connected' if connected else 'not there'}")
+            event = site.next(_LOOK_S)
+            if isinstance(event, Joined):
+                _say(f"{event.name} is here")
+            elif isinstance(event, Left):
+                _say(f"{event.name} has left")
+    return interrupts.code or Exit.DONE
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)

@@ -1,0 +1,236 @@
+"""Processes started one by one, each in its own terminal or on its own machine."""
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from kantor_fleet.cli.exits import Exit, fail, warn
+from kantor_fleet.cli.interrupts import Interrupts
+from kantor_fleet.processes import resume_pointer
+from kantor_protocol.base.machine import SUPERVISOR, ParticipantId
+from kantor_protocol.node.runner import RejectedError, StateError
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.transport import credentials
+from kantor_protocol.transport.credentials import (
+    FLEET_PATTERN,
+    Certificate,
+    CredentialsError,
+    Identity,
+)
+from kantor_protocol.transport.endpoint import await_endpoint, check_endpoint, is_tls
+from kantor_protocol.transport.router import HubRouter
+from kantor_protocol.transport.zenoh_log import host_log, init_log
+
+if TYPE_CHECKING:
+    from kantor_worldsim.exchange.config import MissionConfig
+    from kantor_worldsim.observers.recording import Recording
+    from kantor_worldsim.record.run_folder import Past
+
+_FLEET = "kantor"
+RunParticipant = Callable[[str, Identity, float, Callable[[str], None], Path], str]
+
+
+def host_standalone(
+    scenario: Scenario,
+    seed: int,
+    exchange: str,
+    speed: float,
+    listen: str,
+    secrets: Path,
+    fleet: str | None,
+    start_after_s: float | None,
+    out: Path,
+    exact_every: int | None,
+    state: Path | None = None,
+) -> Exit:
+    """World-sim in this terminal, for a new run. Raises ScenarioError, BusError, OSError.
+
+    state: where it notes which run it is in.
+    """
+    from kantor_worldsim.exchange.config import MissionConfig  # noqa: PLC0415  robots by hand do not need these
+    from kantor_worldsim.observers.recording import Recording  # noqa: PLC0415
+    from kantor_worldsim.record.run_folder import folder_for
+    from kantor_worldsim.world.world import WorldSetup  # noqa: PLC0415
+
+    _check_faults(scenario, exchange)
+    site = WorldSetup.of(scenario, seed)
+    warn(site.warnings)
+    plan = MissionConfig(scenario, seed, site, exchange, speed, start_after_s)
+
+    def record() -> tuple[Path, "Recording"]:
+        folder = folder_for(scenario, seed, out)
+        if state is not None:
+            resume_pointer.note(state, folder)
+        return folder, Recording(scenario, seed, exchange, folder, exact_every, speed=speed)
+
+    return _host(plan, listen, secrets, fleet, record)
+
+
+def resume_standalone(folder: Path, listen: str, secrets: Path, fleet: str | None) -> Exit:
+    """World-sim in this terminal, for a run that was cut short. Raises BusError, OSError."""
+    from kantor_worldsim.record.run_folder import Past, ResumeError  # noqa: PLC0415
+
+    try:
+        past = Past.of(folder)
+    except ResumeError as error:
+        fail(Exit.USAGE, str(error))
+    return _go_on(folder, past, listen, secrets, fleet)
+
+
+def _go_on(folder: Path, past: "Past", listen: str, secrets: Path, fleet: str | None) -> Exit:
+    from kantor_worldsim.exchange.config import MissionConfig  # noqa: PLC0415
+    from kantor_worldsim.observers.recording import Recording  # noqa: PLC0415
+
+    terms, opening = past.terms, past.opening
+    scenario, seed, exchange = opening.scenario, opening.seed, terms.exchange
+    _check_faults(scenario, exchange)
+    plan = MissionConfig(scenario, seed, opening.site, exchange, terms.speed)
+
+    def record() -> tuple[Path, "Recording"]:
+        every = terms.exact_every
+        return folder, Recording(scenario, seed, exchange, folder, every, past=past)
+
+    return _host(plan, listen, secrets, fleet, record, past)
+
+
+def go_on_standalone(state: Path, listen: str, secrets: Path, fleet: str | None) -> Exit | None:
+    """World-sim in this terminal, for the run that it is in; None if another is to begin.
+
+    A mission that was not met is not tried again: whoever starts failed processes anew would do so for ever.
+    """
+    from kantor_fleet.execution.mission import conclude, read_result, verdict  # noqa: PLC0415
+    from kantor_worldsim.record.run_folder import REPORT, OverError, Past, ResumeError  # noqa: PLC0415
+
+    folder = resume_pointer.run_in(state)
+    if folder is None:
+        return None
+    try:
+        past = Past.of(folder)
+    except OverError as over:
+        result = read_result(folder)
+        code = Exit.PROCESS_FAILED if result is None else verdict(result)
+        if not (folder / REPORT).exists():  # killed on its last steps
+            conclude(folder)
+            return code
+        if code is not Exit.DONE:
+            warn([f"{over}, and was not met; a new container begins another"])
+        return code or None
+    except ResumeError:  # nothing has happened in it
+        return None
+    return _go_on(folder, past, listen, secrets, fleet)
+
+
+def _check_faults(scenario: Scenario, exchange: str) -> None:
+    from kantor_worldsim.exchange.config import needs_process_control  # noqa: PLC0415
+
+    if (fault := needs_process_control(scenario, exchange)) is not None:
+        fail(Exit.USAGE, f"{fault}: nobody here can do that to processes; use `kantor run`")
+
+
+def _host(
+    plan: "MissionConfig",
+    listen: str,
+    secrets: Path,
+    fleet: str | None,
+    record: "Callable[[], tuple[Path, Recording]]",
+    past: "Past | None" = None,
+) -> Exit:
+    """Host a mission. record: opens the run folder, once the bus is there."""
+    from kantor_fleet.execution.mission import conclude, read_result, verdict  # noqa: PLC0415
+    from kantor_fleet.processes.preload import warm_up  # noqa: PLC0415  robots by hand do not need these
+    from kantor_fleet.report.progress import ProgressView  # noqa: PLC0415
+    from kantor_worldsim.exchange.main import run  # noqa: PLC0415
+
+    scenario = plan.scenario
+    identity = _host_identity(listen, secrets, fleet, scenario)
+    with (
+        host_log(identity, lambda line: view.note(line)),  # noqa: PLW0108  view comes later
+        Interrupts() as interrupts,
+        ProgressView(scenario.name) as view,
+    ):
+        warm_up()
+        users = credentials.users_file(secrets)
+        with HubRouter(identity, listen, users, scenario.roster, view.note) as host:
+            folder, recording = record()
+            view.note(f"world-sim of fleet {identity.fleet} at {listen}, credentials in {secrets}")
+            for name in scenario.roster:
+                view.note(f"  {_joining(name, listen, secrets)}")
+            run(host, plan, recording, interrupts, view.show, past, say=view.note)
+    with Interrupts(patient=True):  # what comes when the mission is over changes nothing
+        conclude(folder)
+    result = read_result(folder)
+    if result is not None and result.ended == "done":
+        return verdict(result)
+    return interrupts.code or (verdict(result) if result is not None else Exit.PROCESS_FAILED)
+
+
+def _joining(name: ParticipantId, listen: str, secrets: Path) -> str:
+    """The command with which a participant joins, where it is: a host may listen at any address that it has there."""
+    verb = name if name == SUPERVISOR else f"agent {name}"
+    endpoint = listen.replace("/0.0.0.0:", "/HOST:").replace("/[::]:", "/HOST:")
+    own = secrets if secrets.is_dir() else secrets.with_name(f"{name}.toml")
+    file = own if own.exists() else own.name  # it is with the robot
+    return f"kantor {verb} --connect {endpoint} --credentials {file}"
+
+
+def _host_identity(listen: str, place: Path, fleet: str | None, scenario: Scenario) -> Identity:
+    """World-sim's identity, for a mission with this roster. Raises BusError, CredentialsError.
+
+    Passwords are made here; certificates never are.
+    """
+    if not is_tls(listen):
+        name = fleet or _FLEET
+        if not FLEET_PATTERN.fullmatch(name):
+            fail(Exit.USAGE, f"--fleet {name}: use lower-case letters, digits and dashes")
+        return credentials.issue(place, name, scenario.roster)[credentials.HOST]
+    identity = credentials.find(place, credentials.HOST)
+    check_endpoint(listen, identity)
+    if not isinstance(identity, Certificate):
+        raise TypeError(identity)  # pragma: no cover  check_endpoint has refused it
+    if fleet not in {None, identity.fleet}:
+        fail(
+            Exit.USAGE, f"--fleet {fleet}: {place} is of fleet {identity.fleet}; leave --fleet out"
+        )
+    _check_register(identity, scenario, place)
+    warn(identity.warnings((*scenario.roster, credentials.OBSERVER), datetime.now(UTC)))
+    return identity
+
+
+def _check_register(identity: Certificate, scenario: Scenario, place: Path) -> None:
+    """Everybody who takes part must have a certificate, or have had one. Raises CredentialsError."""
+    withdrawn = {name.partition(".")[0] for name in identity.revoked}
+    missing = [name for name in scenario.roster if name not in identity.members]
+    for name in missing:
+        if name not in withdrawn:
+            wanted = "--supervisor" if name == SUPERVISOR else f"--robots {len(scenario.robot_ids)}"
+            raise CredentialsError(
+                f"{place}: the register has no {name}; `kantor keys {identity.fleet} {wanted}`"
+            )
+    warn(f"{name} is revoked and will not be let in" for name in missing)
+
+
+def participate_standalone(
+    run: RunParticipant,
+    name: ParticipantId,
+    connect: str,
+    place: Path,
+    patience_s: float,
+    state: Path,
+) -> Exit:
+    """A participant in this terminal. Raises BusError, CredentialsError."""
+    # A robot may start before world-sim, which writes the passwords: look for them when it is up.
+    if not is_tls(connect) and (not place.exists() or place.is_dir()):
+        await_endpoint(connect, patience_s)
+    identity = credentials.find(place, name)
+    init_log()
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+
+    try:
+        reason = run(connect, identity, patience_s, say, state)
+    except (RejectedError, StateError) as error:
+        fail(Exit.USAGE, str(error))
+    say(f"{name}: mission over: {reason}")
+    return Exit.DONE

@@ -1,0 +1,468 @@
+"""A fleet's private authority: it issues the certificates of its members and keeps the register of them.
+
+Everything is in one folder on the operator's machine: `authority.toml`, which never leaves it, and an identity
+file for each member, to be handed to whoever runs it. The identities of routers, world-sim's and those of sites,
+carry a copy of the register.
+
+A file is written whole or not at all, the identities first, then the authority's register, then the routers' copies.
+So whatever interrupts this, running it again makes good what is missing.
+"""
+
+import fcntl
+import ipaddress
+import os
+import re
+import secrets
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from kantor_protocol.base.machine import SUPERVISOR, ParticipantId
+from kantor_protocol.transport.credentials import (
+    AUTHORITY,
+    FLEET_PATTERN,
+    HOST,
+    OBSERVER,
+    Certificate,
+    CredentialsError,
+    Member,
+    expiry,
+    read,
+    to_toml,
+    write,
+)
+
+ROBOTS_MAX = 1000
+DAYS_MAX = 3650
+_AUTHORITY_DAYS = 7300
+"""How long an authority issues: longer than any certificate of it lasts."""
+_EARLIER = timedelta(days=1)
+"""Certificates are valid from a day before they are made, for clocks that are behind."""
+_HOSTS = ("localhost", "127.0.0.1", "::1")
+"""Names that every router's certificate has, beside its id."""
+_SITE = "site-"
+"""What the id of a site's router begins with."""
+_SITE_PATTERN = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
+_ROBOT_PATTERN = re.compile(r"r[1-9][0-9]{0,3}")
+_HOST_PATTERN = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(\.(?!-)[A-Za-z0-9-]{1,63})*")
+
+
+Sites = dict[ParticipantId, tuple[ParticipantId, ...]]
+
+
+class Authority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What `authority.toml` holds. certificate, key: PEM."""
+
+    fleet: str
+    certificate: str
+    key: str
+    revoked: tuple[str, ...] = ()
+    members: dict[ParticipantId, Member] = {}
+    sites: Sites = {}
+    hosts: dict[ParticipantId, tuple[str, ...]] = {}
+    """Names by which others reach a router, beside those that it has anyway."""
+
+    def register(self, router: ParticipantId) -> dict[str, Any]:
+        """The fields of a router's identity that say whom it lets in."""
+        if router == HOST:
+            return {"revoked": self.revoked, "members": self.members, "sites": self.sites}
+        names = (HOST, *self.sites.get(router, ()))
+        members = {user: self.members[user] for user in names if user in self.members}
+        revoked = tuple(name for name in self.revoked if name.partition(".")[0] in names)
+        return {"revoked": revoked, "members": members}
+
+
+class Wanted(msgspec.Struct, frozen=True):
+    """What an operator asks of the authority."""
+
+    fleet: str
+    robots: int = 0
+    supervisor: bool = False
+    hosts: tuple[str, ...] = ()
+    """World-sim's names, or a site's as SITE=NAME."""
+    sites: tuple[str, ...] = ()
+    """SITE=ROBOT,ROBOT,..."""
+    days: int = 365
+    renew: tuple[ParticipantId, ...] = ()
+    revoke: tuple[ParticipantId, ...] = ()
+
+
+def issue(folder: Path, wanted: Wanted, now: datetime) -> list[str]:
+    """Do what is wanted; a line for each thing that was done. Raises CredentialsError, OSError.
+
+    now: with its zone. Members that the register has are kept, whether their files are here or have been
+    handed out.
+    """
+    _check(wanted)
+    with _locked(folder):
+        before = _open(folder, wanted.fleet)
+        authority = _asked(before or _found(wanted.fleet, now), wanted)
+        fresh = _fresh(before, authority, wanted)
+        made = {user: _certify(authority, user, wanted.days, now) for user in fresh}
+        issued = {user: Member(identity.name, identity.until) for user, identity in made.items()}
+        members = dict(sorted((authority.members | issued).items(), key=lambda row: _order(row[0])))
+        authority = msgspec.structs.replace(authority, members=members)
+        routers = _routers(folder, before, authority, made)
+
+        if before is None:  # first of all: whatever it has signed is worth nothing without it
+            _save(folder / f"{AUTHORITY}.toml", msgspec.structs.replace(authority, members={}))
+        for user, identity in made.items():
+            if user not in routers:
+                _save(folder / f"{user}.toml", identity)
+        _save(folder / f"{AUTHORITY}.toml", authority)
+        for user, identity in routers.items():
+            _save(folder / f"{user}.toml", identity)
+    return _news(
+        folder, wanted, fresh, [] if before is None else list(routers), first=before is None
+    )
+
+
+def _asked(authority: Authority, wanted: Wanted) -> Authority:
+    """The authority without who is revoked, and with the sites and the names that are wanted.
+
+    Raises CredentialsError.
+    """
+    _check_known(authority, wanted)
+    withdrawn = tuple(authority.members[user].name for user in wanted.revoke)
+    placed = _placed(wanted)
+    everywhere = {name for there in placed.values() for name in there}
+    sites = {
+        site: tuple(name for name in there if name not in everywhere)
+        for site, there in authority.sites.items()
+        if site not in wanted.revoke
+    } | placed
+    hosts = dict(authority.hosts)
+    for user, host in map(_host_of, wanted.hosts):
+        if user != HOST and user not in sites:
+            site = user.removeprefix(_SITE)
+            raise CredentialsError(f"--host {site}={host}: no such site; add --site {site}=r1,r2")
+        hosts[user] = tuple(dict.fromkeys((*hosts.get(user, ()), host)))
+    return msgspec.structs.replace(
+        authority,
+        revoked=(*authority.revoked, *withdrawn),
+        members={
+            user: member for user, member in authority.members.items() if user not in wanted.revoke
+        },
+        sites=sites,
+        hosts={user: names for user, names in hosts.items() if user not in wanted.revoke},
+    )
+
+
+def _fresh(before: Authority | None, authority: Authority, wanted: Wanted) -> list[ParticipantId]:
+    """Who gets a new certificate. Whoever was revoked gets one only by its name. Raises CredentialsError."""
+    robots = [f"r{number}" for number in range(1, wanted.robots + 1)]
+    supervisor = [SUPERVISOR] if wanted.supervisor else []
+    users = (HOST, OBSERVER, *authority.sites, *supervisor, *robots)
+    named = {*_placed(wanted), *wanted.renew}
+    without = (_withdrawn(authority) - named) | set(authority.members)
+    renamed = [
+        user
+        for user in authority.hosts
+        if before and authority.hosts[user] != before.hosts.get(user)
+    ]
+    missing = [user for user in users if user not in without]
+    fresh = sorted({*missing, *renamed, *wanted.renew}, key=_order)
+    for site, there in authority.sites.items():
+        for name in there:
+            if name not in {*authority.members, *fresh, *_withdrawn(authority)}:
+                label = f"--site {site.removeprefix(_SITE)}"
+                raise CredentialsError(
+                    f"{label}: the register has no {name}; add --robots {name[1:]}"
+                )
+    return fresh
+
+
+def _routers(
+    folder: Path,
+    before: Authority | None,
+    authority: Authority,
+    made: dict[ParticipantId, Certificate],
+) -> dict[ParticipantId, Certificate]:
+    """The identities of routers that are to be written, each with its copy of the register.
+
+    Raises CredentialsError if one is needed that is not here.
+    """
+    changed = {}
+    for router in (HOST, *authority.sites):
+        path = folder / f"{router}.toml"
+        old = made.get(router) or read(path, Certificate)
+        if old is None or old.name != authority.members[router].name:
+            same = before is not None and before.register(router) == authority.register(router)
+            if same and not path.exists():
+                continue  # it has been handed out
+            raise CredentialsError(
+                f"{path}: not here or no use, and it carries the register; bring it back, "
+                f"or `kantor keys {authority.fleet} --renew {router}`"
+            )
+        new = msgspec.structs.replace(old, **authority.register(router))
+        if router in made or new != old:
+            changed[router] = new
+    return changed
+
+
+def _news(
+    folder: Path,
+    wanted: Wanted,
+    fresh: list[ParticipantId],
+    routers: list[ParticipantId],
+    *,
+    first: bool,
+) -> list[str]:
+    lines = (
+        [f"{folder}/{AUTHORITY}.toml: the authority of fleet {wanted.fleet}; keep it here"]
+        if first
+        else []
+    )
+    lines += [f"{folder}/{user}.toml: made, for {wanted.days} days" for user in fresh]
+    lines += [f"{user}: revoked" for user in wanted.revoke]
+    lines += [f"{folder}/{user}.toml: changed; start {user} again with it" for user in routers]
+    return lines or ["nothing to do"]
+
+
+def listing(folder: Path, fleet: str, now: datetime) -> list[str]:
+    """A line for each certificate: whose, which, until when, and whether it counts. Raises CredentialsError."""
+    authority = _open(folder, fleet)
+    if authority is None:
+        raise CredentialsError(
+            f"{folder}: no {AUTHORITY}.toml; `kantor keys {fleet} --robots 5` makes one"
+        )
+    rows = [
+        (user, member.name, expiry(member.until, now)) for user, member in authority.members.items()
+    ]
+    rows += [(name.partition(".")[0], name, "revoked") for name in authority.revoked]
+    wide = [max(len(row[column]) for row in rows) for column in range(2)]
+    return [f"{user:<{wide[0]}}  {name:<{wide[1]}}  {state}" for user, name, state in rows]
+
+
+def _check(wanted: Wanted) -> None:
+    """Raises CredentialsError."""
+    if not FLEET_PATTERN.fullmatch(wanted.fleet):
+        raise CredentialsError(f"{wanted.fleet}: use lower-case letters, digits and dashes")
+    if not 0 <= wanted.robots <= ROBOTS_MAX:
+        raise CredentialsError(f"--robots {wanted.robots}: give a number from 0 to {ROBOTS_MAX}")
+    if not 1 <= wanted.days <= DAYS_MAX:
+        raise CredentialsError(f"--days {wanted.days}: give a number from 1 to {DAYS_MAX}")
+    for _, host in map(_host_of, wanted.hosts):
+        if not _is_address(host) and not _HOST_PATTERN.fullmatch(host):
+            raise CredentialsError(f"--host {host}: give a name or an IP address, without a port")
+    _placed(wanted)
+    both = sorted(set(wanted.renew) & set(wanted.revoke))
+    if both:
+        raise CredentialsError(
+            f"--renew {both[0]} --revoke {both[0]}: renewed, the old one ceases to count"
+        )
+
+
+def _host_of(text: str) -> tuple[ParticipantId, str]:
+    """NAME, of world-sim, or SITE=NAME."""
+    site, equals, host = text.rpartition("=")
+    return (f"{_SITE}{site}" if equals else HOST), host
+
+
+def _placed(wanted: Wanted) -> Sites:
+    """Which robots stand behind which site. Raises CredentialsError."""
+    placed: Sites = {}
+    for text in wanted.sites:
+        site, _, names = text.partition("=")
+        there = tuple(names.split(","))
+        if not _SITE_PATTERN.fullmatch(site) or not all(map(_ROBOT_PATTERN.fullmatch, there)):
+            raise CredentialsError(f"--site {text}: write it as --site north=r1,r2")
+        placed[f"{_SITE}{site}"] = there
+    everybody = [name for there in placed.values() for name in there]
+    for name in everybody:
+        if everybody.count(name) > 1:
+            raise CredentialsError(f"--site: {name} stands behind one site only")
+    return placed
+
+
+def _check_known(authority: Authority, wanted: Wanted) -> None:
+    """Raises CredentialsError."""
+    withdrawn, see = _withdrawn(authority), f"see `kantor keys {wanted.fleet} --list`"
+    for user in wanted.revoke:
+        if user == HOST:
+            raise CredentialsError(f"--revoke {HOST}: robots know no register; make a new fleet")
+        if user not in authority.members:
+            state = "is revoked already" if user in withdrawn else "is not in the register"
+            raise CredentialsError(f"--revoke {user}: {state}; {see}")
+    for user in wanted.renew:
+        if user.startswith(_SITE) and user not in authority.sites | _placed(wanted):
+            raise CredentialsError(f"--renew {user}: no such site; {see}")
+        if user not in authority.members and user not in withdrawn:
+            raise CredentialsError(f"--renew {user}: is not in the register; {see}")
+
+
+def _withdrawn(authority: Authority) -> set[ParticipantId]:
+    """Who has been revoked and has no other certificate since."""
+    return {name.partition(".")[0] for name in authority.revoked} - set(authority.members)
+
+
+def _order(user: ParticipantId) -> tuple[bool, int, str]:
+    """Robots last, by number."""
+    number = user[1:] if user[:1] == "r" else ""
+    return (number.isdecimal(), int(number) if number.isdecimal() else 0, user)
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """One at a time."""
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _open(folder: Path, fleet: str) -> Authority | None:
+    """The folder's authority, or None where there is none and nothing in its place."""
+    path = folder / f"{AUTHORITY}.toml"
+    if not path.exists():
+        others = sorted(found.name for found in folder.glob("*.toml"))
+        if others:
+            raise CredentialsError(
+                f"{folder}: has {others[0]}, but no {AUTHORITY}.toml; choose an empty folder for --out"
+            )
+        return None
+    authority = read(path, Authority)
+    if authority is None:
+        raise CredentialsError(f"{path}: not an authority, or damaged; choose another --out")
+    if authority.fleet != fleet:
+        raise CredentialsError(
+            f"{path}: the authority of fleet {authority.fleet}; choose another --out"
+        )
+    return authority
+
+
+def _save(path: Path, content: Authority | Certificate) -> None:
+    write(path, to_toml(msgspec.to_builtins(content, builtin_types=(datetime,))))
+
+
+def _found(fleet: str, now: datetime) -> Authority:
+    """A new authority."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name(
+        [x509.NameAttribute(NameOID.COMMON_NAME, f"{fleet[:48]}-{secrets.token_hex(4)}")]
+    )
+    usage = dict.fromkeys(_USAGES, False) | {"key_cert_sign": True, "crl_sign": True}
+    certificate = (
+        _unsigned(name, key.public_key(), now, now + timedelta(days=_AUTHORITY_DAYS))
+        .issuer_name(name)
+        .serial_number(x509.random_serial_number())
+        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
+        .add_extension(x509.KeyUsage(**usage), critical=True)
+        .sign(key, hashes.SHA256())
+    )
+    return Authority(fleet, _pem(certificate), _secret(key))
+
+
+_USAGES = (
+    "digital_signature",
+    "content_commitment",
+    "key_encipherment",
+    "data_encipherment",
+    "key_agreement",
+    "key_cert_sign",
+    "crl_sign",
+    "encipher_only",
+    "decipher_only",
+)
+
+
+def _certify(authority: Authority, user: ParticipantId, days: int, now: datetime) -> Certificate:
+    """A certificate for a member, with a key of its own. Only world-sim's is a server's."""
+    key = ec.generate_private_key(ec.SECP256R1())
+    issuer = x509.load_pem_x509_certificate(authority.certificate.encode())
+    issuer_key = serialization.load_pem_private_key(authority.key.encode(), password=None)
+    assert isinstance(issuer_key, ec.EllipticCurvePrivateKey)
+    until = min(now + timedelta(days=days), issuer.not_valid_after_utc).replace(microsecond=0)
+    if until <= now:
+        raise CredentialsError(
+            f"{AUTHORITY}.toml: has expired; make a new fleet with another --out"
+        )
+    serial = secrets.randbits(64) | 1
+    common_name = f"{user}.{serial:016x}"
+    purposes, is_router = [ExtendedKeyUsageOID.CLIENT_AUTH], user == HOST or user in authority.sites
+    if is_router:
+        purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)
+    usage = dict.fromkeys(_USAGES, False) | {"digital_signature": True}
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common_name)])
+    unsigned = (
+        _unsigned(subject, key.public_key(), now, until)
+        .issuer_name(issuer.subject)
+        .serial_number(serial)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.KeyUsage(**usage), critical=True)
+        .add_extension(x509.ExtendedKeyUsage(purposes), critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(issuer_key.public_key()),
+            critical=False,
+        )
+    )
+    if is_router:
+        hosts = dict.fromkeys((*_HOSTS, user, *authority.hosts.get(user, ())))
+        names = x509.SubjectAlternativeName(_general_names(hosts))
+        unsigned = unsigned.add_extension(names, critical=False)
+    certificate = unsigned.sign(issuer_key, hashes.SHA256())
+    return Certificate(
+        authority.fleet,
+        user,
+        common_name,
+        until,
+        authority.certificate,
+        _pem(certificate),
+        _secret(key),
+    )
+
+
+def _unsigned(
+    subject: x509.Name, key: ec.EllipticCurvePublicKey, now: datetime, until: datetime
+) -> x509.CertificateBuilder:
+    return (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .public_key(key)
+        .not_valid_before(now - _EARLIER)
+        .not_valid_after(until)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
+    )
+
+
+def _general_names(hosts: Iterable[str]) -> list[x509.GeneralName]:
+    return [
+        x509.IPAddress(ipaddress.ip_address(host)) if _is_address(host) else x509.DNSName(host)
+        for host in hosts
+    ]
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _pem(certificate: x509.Certificate) -> str:
+    return certificate.public_bytes(serialization.Encoding.PEM).decode()
+
+
+def _secret(key: ec.EllipticCurvePrivateKey) -> str:
+    return key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    ).decode()
+
+
+def today() -> datetime:
+    """Now, with its zone."""
+    return datetime.now(UTC)

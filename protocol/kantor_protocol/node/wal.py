@@ -1,0 +1,198 @@
+"""A participant's diary on disk: one append-only file, see `life.py`.
+
+The file is a magic, then frames: length, CRC32 of everything so far, content. The first frame is the
+header (run, birth), every other one a page. A page goes to the operating system in one write before the step
+is made, so it outlives the process; after a power cut the tail may be missing or wrong, and what is
+sound from the beginning on is what counts. A file of another run, or of none, is no diary.
+
+A diary has one writer. Whoever opens it while another process has it (a frozen predecessor, say) does not
+go on from it: it begins one of its own under the same name, and the other writes to a file that nobody
+reads any more.
+"""
+
+import contextlib
+import fcntl
+import os
+import struct
+import time
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from kantor_protocol.base.machine import Body
+from kantor_protocol.node.recovery import WalContents
+from kantor_protocol.wire.messages import MESSAGE_BYTES_MAX, RefusedError, decode_inputs
+
+_MAGIC = b"kantor diary 1\n"
+_HEAD = struct.Struct("<II")
+_SKEW = struct.Struct("<q")
+_LOCK_S = 0.5
+"""A process that was killed a moment ago may still have the file."""
+
+
+class _Header(msgspec.Struct, frozen=True, array_like=True):
+    run: str
+    birth: Body
+
+
+class _SoundPrefix(NamedTuple):
+    """What is sound of a file."""
+
+    header: _Header
+    pages: list[bytes]
+    """Encoded inputs."""
+    skew_ns: int
+    """Of the last page."""
+    ends: list[int]
+    """Where the header ends, and each page."""
+    crc: int
+
+
+class WalFile:
+    """The diary of a participant in one run."""
+
+    def __init__(self, path: Path, run: str) -> None:
+        """path: the file, in a folder that is there. Raises OSError."""
+        self._path = path
+        self._run = run
+        self._file = -1
+        self._end = 0
+        self._crc = 0
+        self.skew_ns = 0
+        """How far ahead the clock is that the next page was read by; after `read`, that of the last one."""
+
+    def read(self) -> WalContents | None:
+        """All that is sound from its beginning on, None if there is nothing. Raises OSError."""
+        self.close()
+        try:
+            self._file = os.open(self._path, os.O_RDWR)
+        except FileNotFoundError:
+            return None
+        if not _owned(self._file):
+            self.close()
+            return None
+        with open(self._file, "rb", closefd=False) as file:
+            sound = _sound_prefix(file.read())
+        if sound is None or sound.header.run != self._run:
+            self.close()
+            return None
+        self._end, self._crc, self.skew_ns = sound.ends[-1], sound.crc, sound.skew_ns
+        os.ftruncate(self._file, self._end)
+        return WalContents(sound.header.birth, sound.pages)
+
+    def begin(self, birth: Body) -> None:
+        """Throw away what there is, and begin anew. Raises OSError, and then the old file is still there."""
+        draft = self._path.with_name(f".{self._path.name}.{os.getpid()}")
+        file = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
+        try:
+            _owned(file)
+            content = msgspec.msgpack.encode(_Header(self._run, birth))
+            crc = zlib.crc32(_MAGIC)
+            frame, crc = _frame(content, crc)
+            _write(file, _MAGIC + frame, 0)
+            draft.replace(self._path)
+        except OSError:
+            os.close(file)
+            draft.unlink(missing_ok=True)
+            raise
+        self.close()
+        self._file, self._end, self._crc = file, len(_MAGIC) + len(frame), crc
+
+    def note(self, inputs: bytes) -> None:
+        """Add a page that outlives the process. Raises OSError, and then the page is not there."""
+        frame, crc = _frame(_SKEW.pack(self.skew_ns) + inputs, self._crc)
+        _write(self._file, frame, self._end)
+        self._end += len(frame)
+        self._crc = crc
+
+    def close(self) -> None:
+        """Let the file go."""
+        file, self._file = self._file, -1
+        if file >= 0:
+            os.close(file)
+
+
+def tear(path: Path, step: int) -> None:
+    """Cut a diary in the middle of a page, as a power cut may, so that it lacks the given step.
+
+    If there is no such page nothing is cut. Raises OSError.
+    """
+    sound = _sound_prefix(path.read_bytes())
+    if sound is None:
+        return
+    kept = max(0, step - sound.header.birth.step - 1)
+    if kept < len(sound.pages):
+        os.truncate(path, (sound.ends[kept] + sound.ends[kept + 1]) // 2)
+
+
+def _frame(content: bytes, crc: int) -> tuple[bytes, int]:
+    crc = zlib.crc32(content, zlib.crc32(len(content).to_bytes(4, "little"), crc))
+    return _HEAD.pack(len(content), crc) + content, crc
+
+
+def _write(file: int, frame: bytes, place: int) -> None:
+    """All of it, in one write if there is room, or nothing. Raises OSError."""
+    written = 0
+    try:
+        while written < len(frame):
+            written += os.pwrite(file, frame[written:], place + written)
+    except OSError:
+        with contextlib.suppress(OSError):
+            os.ftruncate(file, place)
+        raise
+
+
+def _owned(file: int) -> bool:
+    """Have the file for this process alone; False if another has it and keeps it. Raises OSError."""
+    give_up = time.monotonic() + _LOCK_S
+    while True:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() >= give_up:
+                return False
+            time.sleep(0.01)
+        else:
+            return True
+
+
+def _sound_prefix(content: bytes) -> _SoundPrefix | None:
+    """The sound beginning of a file; None if not even the header is."""
+    if not content.startswith(_MAGIC):
+        return None
+    frames = _frames(content)
+    try:
+        first, end, crc = next(frames)
+        header = msgspec.msgpack.decode(first, type=_Header)
+    except (StopIteration, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return None
+    pages, ends, skew_ns = [], [end], 0
+    for frame, end, frame_crc in frames:
+        try:
+            decode_inputs(page := frame[_SKEW.size :])
+        except RefusedError:
+            break
+        (skew_ns,) = _SKEW.unpack_from(frame)
+        pages.append(page)
+        ends.append(end)
+        crc = frame_crc
+    return _SoundPrefix(header, pages, skew_ns, ends, crc)
+
+
+def _frames(content: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Content of each sound frame, where it ends, and the CRC up to there."""
+    place, crc = len(_MAGIC), zlib.crc32(_MAGIC)
+    while place + _HEAD.size <= len(content):
+        length, told = _HEAD.unpack_from(content, place)
+        end = place + _HEAD.size + length
+        if length > MESSAGE_BYTES_MAX or end > len(content):
+            return
+        frame = content[place + _HEAD.size : end]
+        crc = zlib.crc32(frame, zlib.crc32(length.to_bytes(4, "little"), crc))
+        if crc != told:
+            return
+        yield frame, end, crc
+        place = end

@@ -1,0 +1,518 @@
+"""The compiled kernels of replication: merging, composing and claiming on the arrays of a replica."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.varint import put_int, put_uint, skip_numbers, take_int, take_uint
+from kantor_protocol.replication.registers import FRESH_STEPS
+from kantor_protocol.wire.version_vector import count_slots
+
+NOBODY = -1
+
+
+LEARNT, MALFORMED = 0, -1
+
+
+NO_ROOM_TO_PACK = -1
+
+
+ENTRIES_MAX = 4096
+"""Log entries in one message; the rest follows with the next."""
+
+
+_CLAIM_LEASE_STEPS = 12
+"""A claim that has not been renewed for so many of the holder's steps is void."""
+
+
+_CLAIM_RENEWAL_STEPS = 6
+"""How stale a neighbour's knowledge of a foreign claim may be before a robot forwards it."""
+
+
+_REPEATED = 32
+"""So many unacknowledged entries are repeated with every message, so that one loss costs nothing.
+Evidence waits for `patience` instead: there are dozens of entries a step, and a late cell does no harm."""
+
+
+LENGTH_MAX = 1 << 40
+"""No log is longer; it keeps sums of positions within 64 bits."""
+
+
+KNOWN_MAX = (1 << 31) - 2
+"""More is not remembered of what another holds: it fits into 32 bits, and nothing gets so long."""
+
+
+# Rows of Store.claims.
+SAMPLE, _SINCE, _STAMP, _HEARD = 0, 1, 2, 3
+
+
+# Slots of Store.counters.
+LOWERED, _STEP, HOLDING = 0, 1, 2
+
+
+class ReplicaArrays(NamedTuple):
+    """All that a participant holds, for the kernels. n origins (slots), N samples.
+
+    A crowd does not fit into a cache: what is touched here and there is kept small, and side by side.
+    """
+
+    weights: npt.NDArray[np.int32]
+    """(N,) units left in this participant's view; never rises."""
+    logs: npt.NDArray[np.int32]
+    """(n, capacity, 2) entries: sample, value. min: (1, capacity, 2), the own log only."""
+    length: npt.NDArray[np.int64]
+    """(n,) entries held of each log; min: of the others, how much has been merged."""
+    known: npt.NDArray[np.int32]
+    """(n, 2n) what each participant is known to hold: log lengths, then claim stamps; it says no
+    more than KNOWN_MAX of any."""
+    sending: npt.NDArray[np.int64]
+    """(3 + patience, n): entries sent; step of the last repetition; step last heard; then a ring of
+    the lengths at the last `patience` steps."""
+    claims: npt.NDArray[np.int64]
+    """(4, n): sample or NOBODY; since_ns; stamp; own step at which the stamp was heard."""
+    lowered: npt.NDArray[np.int32]
+    """(N,) indices of the weights that fell since the last `take_lowered`, each once."""
+    mark: npt.NDArray[np.int32]
+    """(N,) the step at which an index was put into `lowered`."""
+    counters: npt.NDArray[np.int64]
+    """(3,): how many in `lowered`; step; how many weights are above 0."""
+
+
+class ReplicaConfig(NamedTuple):
+    """How a participant merges and talks; it never changes."""
+
+    me: int
+    """Its slot."""
+    ledger: bool
+    claims: bool
+    relay: bool
+    """It forwards at once."""
+    beacon: bool
+    """It sends all that it knows while it hears nobody."""
+    patience: int
+    """Own steps within which an acknowledgement is due."""
+    value_max: int
+    """The largest value of a log entry; 0: entries have no value and weigh nothing."""
+    bound: int
+    """Every index in a log is below it."""
+    roster: int
+    """Participants; slots come in blocks of so many."""
+
+
+@kernel
+def _lower(store: ReplicaArrays, index: int, value: int) -> None:
+    store.counters[HOLDING] -= value <= 0 < store.weights[index]
+    store.weights[index] = value
+    if store.mark[index] != store.counters[_STEP]:
+        store.mark[index] = np.int32(store.counters[_STEP])
+        store.lowered[store.counters[LOWERED]] = index
+        store.counters[LOWERED] += 1
+
+
+@kernel
+def _append(store: ReplicaArrays, row: int, origin: int, index: int, value: int) -> None:
+    store.logs[row, store.length[origin], 0] = index
+    store.logs[row, store.length[origin], 1] = value
+    store.length[origin] += 1
+
+
+@kernel
+def spend(store: ReplicaArrays, manner: ReplicaConfig, index: int, units: int) -> None:
+    """Ship `units` to a sample and log it. The log must have room for one more entry."""
+    _lower(store, index, store.weights[index] - units)
+    if manner.ledger:
+        _append(store, manner.me, manner.me, index, units)
+    else:
+        _append(store, 0, manner.me, index, store.weights[index])
+
+
+@kernel
+def _merge_entry(
+    store: ReplicaArrays, manner: ReplicaConfig, origin: int, index: int, value: int
+) -> None:
+    if manner.ledger:
+        _append(store, origin, origin, index, value)
+        if value > 0 and store.weights[index] > 0:
+            _lower(store, index, max(0, store.weights[index] - value))
+    elif value < store.weights[index]:
+        _lower(store, index, value)
+        _append(store, 0, manner.me, index, value)
+
+
+@kernel
+def _walk_suffixes(
+    store: ReplicaArrays,
+    manner: ReplicaConfig,
+    suffixes: bytes,
+    source: int,
+    told: int,
+    apply: bool,
+) -> int:
+    """Read all suffixes, of `told` origins; apply what is new, or only check.
+
+    Returns how many entries some log may then hold, or a negative number when malformed.
+    """
+    ledger = manner.ledger
+    origins = store.length.shape[0]
+    at = 0
+    entries = 0
+    longest = 0
+    while at < len(suffixes):
+        origin, at = take_uint(suffixes, at)
+        start, at = take_uint(suffixes, at)
+        span, at = take_uint(suffixes, at)
+        count, at = take_uint(suffixes, at)
+        if at < 0 or origin >= told or count > span or count > len(suffixes):
+            return -1
+        if start > LENGTH_MAX or span > LENGTH_MAX:
+            return -1
+        if (ledger and count != span) or (not ledger and origin != source):
+            return -1
+        held = store.length[origin] if origin < origins else 0
+        entries += count
+        if not ledger:
+            longest = store.length[manner.me] + entries
+        elif start <= held + entries:  # it may follow on another suffix in this message
+            longest = max(longest, start + span)
+        fresh = origin != manner.me and (not ledger or start <= held < start + count)
+        if apply and not fresh:
+            at = skip_numbers(suffixes, at, 2 * count if manner.value_max > 0 else count)
+            continue
+        index = 0
+        for i in range(count):
+            step, at = take_int(suffixes, at)
+            value = 0
+            if manner.value_max > 0:
+                value, at = take_uint(suffixes, at)
+            index += step
+            if at < 0 or index < 0 or index >= manner.bound or value > manner.value_max:
+                return -1
+            if apply and (not ledger or start + i >= held):
+                _merge_entry(store, manner, origin, index, value)
+        if apply and not ledger and start <= held:
+            store.length[origin] = max(held, start + span)
+    return longest
+
+
+@kernel
+def _walk_claims(
+    store: ReplicaArrays, manner: ReplicaConfig, claims: bytes, told: int, apply: bool
+) -> int:
+    at = 0
+    while at < len(claims):
+        origin, at = take_uint(claims, at)
+        stamp, at = take_uint(claims, at)
+        sample, at = take_uint(claims, at)
+        since, at = take_uint(claims, at)
+        if at < 0 or origin >= told or sample > store.weights.shape[0]:
+            return -1
+        if apply and origin != manner.me and stamp > store.claims[_STAMP, origin]:
+            store.claims[SAMPLE, origin] = sample - 1
+            store.claims[_SINCE, origin] = since
+            store.claims[_STAMP, origin] = stamp
+            store.claims[_HEARD, origin] = store.counters[_STEP]
+    return at
+
+
+@kernel
+def _apply_have(
+    store: ReplicaArrays, manner: ReplicaConfig, have: bytes, source: int, told: int
+) -> None:
+    known = store.known[source]
+    origins = store.length.shape[0]
+    parts = 2 if manner.claims else 1
+    if told == origins and len(have) == parts * told:
+        # A byte for each: the processor takes many at once.
+        for slot in range(parts * told):
+            known[slot] = max(known[slot], np.int32(have[slot]))
+        return
+    at = 0
+    for part in range(parts):
+        for slot in range(part * origins, part * origins + told):
+            held, at = take_uint(have, at)
+            known[slot] = max(known[slot], min(held, KNOWN_MAX))
+
+
+@kernel
+def config_of(law: np.ndarray) -> ReplicaConfig:
+    return ReplicaConfig(
+        law[0], law[1] != 0, law[2] != 0, law[3] != 0, law[4] != 0, law[5], law[6], law[7], law[8]
+    )
+
+
+@kernel
+def learn(
+    weights: np.ndarray,
+    logs: np.ndarray,
+    length: np.ndarray,
+    known: np.ndarray,
+    sending: np.ndarray,
+    claims: np.ndarray,
+    lowered: np.ndarray,
+    mark: np.ndarray,
+    counters: np.ndarray,
+    law: np.ndarray,
+    have: bytes,
+    suffixes: bytes,
+    registers: bytes,
+    source: int,
+) -> int:
+    """Check a message whole, then apply it whole.
+
+    Returns _LEARNT; or, and nothing changed, _MALFORMED, the length that logs must have room for, or
+    the negative of the slots that there must be room for. Store and Manner come field by field, see
+    `kernels`.
+    """
+    store = ReplicaArrays(
+        weights,
+        logs,
+        length,
+        known,
+        sending,
+        claims,
+        lowered,
+        mark,
+        counters,
+    )
+    manner = config_of(law)
+    told = count_slots(have, manner.roster, 2 if manner.claims else 1)
+    if not 0 <= source < told or source == manner.me:
+        return MALFORMED
+    longest = _walk_suffixes(store, manner, suffixes, source, told, False)
+    if longest < 0 or _walk_claims(store, manner, registers, told, False) < 0:
+        return MALFORMED
+    if told > length.shape[0]:
+        return -told
+    if longest > logs.shape[1]:
+        return longest
+    _apply_have(store, manner, have, source, told)
+    _walk_suffixes(store, manner, suffixes, source, told, True)
+    if manner.claims:
+        _walk_claims(store, manner, registers, told, True)
+    store.sending[2, source] = store.counters[_STEP]
+    return LEARNT
+
+
+@kernel
+def _find_least(
+    store: ReplicaArrays, manner: ReplicaConfig, target: int, least: np.ndarray
+) -> None:
+    """The least that any neighbour, or the target alone, is known to hold in each slot of `known`.
+
+    Whoever was heard lately is a neighbour. The origin of a slot does not count there: it holds its
+    own state. NOBODY where nobody else counts.
+    """
+    origins = store.length.shape[0]
+    least[:] = KNOWN_MAX + 1
+    for other in range(origins):
+        heard = store.sending[2, other]
+        lately = heard >= 0 and heard + manner.patience + FRESH_STEPS >= store.counters[_STEP]
+        if lately and other != manner.me and target in (NOBODY, other):
+            log, claim = least[other], least[origins + other]
+            for slot in range(least.shape[0]):  # row by row: so the processor takes many at once
+                least[slot] = min(least[slot], store.known[other, slot])
+            least[other], least[origins + other] = log, claim
+    for slot in range(least.shape[0]):
+        least[slot] = NOBODY if least[slot] > KNOWN_MAX else least[slot]
+
+
+@kernel
+def _start_of_suffix(
+    store: ReplicaArrays, manner: ReplicaConfig, target: int, least: int, origin: int, aged: int
+) -> int:
+    """First entry to send of an origin's log; its length when nothing is to be sent.
+
+    least: how much of it all neighbours hold.
+    """
+    me, relay, patience = manner.me, manner.relay, manner.patience
+    length = store.length[origin]
+    if least < 0 and target < 0 and manner.beacon:
+        return 0
+    if least < 0:
+        return store.sending[0, origin] if target >= 0 and origin == me else length
+    step = store.counters[_STEP]
+    if (origin == me or relay) and length - least <= (_REPEATED if manner.value_max > 0 else 0):
+        return least
+    if least < aged and step - store.sending[1, origin] >= patience:
+        store.sending[1, origin] = step
+        return least
+    if origin == me or relay:
+        return min(length, max(least, store.sending[0, origin]))
+    return length
+
+
+@kernel
+def _put_suffix(
+    store: ReplicaArrays,
+    manner: ReplicaConfig,
+    out: np.ndarray,
+    at: int,
+    origin: int,
+    start: int,
+    room: int,
+) -> tuple[int, int]:
+    """Write one suffix: (position after it, entries written)."""
+    ledger, valued = manner.ledger, manner.value_max > 0
+    log = store.logs[origin if ledger else 0]
+    count = 0
+    end = start
+    while end < store.length[origin] and count < room:
+        # In a log of minima only the newest entry of a sample matters: the one the vector holds.
+        if ledger or log[end, 1] == store.weights[log[end, 0]]:
+            count += 1
+        end += 1
+    at = put_uint(out, at, origin)
+    at = put_uint(out, at, start)
+    at = put_uint(out, at, end - start)
+    at = put_uint(out, at, count)
+    before = 0
+    for entry in range(start, end):
+        index, value = int(log[entry, 0]), int(log[entry, 1])
+        if ledger or value == store.weights[index]:
+            at = put_int(out, at, index - before)
+            if valued:
+                at = put_uint(out, at, value)
+            before = index
+    store.sending[0, origin] = max(store.sending[0, origin], end)
+    return at, count
+
+
+@kernel
+def _put_claims(
+    store: ReplicaArrays, manner: ReplicaConfig, out: np.ndarray, at: int, least: np.ndarray
+) -> int:
+    me, relay = manner.me, manner.relay
+    origins = store.length.shape[0]
+    step = store.counters[_STEP]
+    for origin in range(origins):
+        stamp = store.claims[_STAMP, origin]
+        if stamp <= 0 or (
+            origin != me and step - store.claims[_HEARD, origin] > _CLAIM_LEASE_STEPS
+        ):
+            continue
+        if origin != me:
+            held = least[origins + origin]
+            slack = 0 if relay else _CLAIM_RENEWAL_STEPS
+            if held < 0 or held + slack >= stamp:
+                continue
+        at = put_uint(out, at, origin)
+        at = put_uint(out, at, stamp)
+        at = put_uint(out, at, store.claims[SAMPLE, origin] + 1)
+        at = put_uint(out, at, store.claims[_SINCE, origin])
+    return at
+
+
+@kernel
+def compose(
+    weights: np.ndarray,
+    logs: np.ndarray,
+    length: np.ndarray,
+    known: np.ndarray,
+    sending: np.ndarray,
+    claims: np.ndarray,
+    lowered: np.ndarray,
+    mark: np.ndarray,
+    counters: np.ndarray,
+    law: np.ndarray,
+    out: np.ndarray,
+    least: np.ndarray,
+    target: int,
+) -> tuple[int, int, int]:
+    """Write have, logs and claims one after the other; the position at the end of each.
+
+    least: (2n,) room, see `_find_least`.
+    """
+    store = ReplicaArrays(
+        weights,
+        logs,
+        length,
+        known,
+        sending,
+        claims,
+        lowered,
+        mark,
+        counters,
+    )
+    manner = config_of(law)
+    me, ledger = manner.me, manner.ledger
+    _find_least(store, manner, target, least)
+    origins = store.length.shape[0]
+    at = 0
+    for origin in range(origins):
+        at = put_uint(out, at, store.length[origin])
+    if manner.claims:
+        for origin in range(origins):
+            at = put_uint(out, at, store.claims[_STAMP, origin])
+    end_of_have = at
+    slot = 3 + store.counters[_STEP] % manner.patience
+    entries_left = ENTRIES_MAX
+    for turn in range(origins):
+        origin = (me + turn) % origins
+        if ledger or origin == me:
+            aged = store.sending[slot, origin]
+            start = _start_of_suffix(store, manner, target, least[origin], origin, aged)
+            if start < store.length[origin] and entries_left > 0:
+                at, written = _put_suffix(store, manner, out, at, origin, start, entries_left)
+                entries_left -= written
+    for origin in range(origins):
+        store.sending[slot, origin] = store.length[origin]
+    end_of_logs = at
+    if manner.claims:
+        at = _put_claims(store, manner, out, at, least)
+    return end_of_have, end_of_logs, at
+
+
+@kernel
+def taken(claims: np.ndarray, counters: np.ndarray, me: int, out: np.ndarray) -> int:
+    """Samples claimed by others that outrank this participant's claim; their number."""
+    count = 0
+    for origin in range(claims.shape[1]):
+        sample = claims[SAMPLE, origin]
+        age = counters[_STEP] - claims[_HEARD, origin]
+        if origin == me or sample < 0 or age > _CLAIM_LEASE_STEPS:
+            continue
+        if sample == claims[SAMPLE, me]:
+            mine = claims[_SINCE, me]
+            theirs = claims[_SINCE, origin]
+            if mine < theirs or (mine == theirs and me < origin):
+                continue
+        out[count] = sample
+        count += 1
+    return count
+
+
+@kernel
+def claim(claims: np.ndarray, counters: np.ndarray, me: int, sample: int, now_ns: int) -> None:
+    """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
+    if claims[SAMPLE, me] != sample:
+        claims[SAMPLE, me] = sample
+        claims[_SINCE, me] = max(
+            0, now_ns
+        )  # a clock may run wrong; a message holds no time before 0
+    claims[_STAMP, me] = counters[_STEP]
+
+
+@kernel
+def pack_lowered(
+    weights: np.ndarray, lowered: np.ndarray, counters: np.ndarray, out: np.ndarray
+) -> int:
+    """Pairs (sample, units left) in the order in which they fell; the bytes used, or that they are too many."""
+    count = counters[LOWERED]
+    if 20 * count > out.shape[0]:
+        return NO_ROOM_TO_PACK
+    at = 0
+    before = 0
+    for i in range(count):
+        index = int(lowered[i])
+        at = put_int(out, at, index - before)
+        at = put_uint(out, at, int(weights[index]))
+        before = index
+    return at
+
+
+@kernel
+def end_step(counters: np.ndarray) -> None:
+    counters[LOWERED] = 0
+    counters[_STEP] += 1

@@ -1,0 +1,170 @@
+"""Clients of the bus: a participant's session and an observer's."""
+
+import contextlib
+import queue
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import zenoh
+
+from kantor_protocol.transport import zenoh_config
+from kantor_protocol.transport.credentials import Certificate, Identity
+from kantor_protocol.transport.endpoint import await_endpoint, check_endpoint
+from kantor_protocol.transport.session import QUEUE_MAX, BusError, close_session, open_session
+from kantor_protocol.wire import keys
+
+
+class ParticipantSession:
+    """A participant's end of the bus: a client of world-sim."""
+
+    def __init__(self, session: zenoh.Session, identity: Identity, nonce: str) -> None:
+        """Use `line` to open one."""
+        fleet, name = identity.fleet, identity.user
+        self.nonce = nonce
+        self._session = session
+        self._received: queue.SimpleQueue[bytes | BusError] = queue.SimpleQueue()
+        self._identity = identity
+        self._block = zenoh.CongestionControl.BLOCK
+        self._drop = zenoh.CongestionControl.DROP
+        self._tx, self._pose = keys.tx(fleet, name), keys.pose(fleet, name)
+        self._weights = keys.weights(fleet, name)
+        self._held: list[Any] = [
+            session.declare_subscriber(keys.rx(fleet, name), self._on_message),
+            session.liveliness().declare_token(keys.alive(fleet, name, nonce)),
+        ]
+        if isinstance(identity, Certificate):
+            self._held.append(session.info.declare_transport_events_listener(self._on_transport))
+
+    def next(self, timeout_s: float | None) -> bytes | None:
+        """The next message from world-sim, or None after the timeout.
+
+        Raises BusError if world-sim was started again and does not let us in any more.
+        """
+        try:
+            got = self._received.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
+        except queue.Empty:
+            return None
+        if isinstance(got, BusError):
+            raise got
+        return got
+
+    def send(self, payload: bytes, *, patiently: bool) -> None:
+        """Put on the own `tx`. patiently: wait for a full queue rather than drop."""
+        congestion = self._block if patiently else self._drop
+        self._session.put(self._tx, payload, congestion_control=congestion, express=True)
+
+    def publish_pose(self, payload: bytes) -> None:
+        """Tell observers the own pose."""
+        self._session.put(self._pose, payload)
+
+    def publish_weights(self, payload: bytes) -> None:
+        """Tell observers the own weight vector."""
+        self._session.put(self._weights, payload)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        close_session(self._session, self._held)
+
+    def _on_message(self, sample: zenoh.Sample) -> None:
+        if self._received.qsize() < QUEUE_MAX:
+            self._received.put(sample.payload.to_bytes())
+
+    def _on_transport(self, event: zenoh.TransportEvent) -> None:
+        """We are connected again: perhaps to a world-sim with another register."""
+        assert isinstance(self._identity, Certificate)
+        with contextlib.suppress(zenoh.ZError):  # it is closed meanwhile
+            if event.kind == zenoh.SampleKind.PUT and (
+                objection := _reason_of_refusal(self._session, self._identity)
+            ):
+                self._received.put(BusError(f"refuses {self._identity.user}: {objection}"))
+
+
+class ObserverSession:
+    """An observer's end of the bus: reads, never writes."""
+
+    def __init__(self, session: zenoh.Session, key: str) -> None:
+        """Use `watch` to open one."""
+        self._session = session
+        self._received: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
+        self._held: list[Any] = [session.declare_subscriber(key, self._on_message)]
+
+    def next(self, timeout_s: float) -> tuple[str, bytes] | None:
+        """The next message as (key, payload), or None after the timeout."""
+        try:
+            return self._received.get(timeout=max(0.0, timeout_s))
+        except queue.Empty:
+            return None
+
+    def close(self) -> None:
+        """Leave the bus."""
+        close_session(self._session, self._held)
+
+    def _on_message(self, sample: zenoh.Sample) -> None:
+        if self._received.qsize() < QUEUE_MAX:
+            self._received.put((str(sample.key_expr), sample.payload.to_bytes()))
+
+
+@contextlib.contextmanager
+def participant_session(
+    connect: str, identity: Identity, nonce: str, patience_s: float
+) -> Iterator[ParticipantSession]:
+    """Join world-sim's bus as a participant, waiting for it up to `patience_s`. Raises BusError."""
+    opened = ParticipantSession(client(connect, identity, patience_s), identity, nonce)
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+@contextlib.contextmanager
+def observer_session(
+    connect: str, identity: Identity, key: str, patience_s: float
+) -> Iterator[ObserverSession]:
+    """Join world-sim's bus as an observer of the keys that match. Raises BusError."""
+    opened = ObserverSession(client(connect, identity, patience_s), key)
+    try:
+        yield opened
+    finally:
+        opened.close()
+
+
+def client(connect: str, identity: Identity, patience_s: float) -> zenoh.Session:
+    check_endpoint(connect, identity)
+    await_endpoint(connect, patience_s, identity)
+    try:
+        session = open_session("client", zenoh_config.client_config(identity), connect=connect)
+    except zenoh.ZError:
+        await_endpoint(connect, 0.0, identity)  # which may have changed since
+        raise BusError(
+            f"{connect}: refuses {identity.user}; its credentials are not this world-sim's"
+        ) from None
+    if isinstance(identity, Certificate):
+        try:
+            _check_admitted(connect, session, identity)
+        except BusError:
+            close_session(session, [])
+            raise
+    return session
+
+
+def _check_admitted(connect: str, session: zenoh.Session, identity: Certificate) -> None:
+    """Ask whether we are let in: a certificate may be sound and yet not the register's. Raises BusError."""
+    objection = _reason_of_refusal(session, identity)
+    if objection is None:
+        raise BusError(
+            f"{connect}: no world-sim of fleet {identity.fleet} answers; check --connect"
+        )
+    if objection:
+        raise BusError(f"{connect}: refuses {identity.user}: {objection}")
+
+
+def _reason_of_refusal(session: zenoh.Session, identity: Certificate) -> str | None:
+    """What the router has against us; None if nobody answers. One that has just been opened may take a moment."""
+    give_up = time.monotonic() + zenoh_config.HANDSHAKE_S
+    while time.monotonic() < give_up:
+        for reply in session.get(keys.door(identity.fleet, identity.name), timeout=1.0):
+            if reply.ok is not None:
+                return reply.ok.payload.to_bytes().decode(errors="replace")
+        time.sleep(0.02)
+    return None

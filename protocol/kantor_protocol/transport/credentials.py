@@ -1,0 +1,277 @@
+"""Identities on the bus: who a process is, one TOML file for each, for the eyes of its owner only.
+
+There are two kinds. A *password* is for a run on one machine: `kantor worldsim` makes them, a folder with
+`<id>.toml` for each identity and `users.txt` for the router. A *certificate* is for everything else: it is
+issued by the fleet's authority (`kantor keys`), and never by world-sim. World-sim's own certificate comes
+with the register of whom it lets in.
+"""
+
+import os
+import re
+import secrets
+import tomllib
+from collections.abc import Iterable, Mapping
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
+
+HOST = WORLD_SIM
+OBSERVER = "observer"
+AUTHORITY = "authority"
+"""Not an identity: the name of the file that the fleet's certificates come from."""
+SOON = timedelta(days=7)
+"""A certificate that expires within this is worth a warning."""
+_USERS = "users.txt"
+_PEM_MAX = 16_384
+"""Characters of a certificate or a key; what is longer is none."""
+FLEET_PATTERN = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
+NAME_PATTERN = re.compile(r"[a-z0-9-]{1,69}\.[0-9a-f]{16}")
+"""Names of certificates."""
+
+
+class CredentialsError(ValueError):
+    """Credentials that are missing or no use; the message is one line with the remedy."""
+
+
+def _check_fleet(fleet: str) -> None:
+    if not FLEET_PATTERN.fullmatch(fleet):
+        raise ValueError(f"{fleet} is no name of a fleet")
+
+
+class Password(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Who a process is on which fleet's bus: a user with a password."""
+
+    fleet: str
+    user: ParticipantId
+    password: str
+
+    def __post_init__(self) -> None:
+        """Refuse a fleet that is no name. Raises ValueError."""
+        _check_fleet(self.fleet)
+
+
+class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A certificate as the register knows it."""
+
+    name: str
+    """Its common name: the identity's id, a dot, and the certificate's serial number in hexadecimal."""
+    until: datetime
+    """When it expires (UTC)."""
+
+
+class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Who a process is on which fleet's bus: a user with a certificate. All three parts are PEM."""
+
+    fleet: str
+    user: ParticipantId
+    name: str
+    """The certificate's common name."""
+    until: datetime
+    authority: str
+    certificate: str
+    key: str
+    revoked: tuple[str, ...] = ()
+    """A router's: names of certificates that were withdrawn before their time."""
+    members: dict[ParticipantId, Member] = {}
+    """A router's: the certificate of everybody; whoever shows another is not let in. A site's has its robots
+    and world-sim."""
+    sites: dict[ParticipantId, tuple[ParticipantId, ...]] = {}
+    """World-sim's: for each site the robots that stand behind it."""
+
+    def __post_init__(self) -> None:
+        """Refuse what no authority has made. Raises ValueError."""
+        _check_fleet(self.fleet)
+        for user, name, until in (
+            (self.user, self.name, self.until),
+            *((user, member.name, member.until) for user, member in self.members.items()),
+        ):
+            if not NAME_PATTERN.fullmatch(name) or name.partition(".")[0] != user:
+                raise ValueError(f"{name} is no name of a certificate of {user}")
+            if until.utcoffset() != timedelta(0):
+                raise ValueError("a time without its zone")
+        if any(len(part) > _PEM_MAX for part in (self.authority, self.certificate, self.key)):
+            raise ValueError("no PEM")
+
+    def behind(self) -> dict[ParticipantId, tuple[ParticipantId, ...]]:
+        """For each site the robots that it speaks for: those that have not been revoked."""
+        return {
+            site: tuple(name for name in there if name in self.members)
+            for site, there in self.sites.items()
+        }
+
+    def objection(self, name: str, wanted: Iterable[ParticipantId]) -> str:
+        """Why the holder of a certificate is not let in, with the remedy; empty if it is.
+
+        wanted: the users that take part.
+        """
+        user = name.partition(".")[0]
+        member = self.members.get(user)
+        renew = f"`kantor keys {self.fleet} --renew {user}` makes a new one"
+        if name in self.revoked:
+            return f"its certificate has been revoked; {renew}"
+        if member is None:
+            return (
+                f"is not in the register; start {self.user} again with the newest {self.user}.toml"
+            )
+        if member.name != name:
+            return f"the register names another certificate; use the newest {user}.toml, or {renew}"
+        if user not in wanted:
+            return "is not in the team; choose another id"
+        return ""
+
+    def warnings(self, users: Iterable[ParticipantId], now: datetime) -> list[str]:
+        """A line for each of those users' certificates, and the own, that expires soon or has expired."""
+        return [
+            f"{user}'s certificate {expiry(self.members[user].until, now)}; "
+            f"`kantor keys {self.fleet} --renew {user}`"
+            for user in (self.user, *users)
+            if user in self.members and self.members[user].until - now < SOON
+        ]
+
+
+Identity = Password | Certificate
+
+T = TypeVar("T")
+
+
+def issue(folder: Path, fleet: str, users: Iterable[ParticipantId]) -> dict[str, Password]:
+    """Passwords for the given users; those that the folder has already are kept.
+
+    Raises CredentialsError if the folder holds something else: nothing is overwritten.
+    """
+    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    names = (HOST, OBSERVER, *users)
+    kept = {user: _kept(folder / f"{user}.toml", fleet, user) for user in names}
+    identities = {}
+    for user, password in kept.items():
+        identity = password or Password(fleet, user, secrets.token_urlsafe(24))
+        if password is None:
+            write(folder / f"{user}.toml", to_toml(msgspec.to_builtins(identity)))
+        identities[user] = identity
+    lines = (f"{identity.user}:{identity.password}\n" for identity in identities.values())
+    write(folder / _USERS, "".join(lines))
+    return identities
+
+
+def _kept(path: Path, fleet: str, user: ParticipantId) -> Password | None:
+    """What a folder of passwords has for a user."""
+    if not path.exists():
+        return None
+    identity = _read(path)
+    if isinstance(identity, Certificate):
+        raise CredentialsError(
+            f"{path}: a certificate; listen on tls/HOST:PORT, or choose another folder for passwords"
+        )
+    if identity is None:
+        raise CredentialsError(f"{path}: not a credentials file; delete it to have it made anew")
+    if (identity.fleet, identity.user) != (fleet, user):
+        raise CredentialsError(
+            f"{path}: credentials of {identity.user} of fleet {identity.fleet}; choose another folder"
+        )
+    return identity
+
+
+def users_file(folder: Path) -> Path:
+    """What the router reads."""
+    return folder / _USERS
+
+
+def find(place: Path, user: ParticipantId) -> Identity:
+    """The identity of a user from a credentials folder, or from its file itself.
+
+    Raises CredentialsError.
+    """
+    path = place / f"{user}.toml" if place.is_dir() else place
+    if not path.exists():
+        found = {found.stem for found in place.glob("*.toml")} if place.is_dir() else set()
+        known = sorted(found - {AUTHORITY})
+        hint = f"known here: {', '.join(known)}" if known else _NONE_HERE
+        raise CredentialsError(f"{path}: no credentials for {user}; {hint}")
+    identity = _read(path)
+    if identity is None:
+        raise CredentialsError(f"{path}: not a credentials file; {_ANEW}")
+    if identity.user != user:
+        raise CredentialsError(f"{path}: credentials of {identity.user}, not of {user}")
+    return identity
+
+
+_NONE_HERE = "start `kantor worldsim` first, or bring what `kantor keys` has made"
+_ANEW = "delete it and let world-sim, or `kantor keys --renew`, make it anew"
+
+
+def _read(path: Path) -> Identity | None:
+    tree = _tree(path)
+    return _converted(tree, Password) or _converted(tree, Certificate)
+
+
+def read(path: Path, kind: type[T]) -> T | None:
+    """A TOML file as a Struct; None if it is none."""
+    return _converted(_tree(path), kind)
+
+
+def _tree(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):  # not to be read, no text, no TOML
+        return {}
+
+
+def _converted(tree: dict[str, Any], kind: type[T]) -> T | None:
+    try:
+        return msgspec.convert(tree, kind)
+    except (ValueError, RecursionError):
+        return None
+
+
+def to_toml(tree: Mapping[str, Any]) -> str:
+    """Texts, times, lists of texts, and tables of tables of these, as TOML."""
+    flat = {key: value for key, value in tree.items() if not isinstance(value, Mapping)}
+    text = "".join(f"{key} = {_value(value)}\n" for key, value in flat.items())
+    for key, table in tree.items():
+        if isinstance(table, Mapping):
+            rows = (f"{_text(row)} = {_value(value)}\n" for row, value in table.items())
+            text += f"\n[{key}]\n{''.join(rows)}"
+    return text
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{key} = {_value(item)}' for key, item in value.items())} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_value, value))}]"
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if (
+        "\n" in value
+        and value.isascii()
+        and not re.search(r"[\\\"\r\x00-\x09\x0b-\x1f\x7f]", value)
+    ):
+        return f'"""\n{value}"""'
+    return _text(value)
+
+
+def _text(value: str) -> str:
+    """A text in quotes. TOML knows JSON's escapes, except that DEL must be written as one."""
+    return msgspec.json.encode(value).decode().replace("\x7f", "\\u007f")
+
+
+def expiry(until: datetime, now: datetime) -> str:
+    """When a certificate expires, in words."""
+    when = f"{until:%Y-%m-%d %H:%M} UTC"
+    return f"expires on {when}" if until > now else f"expired on {when}"
+
+
+def write(path: Path, text: str) -> None:
+    """Write for the owner's eyes only, whole or not at all."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    with os.fdopen(
+        os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8"
+    ) as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    draft.replace(path)

@@ -1,0 +1,101 @@
+"""Endpoints of the bus: their syntax, whether one is free, and waiting for one to come up."""
+
+import socket
+import time
+from collections.abc import Callable
+
+from kantor_protocol.transport import tls
+from kantor_protocol.transport.credentials import Certificate, CredentialsError, Identity, Password
+from kantor_protocol.transport.session import BusError
+
+
+def free_endpoint(protocol: str = "tcp") -> str:
+    """A loopback endpoint that nobody uses now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def await_endpoint(
+    connect: str,
+    patience_s: float,
+    identity: Identity | None = None,
+    monotonic: Callable[[], float] = time.monotonic,
+) -> None:
+    """Return once something accepts connections there.
+
+    identity: if it is a certificate, also shake hands with it, which is worth an objection in words. Raises
+    BusError after `patience_s`, and at once if either side objects.
+    """
+    _, host, port = parse_endpoint(connect)
+    give_up = monotonic() + patience_s
+    pause_s = 0.02
+    while True:
+        try:
+            objection = _look_in(host, port, identity)
+        except socket.gaierror:
+            raise BusError(f"{connect}: no such host; check --connect") from None
+        except OSError:
+            if monotonic() >= give_up:
+                raise BusError(
+                    f"{connect}: nothing listens there after {patience_s:g} s; "
+                    f"start `kantor worldsim` or check --connect"
+                ) from None
+        else:
+            if objection:
+                raise BusError(f"{connect}: {objection}")
+            return
+        time.sleep(pause_s)
+        pause_s = min(0.2, 1.5 * pause_s)
+
+
+def _look_in(host: str, port: int, identity: Identity | None) -> str:
+    """What world-sim or we have against each other. Raises OSError if nothing listens there."""
+    if isinstance(identity, Certificate):
+        return tls.objection(host, port, identity)
+    socket.create_connection((host, port), timeout=1.0).close()
+    return ""
+
+
+def parse_endpoint(endpoint: str) -> tuple[str, str, int]:
+    protocol, _, place = endpoint.partition("/")
+    host, _, port = place.rpartition(":")
+    sound = protocol in {"tcp", "tls"} and host and port.isdecimal() and port.isascii()
+    if not sound or int(port) > 65535:
+        raise BusError(f"{endpoint}: not an endpoint; write it as tcp/HOST:PORT or tls/HOST:PORT")
+    return protocol, host.strip("[]"), int(port)
+
+
+def is_tls(endpoint: str) -> bool:
+    """Whether an endpoint is for certificates. Raises BusError if it is none."""
+    return parse_endpoint(endpoint)[0] == "tls"
+
+
+def check_endpoint(endpoint: str, identity: Identity | None = None) -> None:
+    """Raise BusError unless it reads tcp/HOST:PORT or tls/HOST:PORT.
+
+    identity: raise CredentialsError unless it is of the kind that the endpoint is for.
+    """
+    protocol, _, place = endpoint.partition("/")
+    if is_tls(endpoint) and isinstance(identity, Password):
+        raise CredentialsError(
+            f"{endpoint}: {identity.user} has a password, and tls takes certificates; "
+            f"make them with `kantor keys`, or use tcp/{place}"
+        )
+    if protocol == "tcp" and isinstance(identity, Certificate):
+        raise CredentialsError(
+            f"{endpoint}: {identity.user} has a certificate, and tcp takes passwords; use tls/{place}"
+        )
+
+
+def check_free(listen: str) -> None:
+    """Raise BusError if somebody else listens there."""
+    _, host, port = parse_endpoint(listen)
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            reason = error.strerror or error
+            raise BusError(f"cannot listen on {listen}: {reason}; choose another") from None

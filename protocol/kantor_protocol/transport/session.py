@@ -1,0 +1,54 @@
+"""How a Zenoh session is opened and closed, and the error of a bus that cannot be reached."""
+
+import contextlib
+import json
+import threading
+from typing import Any
+
+import zenoh
+
+from kantor_protocol.transport import zenoh_config
+
+LEASE_MS = zenoh_config.LEASE_MS
+
+
+QUEUE_MAX = 16_384
+"""Messages that wait for a reader."""
+
+
+CLOSE_S = 5.0
+
+
+class BusError(ConnectionError):
+    """The bus cannot be reached or refuses us; the message is one line with the remedy."""
+
+
+def open_session(
+    mode: str,
+    own: zenoh_config.ZenohConfig,
+    *,
+    connect: str | None = None,
+    listen: str | None = None,
+) -> zenoh.Session:
+    """Raises zenoh.ZError."""
+    config = zenoh.Config()
+    for key, value in (zenoh_config.common_config(mode, connect, listen) | own).items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+def close_session(session: zenoh.Session, held: list[Any]) -> None:
+    """Close without ever hanging: a close may block when the other side is gone."""
+    held.clear()
+
+    def close() -> None:
+        with contextlib.suppress(zenoh.ZError):
+            session.close()  # type: ignore[no-untyped-call]
+
+    closing = threading.Thread(target=close, daemon=True)
+    closing.start()
+    closing.join(CLOSE_S)
+
+
+def one_line(error: Exception) -> str:
+    return str(error).splitlines()[0].partition(" at ")[0][:200]

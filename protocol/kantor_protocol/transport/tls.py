@@ -1,0 +1,169 @@
+"""Why a connection with certificates is refused, in words.
+
+Zenoh tells neither side. A client therefore shakes hands once by itself before it joins, with the same
+certificate and the same authority, and reads the alert; world-sim reads the line that Zenoh logs.
+"""
+
+import os
+import re
+import socket
+import ssl
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+
+from kantor_protocol.transport.credentials import Certificate, CredentialsError
+
+HANDSHAKE_S = 5.0
+_WINDOW_S = 10.0
+"""World-sim tells of the same reason once in this time, however many are refused."""
+
+
+def objection(host: str, port: int, identity: Certificate) -> str:
+    """Shake hands with world-sim: why it comes to nothing, with the remedy; empty if it does not.
+
+    Raises OSError if nothing listens there, CredentialsError if the identity is no use.
+    """
+    renew = f"`kantor keys {identity.fleet} --renew {identity.user}` makes a new one"
+    with socket.create_connection((host, port), timeout=HANDSHAKE_S) as raw:
+        try:
+            _shake_hands(raw, host, context(identity))
+        except ssl.SSLCertVerificationError as error:
+            return _distrust(error, host, identity)
+        except ssl.SSLError as error:
+            reason = (error.reason or "").lower()
+            for pattern, words in _ALERTS.items():
+                if re.search(pattern, reason):
+                    return words.format(user=identity.user, renew=renew)
+            return f"the handshake failed ({error.reason or 'no answer'}); is it a world-sim with certificates?"
+        except OSError:
+            return "does not answer as one with certificates; check --connect"
+    return ""
+
+
+_ALERTS = {
+    "certificate_expired": "refuses {user}: its certificate has expired; {renew}",
+    "unknown_ca|decrypt_error": "refuses {user}: its certificate is from another authority; "
+    "use the file that this fleet's `kantor keys` has made",
+    "certificate_required|handshake_failure": "refuses {user}: it showed no certificate; {renew}",
+    "bad_certificate|certificate_unknown|unsupported_certificate": "refuses {user}: its certificate is no use; {renew}",
+    "wrong_version_number|record_layer|unexpected_eof|http_request": "does not answer as one with certificates; "
+    "check --connect",
+}
+"""OpenSSL's names of alerts, and what they mean."""
+
+
+def _shake_hands(raw: socket.socket, host: str, context: ssl.SSLContext) -> None:
+    """Raises ssl.SSLError, OSError."""
+    with context.wrap_socket(raw, server_hostname=host) as secured:
+        # In TLS 1.3 the server looks at our certificate after our handshake is over. Once it has taken note
+        # that we say no more, it has either sent its alert or closes.
+        raw_end = socket.socket(fileno=os.dup(secured.fileno()))
+        with raw_end, suppress(OSError):  # it may have hung up already
+            raw_end.shutdown(socket.SHUT_WR)
+        with suppress(ConnectionError):  # without an alert: whoever joins is told why
+            secured.recv(1)
+
+
+def _distrust(error: ssl.SSLCertVerificationError, host: str, identity: Certificate) -> str:
+    """Why we do not trust whoever answers."""
+    code, fleet = error.verify_code, identity.fleet
+    if code in {62, 64}:  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
+        return (
+            f"what answers has no certificate for the name {host}; connect by another name, "
+            f"or `kantor keys {fleet} --host {host}` and start world-sim with it"
+        )
+    if code in {9, 10}:  # X509_V_ERR_CERT_NOT_YET_VALID, X509_V_ERR_CERT_HAS_EXPIRED
+        return (
+            f"world-sim's certificate is {'not valid yet' if code == 9 else 'expired'}; "
+            f"check the clock, or `kantor keys {fleet} --renew worldsim` and start world-sim with it"
+        )
+    if code == 26:  # X509_V_ERR_INVALID_PURPOSE
+        return "what answers shows a robot's certificate, not world-sim's; do not trust it"
+    return (
+        f"what answers has a certificate from another authority ({error.verify_message}); "
+        f"it is not the world-sim of this identity's fleet {fleet}"
+    )
+
+
+def context(identity: Certificate) -> ssl.SSLContext:
+    """A client's, which trusts the fleet's authority alone. Raises CredentialsError."""
+    made = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    try:
+        made.load_verify_locations(cadata=identity.authority)
+        with _readable(identity.certificate) as certificate, _readable(identity.key) as key:
+            made.load_cert_chain(certificate, key, password=lambda: "")
+    except (ssl.SSLError, ValueError):
+        raise CredentialsError(
+            f"{identity.user}.toml: its certificate or key is damaged; "
+            f"`kantor keys {identity.fleet} --renew {identity.user}` makes a new one"
+        ) from None
+    return made
+
+
+@contextmanager
+def _readable(text: str) -> Iterator[str]:
+    """A text as a path, for a library that reads files only; no file is made."""
+    reading, writing = os.pipe()
+    try:
+        with os.fdopen(writing, "w", encoding="utf-8") as file:
+            file.write(text)
+        yield f"/dev/fd/{reading}"
+    finally:
+        os.close(reading)
+
+
+class Refusals:
+    """Tells of whom world-sim refuses: a line for a reason at once, then how often, now and then."""
+
+    def __init__(
+        self, say: Callable[[str], None], monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
+        """say: takes one line for a person. monotonic: seconds."""
+        self._say = say
+        self._monotonic = monotonic
+        self._due_s: dict[str, float] = {}
+        self._untold: dict[str, int] = {}
+
+    def tell(self, reason: str) -> None:
+        """Somebody was refused."""
+        now_s = self._monotonic()
+        self._untold[reason] = self._untold.get(reason, 0) + 1
+        if now_s >= self._due_s.get(reason, now_s):
+            self._due_s[reason] = now_s + _WINDOW_S
+            self._flush(reason)
+
+    def close(self) -> None:
+        """Tell what has not been told."""
+        for reason in tuple(self._untold):
+            self._flush(reason)
+
+    def _flush(self, reason: str) -> None:
+        count = self._untold.pop(reason)
+        self._say(reason if count == 1 else f"{reason} ({count} times)")
+
+
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+_LOGGED = re.compile(r" WARN .*zenoh_link_tls::unicast: (.*?)(?:\. Hint: .*)?$")
+_LOGGED_REASONS = {
+    "certificate expired": "its certificate has expired",
+    "UnknownIssuer|BadSignature": "its certificate is from another authority",
+    "peer sent no certificates": "it showed no certificate",
+    "InvalidContentType|corrupt message": "it does not speak TLS",
+    "fatal alert: (UnknownCA|DecryptError)": "it trusts another authority than world-sim's",
+    "fatal alert: CertificateExpired": "to it, world-sim's certificate has expired",
+    "fatal alert: (UnsupportedCertificate|BadCertificate|CertificateUnknown)": "it does not trust world-sim's certificate",
+}
+_NOBODY = re.compile(r"\beof\b|reset|timed? ?out", re.IGNORECASE)
+"""Who only looks whether the port is open is nobody that was refused."""
+
+
+def logged_reason(line: str) -> str:
+    """Why Zenoh refused a client, from a line of its log; empty if it does not say so."""
+    found = _LOGGED.search(_COLOURS.sub("", line).rstrip())
+    if found is None or _NOBODY.search(found[1]):
+        return ""
+    for pattern, words in _LOGGED_REASONS.items():
+        if re.search(pattern, found[1]):
+            return f"refused a client: {words}"
+    return f"refused a client: {found[1][:200]}"

@@ -1,0 +1,20 @@
+"""What referees say of a record, and which rules they know."""
+
+import inspect
+from collections.abc import Iterable
+
+from kantor_worldsim.observers.checkers.checker import check
+from kantor_worldsim.record.records import Record
+
+
+def rules(records: Iterable[Record]) -> set[str]:
+    """The rules that a record breaks."""
+    return {complaint.partition(":")[0] for complaint in check(records).complaints}
+
+
+def listed(referee: type) -> set[str]:
+    """The rules that a referee's docstring lists. Python 3.13 takes its indentation off, earlier ones do not."""
+    text = inspect.getdoc(referee)
+    assert text is not None
+    lines = text.partition("-----\n")[2].splitlines()
+    return {line.split()[0] for line in lines if line[:1].isalpha()}

@@ -1,0 +1,78 @@
+"""Floor plans for planners: a chart that is drawn, and robots on it."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from hypothesis import strategies as st
+
+from kantor_agent.mapping.cost_map import CostMap
+from kantor_agent.mapping.fused_map import FusedMap
+from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import Scenario
+from support.strategies import SEEDS
+
+_MISSION = """
+name = "floor"
+robots = { count = 8 }
+starts = { random = true }
+map = { layout = "blank" }
+sensor = { range_m = 3.0 }
+planner = { name = "burgard", cost = "length" }
+"""
+_KINDS = {" ": UNKNOWN, ".": FREE, "#": OCCUPIED}
+
+
+class Floor:
+    """What is known of a map with cells of 1 m, and the scenario. Ways cost their length in cells."""
+
+    def __init__(self, cells: npt.NDArray[np.uint8], *overrides: str) -> None:
+        """cells: (rows, columns)."""
+        self.scenario: Scenario = parse(_MISSION, "floor", overrides)
+        self.chart = FusedMap(Frame(1.0, (0.0, 0.0), *cells.shape), 8)
+        self.chart.cells[:] = cells.ravel()
+        self.chart.revision = 1
+        self.terrain = CostMap(self.scenario, self.chart)
+
+    def situation(
+        self,
+        members: Sequence[Member],
+        others: Sequence[Member] = (),
+        absent: Sequence[int] = (),
+        but: Sequence[int] = (),
+    ) -> Situation:
+        """With all frontiers but some to choose from."""
+        frontiers = self.chart.frontiers
+        frontiers = frontiers[~np.isin(frontiers, but)]
+        return Situation(self.terrain, frontiers, tuple(members), tuple(others), tuple(absent), 0)
+
+
+def drawn(plan: Sequence[str], *overrides: str) -> Floor:
+    """A floor as a picture: row 0 comes first; a wall is #, free is a dot, unknown is blank."""
+    return Floor(np.array([[_KINDS[c] for c in row] for row in plan], dtype=np.uint8), *overrides)
+
+
+def robot(place: int, cell: int, target: int = NOWHERE, *, arrived: bool = False) -> Member:
+    """A member."""
+    return Member(place, cell, Task(target), 0, arrived)
+
+
+@st.composite
+def crowded(draw: st.DrawFn, *overrides: str) -> tuple[Floor, Situation]:
+    """Any floor, with up to six robots on it, and targets that are taken."""
+    dice = np.random.default_rng(draw(SEEDS))
+    rows, columns = draw(st.integers(1, 12)), draw(st.integers(1, 12))
+    walls, unseen = draw(st.sampled_from([0.0, 0.2, 0.4])), draw(st.sampled_from([0.1, 0.3]))
+    kinds = dice.choice(
+        [OCCUPIED, UNKNOWN, FREE], (rows, columns), p=[walls, unseen, 1 - walls - unseen]
+    )
+    floor = Floor(kinds.astype(np.uint8), *overrides)
+    cells = st.integers(0, rows * columns - 1)
+    members = [
+        robot(i, cell) for i, cell in enumerate(draw(st.lists(cells, min_size=1, max_size=6)))
+    ]
+    targets = draw(st.lists(st.integers(NOWHERE, rows * columns - 1), max_size=2))
+    others = [robot(6 + i, 0, target) for i, target in enumerate(targets)]
+    return floor, floor.situation(members, others, draw(st.lists(cells, max_size=2)))

@@ -1,0 +1,267 @@
+"""What the tests draw from and stand on: small missions, crowds of points, messages, TOML trees."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+
+from kantor_agent.robots.density import DensityRobot
+from kantor_protocol.base.counter_rng import Purpose, generator
+from kantor_protocol.base.machine import (
+    SUPERVISOR,
+    Body,
+    Envelope,
+    Inputs,
+    Observation,
+    Outputs,
+    ParticipantId,
+    Pose,
+    State,
+    StateMachine,
+)
+from kantor_protocol.scenario.load import parse
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import GossipMessage
+from kantor_supervisor.density import DensitySupervisor
+
+Points = npt.NDArray[np.float64]
+
+SMALL = """
+name = "small"
+coordination = "decentralized"
+
+[domain]
+min_m = [0.0, 0.0]
+max_m = [100.0, 100.0]
+
+[robots]
+count = 3
+
+[starts]
+poses_m = [[10.0, 10.0], [90.0, 20.0], [50.0, 80.0]]
+
+[energy]
+points = 30
+
+[samples]
+count = 12
+
+[[density]]
+mean_m = [50.0, 50.0]
+variance_m2 = [400.0, 400.0]
+"""
+"""Three robots, M = 30, N = 12: L = 60, five units a sample, two a point."""
+
+MINIMUM = ("merge=min", "claims=false")
+"""Overrides that make a mission merge as the paper does."""
+
+
+def examples(count: int) -> settings:
+    """How many examples a property is tried on.
+
+    Nothing is timed: the first call may compile kernels, and the machine may have other work.
+    """
+    return settings(max_examples=count, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+
+
+def mission(*overrides: str) -> Scenario:
+    """The small mission with `key.sub=value` overrides."""
+    return parse(SMALL, "small", overrides)
+
+
+def scattered(count: int, seed: int = 1, extent_m: float = 100.0) -> Points:
+    """(count, 2) points, uniform in a square, the same for the same seed."""
+    return generator(seed, Purpose.SAMPLES).random((count, 2)) * extent_m
+
+
+# Rehearsals: a mission played with a perfect radio and a world that accepts every move.
+
+Transcript = list[tuple[Inputs, Outputs]]
+Hears = Callable[[ParticipantId, ParticipantId], bool]
+
+
+def cast(scenario: Scenario, samples_m: Points, seed: int = 1) -> dict[ParticipantId, StateMachine]:
+    """All participants of a mission, robots first."""
+    made: dict[ParticipantId, StateMachine] = {}
+    for name, start_m in zip(scenario.robot_ids, scenario.starts.poses_m, strict=True):
+        made[name] = DensityRobot(name, scenario, seed, Body(Pose(*start_m)), samples_m)
+    if scenario.centralized:
+        made[SUPERVISOR] = DensitySupervisor(
+            SUPERVISOR, scenario, Body(Pose(*scenario.supervisor_m)), samples_m.shape[0]
+        )
+    return made
+
+
+def starts(scenario: Scenario) -> dict[ParticipantId, Pose]:
+    """Where everybody stands at time 0."""
+    poses = zip(scenario.robot_ids, scenario.starts.poses_m, strict=True)
+    placed = {name: Pose(*start_m) for name, start_m in poses}
+    return {**placed, SUPERVISOR: Pose(*scenario.supervisor_m)}
+
+
+def everybody(_speaker: ParticipantId, _listener: ParticipantId) -> bool:
+    """A radio without a range."""
+    return True
+
+
+def in_a_row(speaker: ParticipantId, listener: ParticipantId) -> bool:
+    """A radio by which r1 hears r2, r2 hears r1 and r3, and so on."""
+    return abs(int(speaker[1:]) - int(listener[1:])) == 1
+
+
+def rehearse(
+    machines: Mapping[ParticipantId, StateMachine],
+    scenario: Scenario,
+    rounds: int,
+    hears: Hears = everybody,
+) -> dict[ParticipantId, Transcript]:
+    """Step everybody once a period. What is sent in one round arrives before the next."""
+    inboxes: dict[ParticipantId, list[Envelope]] = {name: [] for name in machines}
+    places = starts(scenario)
+    transcripts: dict[ParticipantId, Transcript] = {name: [] for name in machines}
+    for step in range(1, rounds + 1):
+        sent: list[Envelope] = []
+        for name, machine in machines.items():
+            look = Observation(step=step - 1, pose=places[name])
+            inputs = Inputs(step * scenario.period_ns, look, tuple(inboxes[name]))
+            outputs = machine.step(inputs)
+            transcripts[name].append((inputs, outputs))
+            places[name] = outputs.pose
+            inboxes[name] = []
+            sent += outputs.outbox
+        for envelope in sent:
+            for name in machines:
+                wanted = envelope.target in ("", name) and envelope.source != name
+                if wanted and hears(envelope.source, name):
+                    inboxes[name].append(envelope)
+    return transcripts
+
+
+# Numbers and places.
+
+SEEDS = st.integers(0, 2**63 - 1)
+WORDS = st.integers(0, 2**32 - 1)
+COUNTS = st.integers(0, 2**63 - 1)
+MOMENTS = st.integers(-(2**62), 2**62)
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+UNUSABLE = st.sampled_from([math.nan, math.inf, -math.inf])
+METRES = st.floats(-1e6, 1e6)
+ANGLES = st.floats(-10.0, 10.0)
+
+_LATTICE = st.integers(-3, 3).map(float)
+_CROWDS_AROUND_0 = st.one_of(
+    st.lists(st.tuples(METRES, METRES), min_size=1, max_size=60),
+    st.lists(st.tuples(_LATTICE, _LATTICE), min_size=1, max_size=60),
+    st.lists(st.tuples(METRES, st.just(2.5)), min_size=1, max_size=40),
+    st.tuples(METRES, METRES).flatmap(lambda xy: st.integers(1, 30).map(lambda n: [xy] * n)),
+)
+
+
+@st.composite
+def crowds(draw: st.DrawFn) -> Points:
+    """Points scattered, on a lattice with duplicates, on a line, in one place; near 0 or far off."""
+    xy_m = np.array(draw(_CROWDS_AROUND_0), dtype=np.float64)
+    return xy_m + draw(st.sampled_from([0.0, 0.0, 1e3, -1e8]))
+
+
+# Messages.
+
+NEWS = st.builds(
+    GossipMessage,
+    version=st.just(1),
+    step=COUNTS,
+    x_m=FINITE,
+    y_m=FINITE,
+    have=st.binary(max_size=40),
+    logs=st.binary(max_size=40),
+    claims=st.binary(max_size=40),
+    registers=st.binary(max_size=40),
+    epoch=st.integers(0, 15),
+)
+POSES = st.builds(Pose, x_m=FINITE, y_m=FINITE, heading_rad=FINITE, speed_m_s=FINITE)
+ENVELOPES = st.builds(
+    Envelope,
+    source=st.text(max_size=8),
+    sequence=COUNTS,
+    target=st.text(max_size=8),
+    body=st.binary(max_size=40),
+)
+INPUTS = st.builds(
+    Inputs,
+    now_ns=MOMENTS,
+    observation=st.builds(
+        Observation, step=COUNTS, pose=POSES, detected=st.lists(COUNTS, max_size=4).map(tuple)
+    ),
+    inbox=st.lists(ENVELOPES, max_size=3).map(tuple),
+)
+OUTPUTS = st.builds(
+    Outputs,
+    step=COUNTS,
+    pose=POSES,
+    goal=st.none() | st.tuples(FINITE, FINITE),
+    spent=st.binary(max_size=20),
+    lowered=st.binary(max_size=20),
+    weights=st.binary(max_size=20),
+    outbox=st.lists(ENVELOPES, max_size=3).map(tuple),
+    energy_spent=COUNTS,
+    state=st.sampled_from(State),
+    refused=COUNTS,
+)
+
+
+# TOML trees.
+
+_KEYS_OF_SCENARIOS = """
+name summary coordination merge claims limit_s domain robots energy samples density starts
+targets vehicle clock sensor radio supervisor planner publish metrics min_m max_m count
+random poses_m speed_m_s period_s order spread drift_ppm jitter_s points steps mean_m
+variance_m2 weight file diffusion_m range_m drop delay_s horizon modes every
+"""
+TOML_KEYS = st.sampled_from(_KEYS_OF_SCENARIOS.split()) | st.text(max_size=6)
+_TOML_SCALARS = st.one_of(
+    st.booleans(),
+    st.integers(-3, 2000),
+    st.integers(-(10**400), 10**400),
+    st.floats(),
+    st.text(max_size=12),
+    st.sampled_from(["min", "ledger", "turn", "dubins", "a.csv", "b.png", "c.txt"]),
+    st.dates(),
+    st.datetimes(),
+    st.times(),
+)
+TomlTree = dict[str, Any]
+TOML_VALUES: st.SearchStrategy[Any] = st.recursive(
+    _TOML_SCALARS,
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(TOML_KEYS, inner, max_size=4),
+    max_leaves=10,
+)
+TOML_TREES: st.SearchStrategy[TomlTree] = st.dictionaries(TOML_KEYS, TOML_VALUES, max_size=6)
+
+
+def paths_of(tree: Any) -> list[tuple[str | int, ...]]:
+    """Every place in a TOML tree, as the keys and positions that lead there."""
+    inside: list[tuple[str | int, Any]] = []
+    if isinstance(tree, dict):
+        inside = list(tree.items())
+    elif isinstance(tree, list):
+        inside = list(enumerate(tree))
+    return [
+        way
+        for key, value in inside
+        for way in [(key,), *((key, *rest) for rest in paths_of(value))]
+    ]
+
+
+def planted(tree: Any, path: tuple[str | int, ...], value: Any) -> Any:
+    """A copy of a TOML tree with the value at one place replaced."""
+    if not path:
+        return value
+    if isinstance(tree, dict):
+        return {**tree, path[0]: planted(tree.get(str(path[0])), path[1:], value)}
+    copy = list(tree)
+    copy[int(path[0])] = planted(copy[int(path[0])], path[1:], value)
+    return copy

@@ -1,0 +1,5 @@
+"""Checkers: rules that every record must satisfy, each with a test that breaks it.
+
+One file for each subject; `checker.py` runs them batch by batch. They share no code with the radio, the world and
+the engine, whose mistakes they must find. Start with `checker.py`.
+"""

@@ -1,0 +1,306 @@
+"""Metrics that every run has, on a density or on a map."""
+
+from collections import Counter
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from kantor_protocol.base.counter_rng import Purpose
+from kantor_protocol.base.machine import ParticipantId
+from kantor_protocol.base.random_walk import RandomWalk
+from kantor_protocol.scenario.faults.schedule import kind_of
+from kantor_protocol.transport.rate_limit import Excess
+from kantor_worldsim.observers.metrics.density import (
+    BYTES_TOTAL,
+    BYTES_WEIGHTS,
+    DELIVERIES,
+    DROPS,
+    ENERGY,
+    FIRST_CONTACT,
+    LEAST,
+    NEVER,
+    NOW,
+    REFUSED_BEFORE,
+    STEPS,
+    VIOLATIONS,
+    DensityTally,
+    begin_anew,
+    follow,
+)
+from kantor_worldsim.observers.metrics.result import (
+    LINK_COUNTERS,
+    PROCESS_COUNTERS,
+    BytesPerRobotTick,
+    FaultCounts,
+    Rejoining,
+    Result,
+)
+from kantor_worldsim.record.columnar import ColumnarDecoder
+from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record
+
+
+class Snapshot(NamedTuple):
+    """How the run stands, cheap to get at any time."""
+
+    now_ns: int
+    energy_spent: int
+    detected: int
+    targets: int
+    w_ub: float
+    links: int
+    messages_per_s: float
+    """Deliveries a simulated second over the last ten rows."""
+    robots_done: int
+    mass_left: float
+    """On a map the share of cells that nobody has seen."""
+    distance_m: float | None = None
+    """On a map: what all robots have driven."""
+
+
+class RunMetrics:
+    """Follows the records of one run: what is the same whatever is explored.
+
+    A kind of mission adds what it measures: `_begin`, `_attend`, `_row`, `_glimpse` and `_measured`.
+    """
+
+    columns: ClassVar[tuple[str, ...]]
+    """The names in a row."""
+
+    def __init__(self, reader: ColumnarDecoder | None = None) -> None:
+        """reader: the one that another referee of the same run reads by."""
+        self.rows: list[Any] = []
+        self.finds: list[tuple[float, ParticipantId, int, float, float]] = []
+        """(time, robot, target, x, y), world frame."""
+        self._reader = reader or ColumnarDecoder()
+        self._opening: Opening | None = None
+        self._every = 1
+        """Periods from one row to the next."""
+
+    def take(self, record: Record) -> None:
+        """Follow one record."""
+        if isinstance(record, Opening):
+            self._open(record)
+        elif isinstance(record, Batch):
+            self._follow(record)
+        elif isinstance(record, ProcessEvent):
+            self._befall(record)
+        else:
+            self._ending = record
+            self._row(last=True)
+
+    def _open(self, opening: Opening) -> None:
+        self._reader.read(opening)
+        scenario, site = opening.scenario, opening.site
+        self._opening, self._scenario, self._units = opening, scenario, opening.units
+        self._period_ns = scenario.period_ns
+        self._walk = RandomWalk(
+            site.samples_m,
+            scenario.samples.diffusion_m,
+            self._period_ns,
+            opening.seed,
+            Purpose.SAMPLE_WALK,
+        )
+        names, samples, robots = scenario.roster, site.samples_m.shape[0], scenario.robots.count
+        self._targets = site.targets_m.shape[0]
+        self._tally = DensityTally(
+            counts=np.zeros(11, dtype=np.int64),
+            shipped=np.zeros(2),
+            standing=np.zeros((len(names), 4), dtype=np.int64),
+            shipped_by=np.zeros(robots),
+            xy_m=site.starts_m.copy(),
+            views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
+            least=np.full(samples, self._units.sample, dtype=np.int64),
+            true_left=np.full(samples, self._units.sample, dtype=np.int64),
+        )
+        self._tally.counts[FIRST_CONTACT] = NEVER
+        self._tally.counts[LEAST] = self._units.whole
+        self._tally.standing[:, 2] = NEVER
+        self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
+        self._out_of_range = self._absences = 0
+        self._tolls = Counter[tuple[int, str]]()
+        self._restarts = 0
+        self._epochs = dict.fromkeys(names, 0)
+        self._gone: set[ParticipantId] = set()
+        self._started_ns: dict[ParticipantId, int] = {}
+        """Who has started again and not stepped yet, and when that was."""
+        self._rejoined_ns: list[int] = []
+        self._ending = Ending(0, "cut")
+        self._tick = 0
+        for name, found in opening.first_look.items():
+            self.finds += [(0.0, name, target, x, y) for target, x, y in found]
+        self._begin(opening)
+        self._row()
+
+    def _follow(self, batch: Batch) -> None:
+        tick = batch.now_ns // self._period_ns
+        if tick != self._tick:
+            if self._tick and self._tick % self._every == 0:
+                self._row()
+            self._tick, self._tally.shipped[NOW] = tick, 0.0
+        self._walk.advance(batch.now_ns)
+        self._out_of_range += batch.out_of_range
+        self._absences += len(batch.absent)
+        for toll in batch.tolls:
+            for deed in LINK_COUNTERS:
+                self._tolls[toll.fault, deed] += getattr(toll, deed)
+        if self._started_ns:
+            self._note_rejoining(batch)
+        reading = self._reader.read(batch)
+        if follow(*reading, *self._arguments):
+            self._note_finds(batch)
+        self._attend(batch, reading)
+
+    def _befall(self, incident: ProcessEvent) -> None:
+        """Follow what befell a process."""
+        name, what = incident.who, incident.what
+        if incident.fault >= 0 and what in PROCESS_COUNTERS:
+            self._tolls[incident.fault, PROCESS_COUNTERS[what]] += 1
+        if what in {"kill", "leave"}:
+            self._gone.add(name)
+            self._started_ns.pop(name, None)
+        elif what in {"start", "join"}:
+            self._restarts += name in self._gone
+            if name in self._epochs:
+                self._take_over(incident)
+            self._gone.discard(name)
+
+    def _take_over(self, incident: ProcessEvent) -> None:
+        name = incident.who
+        if name in self._gone:
+            self._started_ns[name] = incident.now_ns
+        if incident.epoch <= self._epochs[name]:
+            return
+        self._epochs[name] = incident.epoch
+        place = self._scenario.roster.index(name)
+        begin_anew(*self._tally, place, self._units.sample)
+
+    def _note_rejoining(self, batch: Batch) -> None:
+        for act in batch.acts:
+            if act.outputs is not None and act.name in self._started_ns:
+                started_ns = self._started_ns.pop(act.name)
+                self._rejoined_ns.append(max(0, batch.now_ns - started_ns))
+
+    @property
+    def steps(self) -> int:
+        """Of all robots so far."""
+        return self._tally.counts.item(STEPS)
+
+    @property
+    def deliveries(self) -> int:
+        """So far."""
+        return self._tally.counts.item(DELIVERIES)
+
+    @property
+    def drops(self) -> int:
+        """So far."""
+        return self._tally.counts.item(DROPS)
+
+    def _note_finds(self, batch: Batch) -> None:
+        for act in batch.acts:
+            if act.ruling is not None and act.outputs is not None:
+                time_s = act.now_ns * 1e-9
+                self.finds += [
+                    (time_s, act.name, target, x, y) for target, x, y in act.ruling.found
+                ]
+
+    def _begin(self, opening: Opening) -> None:
+        """Prepare for the run, before its first row."""
+        raise NotImplementedError
+
+    def _attend(self, batch: Batch, reading: tuple[Any, ...]) -> None:
+        """Follow a batch that has been counted. reading: a Reading as arguments of a kernel."""
+
+    def _row(self, *, last: bool = False) -> None:
+        """Measure."""
+        raise NotImplementedError
+
+    def _glimpse(self) -> dict[str, Any]:
+        """By the last row: `w_ub`, `mass_left` and what else there is in a Glance."""
+        raise NotImplementedError
+
+    def _measured(self) -> dict[str, Any]:
+        """What a Result has beside the counts."""
+        raise NotImplementedError
+
+    def glance(self) -> Snapshot:
+        """How the run stands, by the last row."""
+        if not self.rows:
+            return Snapshot(0, 0, 0, 0, 0.0, 0, 0.0, 0, 1.0)
+        last = self.rows[-1]
+        before = self.rows[max(0, len(self.rows) - 11)]
+        elapsed_s = last.time_s - before.time_s
+        rate = (last.deliveries - before.deliveries) / elapsed_s if elapsed_s > 0.0 else 0.0
+        return Snapshot(
+            now_ns=round(last.time_s * 1e9),
+            energy_spent=int(self._tally.counts[ENERGY]),
+            detected=len(self.finds),
+            targets=self._targets,
+            links=last.links,
+            messages_per_s=rate,
+            robots_done=int(self._tally.standing[:, 1].sum()),
+            **self._glimpse(),
+        )
+
+    def result(
+        self,
+        *,
+        exchange: str,
+        digest: str,
+        wall_s: float,
+        refused_at_door: int = 0,
+        excess: Mapping[ParticipantId, Excess] = MappingProxyType({}),
+        record: str,
+        complaints: tuple[str, ...],
+    ) -> Result:
+        """The summary; call it after the last record. complaints: the checker's."""
+        scenario, counts = self._scenario, self._tally.counts.tolist()
+        robots = scenario.robots.count
+        finished = self._tally.standing[:robots, 2].tolist()
+        steps = max(1, counts[STEPS])
+        assert self._opening is not None
+        return Result(
+            scenario=scenario.name,
+            seed=self._opening.seed,
+            exchange=exchange,
+            clock=scenario.clock.order,
+            planner=scenario.planner.name,
+            merge=scenario.merge,
+            claims=scenario.claiming,
+            robots=robots,
+            ticks=self._tick,
+            finished_tick=None if NEVER in finished else max(finished),
+            first_contact_tick=None if counts[FIRST_CONTACT] == NEVER else counts[FIRST_CONTACT],
+            detected=len(self.finds),
+            targets=self._targets,
+            detection_rate=len(self.finds) / self._targets if self._targets else None,
+            energy_spent=counts[ENERGY],
+            bytes_per_robot_tick=BytesPerRobotTick(
+                counts[BYTES_WEIGHTS] / steps, counts[BYTES_TOTAL] / steps
+            ),
+            deliveries=counts[DELIVERIES],
+            drops=counts[DROPS],
+            out_of_range_refused=self._out_of_range,
+            messages_refused=int(self._tally.standing[:, 0].sum())
+            + counts[REFUSED_BEFORE]
+            + refused_at_door,
+            absences=self._absences,
+            ended=self._ending.reason,
+            record=record,
+            violations=counts[VIOLATIONS] + len(complaints),
+            complaints=complaints[:10],
+            digest=digest,
+            wall_s=wall_s,
+            faults={
+                f"{i} {kind_of(fault)}": FaultCounts(
+                    **{deed: self._tolls[i, deed] for deed in FaultCounts.__struct_fields__}
+                )
+                for i, fault in enumerate(scenario.faults)
+            },
+            restarts=self._restarts,
+            incarnations=sum(self._epochs.values()),
+            rejoin_s=Rejoining.of(self._rejoined_ns),
+            excess=dict(excess),
+            **self._measured(),
+        )

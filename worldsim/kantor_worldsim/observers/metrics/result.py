@@ -1,0 +1,201 @@
+"""The result of a run, as `result.json` has it."""
+
+from collections.abc import Sequence
+
+import msgspec
+
+from kantor_protocol.base.machine import ParticipantId
+from kantor_protocol.transport.rate_limit import Excess
+
+
+class Bounds(msgspec.Struct, frozen=True):
+    """The three readings of W_UB, see the module."""
+
+    paper: float
+    tight: float | None
+    final_instant: float
+
+
+class BytesPerRobotTick(msgspec.Struct, frozen=True):
+    """What a robot puts on the bus in one step, payload only."""
+
+    weights: float
+    """On its weights key."""
+    total: float
+    """Weights and all radio bodies."""
+
+
+class ByRegions(msgspec.Struct, frozen=True):
+    """A variance over so many regions of the map (Puig, Garcia, Wu, section 4)."""
+
+    r2: float
+    r4: float
+    r8: float
+    r16: float
+    r32: float
+    r64: float
+
+
+class MapResult(msgspec.Struct, frozen=True, kw_only=True):
+    """What came of exploring a map. Only cells that can ever be seen count; ticks are periods."""
+
+    explored: float
+    """Share of them that somebody has seen."""
+    completed_tick: int | None
+    """When no reachable free cell that somebody had seen had an unknown neighbour any more, or null."""
+    t95_tick: int | None
+    """When that share was seen by somebody."""
+    t99_tick: int | None
+    all_t99_tick: int | None
+    """When every robot knew of that share, by itself or from others."""
+    distance_m: float
+    """Driven by all robots."""
+    longest_m: float
+    """By one of them, at most."""
+    overlap: float
+    """What robots have seen themselves, summed, over what somebody has seen; minus 1."""
+    bumps: int
+    """Moves that ended at a wall."""
+    switches: int
+    """Goals given up, a sensor range or farther from the new one, before the robot had come within a cell."""
+    stall_ticks: int
+    """The longest that a robot stood still that had not finished."""
+    log_bytes_per_robot_tick: float
+    """Map traffic: what a robot sends of logs in a step."""
+    wtv_final: ByRegions
+    """Eq. 10, squared ticks: variance of the regions' mean time at which a cell was first seen."""
+    wtv_mean: ByRegions
+    """Eq. 9, the same with unseen cells counted as seen when the closest robot could be there, over time."""
+    epv_final: ByRegions
+    """Variance of the regions' explored share, squared percent."""
+    epv_mean: ByRegions
+
+
+class FaultCounts(msgspec.Struct, frozen=True, kw_only=True):
+    """What one fault of the scenario did; all 0 says that it never struck.
+
+    A fault of links counts copies of messages, one of processes how often it did what.
+    """
+
+    dropped: int = 0
+    """For receivers that the radio alone would have let hear; one that several faults drop counts for each."""
+    delayed: int = 0
+    doubled: int = 0
+    replayed: int = 0
+    forged: int = 0
+    """Nobody sent them."""
+    killed: int = 0
+    started: int = 0
+    """Late joiners too."""
+    paused: int = 0
+    resumed: int = 0
+    filled: int = 0
+    """Disks."""
+    freed: int = 0
+    slowed: int = 0
+    quickened: int = 0
+    skewed: int = 0
+    """Clocks."""
+    righted: int = 0
+    refused: int = 0
+    """Impostors."""
+    let_in: int = 0
+
+
+LINK_COUNTERS = ("dropped", "delayed", "doubled", "replayed", "forged")
+
+
+PROCESS_COUNTERS = {
+    "kill": "killed",
+    "start": "started",
+    "pause": "paused",
+    "resume": "resumed",
+    "fill": "filled",
+    "free": "freed",
+    "slow": "slowed",
+    "quicken": "quickened",
+    "skew": "skewed",
+    "right": "righted",
+    "pretend": "refused",
+    "let in": "let_in",
+}
+"""What a fault is counted for by what it did, see `outages.Deed`."""
+
+
+class Rejoining(msgspec.Struct, frozen=True, kw_only=True):
+    """How long participants that had started again took to their first step, in simulated seconds."""
+
+    count: int
+    median_s: float
+    p99_s: float
+    max_s: float
+
+    @classmethod
+    def of(cls, times_ns: Sequence[int]) -> "Rejoining | None":
+        """Of so many times, if there are any. A quantile is one of them."""
+        if not times_ns:
+            return None
+        times_s = [time_ns * 1e-9 for time_ns in sorted(times_ns)]
+        last = len(times_s) - 1
+        return cls(
+            count=len(times_s),
+            median_s=times_s[-(-last // 2)],
+            p99_s=times_s[-(-99 * last // 100)],
+            max_s=times_s[-1],
+        )
+
+
+class Result(msgspec.Struct, frozen=True, kw_only=True):
+    """result.json. The names are stable."""
+
+    scenario: str
+    seed: int
+    exchange: str
+    clock: str
+    planner: str
+    merge: str
+    claims: bool
+    robots: int
+    ticks: int
+    finished_tick: int | None
+    """The step at which the last robot saw no weight left, or no frontier to go to, or null."""
+    first_contact_tick: int | None
+    """The step in which a robot first took in another's message, or null."""
+    detected: int
+    targets: int
+    detection_rate: float | None
+    w_ub_start: float
+    w_ub: Bounds
+    w1_exact: float | None
+    energy_spent: int
+    energy_total: int
+    mass_left: float
+    mass_double_counted: float
+    bytes_per_robot_tick: BytesPerRobotTick
+    deliveries: int
+    drops: int
+    out_of_range_refused: int
+    messages_refused: int
+    absences: int
+    ended: str
+    record: str
+    """`whole`, or why it was cut."""
+    violations: int
+    complaints: tuple[str, ...]
+    """What the checker found, at most the first ten."""
+    digest: str
+    wall_s: float
+    faults: dict[str, FaultCounts] = {}
+    """By place in the scenario's list and kind, such as `0 partition`."""
+    restarts: int = 0
+    """How often a participant, or world-sim, that had been killed or had left was there again."""
+    incarnations: int = 0
+    """New ones: robots, or the supervisor, that came back and had forgotten what others had of them."""
+    rejoin_s: Rejoining | None = None
+    """In real seconds on the wall at speed 1; turn by turn to the next step that is due."""
+    map: MapResult | None = None
+    """Of a mission that explores a map; bounds, energy and mass then say nothing but mass_left, the share
+    of cells that nobody has seen."""
+    excess: dict[ParticipantId, Excess] = {}
+    """Who flooded the bus, and how much of it was not taken in since it was beyond its quota. It counts for no
+    other figure."""

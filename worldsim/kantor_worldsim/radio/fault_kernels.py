@@ -1,0 +1,566 @@
+"""The link faults of a scenario as a table, and the kernels that rule by it.
+
+Every fault is a rule. Of a copy of an envelope, on a link, at the time of sending, it says pass, deliver
+later, or drop; some also send more copies, or shorten the range. What several rules say is joined: a drop
+wins, delays add up, and of several that hold a copy the longest counts. So their order does not matter.
+
+Every draw is keyed by (seed, purpose, link, sequence, fault and copy), or by a slot of time, and not by
+what happened before: one more message changes no other draw, and faults that are appended to a list
+leave those before them as they were.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kantor_protocol.base.counter_rng import Purpose, uniform
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.links import (
+    COPIES_MAX,
+    Bandwidth,
+    Burst,
+    Clog,
+    Delay,
+    Drop,
+    Duplicate,
+    Hostile,
+    OneWay,
+    OnLinks,
+    Partition,
+    Range,
+    Reorder,
+    Replay,
+)
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.radio.channel import DROPPED, Field, hears, link_of
+
+NEVER_NS = 2**62
+"""Later than any mission; whatever is due then does not arrive."""
+_SLOTS_IN_A_STATE = 10
+"""Of a burst: slots in the shorter of its mean times."""
+_FLAP_SHARE = 0.5
+
+# The last word of a draw's counter: which fault, and which of the copies that it may meet.
+FAULT_SHIFT = 16
+_FIRST_EXTRA = 2  # the radio itself makes one copy, or two
+_FORGED = 1 << 14
+_REPLAYED = 1 << 15
+
+# Kinds of rules: those that may drop a copy, those that may delay one, and the others.
+_DROP, _BURST, _ONE_WAY, _PARTITION, _DELAY, _REORDER = 0, 1, 2, 3, 4, 5
+_CLOG, _BANDWIDTH, _RANGE, _DUPLICATE, _REPLAY, _HOSTILE = 6, 7, 8, 9, 10, 11
+
+# Columns of Table.rules.
+_KIND, FAULT, _FROM_NS, _UNTIL_NS, _AT, _SPAN_NS, _COPIES = 0, 1, 2, 3, 4, 5, 6
+_RULE_COLUMNS = 7
+"""AT: of a cut its row in severed, of a queue its column in what is said of envelopes. SPAN_NS: slots of
+a burst or of a cut that flaps, age of what is replayed."""
+
+# Columns of Table.numbers, by kind.
+_PROBABILITY = 0  # drop, duplicate, reorder, replay, hostile
+_DROP_GOOD, _DROP_BAD, _TO_BAD, _TO_GOOD = 0, 1, 2, 3  # burst
+_DELAY_S, _JITTER_S = 0, 1  # delay
+_LATER_S = 1  # duplicate, reorder
+_SHARE = 0  # partition
+_RANGE_M, _FACTOR = 0, 1  # range; a negative range_m is none
+_NUMBER_COLUMNS = 4
+
+# Columns of what is counted, in the order of `Toll`.
+_DROPPED, _DELAYED, _DOUBLED, _REPLAYS, _FORGERIES = 0, 1, 2, 3, 4
+
+# Columns of what comes beside a message.
+_FIRST, _RULE, _LATEST_NS, ON_AIR = 0, 1, 2, 3
+
+
+class FaultTable(NamedTuple):
+    """The link faults of a scenario for kernels. n faults, p participants."""
+
+    seed: int
+    rules: npt.NDArray[np.int64]
+    """(n, 7): kind, place in the scenario's list, window, span, place of what it has elsewhere, copies."""
+    numbers: npt.NDArray[np.float64]
+    """(n, 4), by kind."""
+    named: npt.NDArray[np.uint8]
+    """(n, p): whether a fault is about the links of a participant."""
+    severed: npt.NDArray[np.uint8]
+    """(cuts, p, p): whether a cut, while it is there, severs the link from one to another."""
+
+
+class _Hop(NamedTuple):
+    """A copy of an envelope on its way over a link."""
+
+    now_ns: int
+    source: int
+    target: int
+    link: int
+    sequence: int
+    copy: int
+
+
+@kernel
+def in_burst(seed: int, link: int, index: int, slot: int, to_bad: float, to_good: float) -> bool:
+    """Whether a link is bad in a slot, which it is not in slot 0. to_bad + to_good is at most 1.
+
+    A draw below to_bad makes a link bad in whatever state it was, one from 1 - to_good on makes it good,
+    and any other leaves it. So the last draw that decides is all that needs to be looked for.
+    """
+    while slot > 0:
+        draw = uniform(seed, Purpose.FAULT_BURST.value, link, slot, index)
+        if draw < to_bad:
+            return True
+        if draw >= 1.0 - to_good:
+            return False
+        slot -= 1
+    return False
+
+
+@kernel
+def _about(table: FaultTable, rule: int, now_ns: int, source: int, target: int) -> bool:
+    """Whether a fault's window is open and the link is one of its own."""
+    row = table.rules[rule]
+    if not row[_FROM_NS] <= now_ns < row[_UNTIL_NS]:
+        return False
+    return table.named[rule, source] != 0 or table.named[rule, target] != 0
+
+
+@kernel
+def _draw(table: FaultTable, rule: int, purpose: int, hop: _Hop, copy: int) -> float:
+    index = table.rules[rule, FAULT] << FAULT_SHIFT | copy
+    return uniform(table.seed, purpose, hop.link, hop.sequence, index)
+
+
+@kernel
+def _cuts(table: FaultTable, rule: int, now_ns: int, source: int, target: int) -> bool:
+    """Whether a cut whose window is open severs a link."""
+    row = table.rules[rule]
+    if table.severed[row[_AT], source, target] == 0:
+        return False
+    if row[_SPAN_NS] == 0:
+        return True
+    index, slot = row[FAULT] << FAULT_SHIFT, now_ns // row[_SPAN_NS]
+    draw = uniform(table.seed, Purpose.FAULT_FLAP.value, 0, slot, index)
+    return draw < table.numbers[rule, _SHARE]
+
+
+@kernel
+def _is_in(table: FaultTable, source: int, target: int) -> bool:
+    count = table.named.shape[1]
+    return 0 <= source < count and 0 <= target < count
+
+
+@kernel
+def severs(table: FaultTable, now_ns: int, source: int, target: int) -> bool:
+    """Whether nothing that is sent now gets from one place in the roster to another, however near."""
+    if _is_in(table, source, target):
+        for rule in range(table.rules.shape[0]):
+            kind = table.rules[rule, _KIND]
+            if (
+                kind in (_ONE_WAY, _PARTITION)
+                and _about(table, rule, now_ns, source, target)
+                and _cuts(table, rule, now_ns, source, target)
+            ):
+                return True
+    return False
+
+
+@kernel
+def _reach_m(table: FaultTable, rule: int, whole_m: float) -> float:
+    """What one fault leaves of a range."""
+    range_m = table.numbers[rule, _RANGE_M]
+    return min(whole_m, range_m) if range_m >= 0.0 else whole_m * table.numbers[rule, _FACTOR]
+
+
+@kernel
+def reach_m(table: FaultTable, now_ns: int, source: int, target: int, whole_m: float) -> float:
+    """What is left now of the range of a link between places in the roster, before walls."""
+    least_m = whole_m
+    if _is_in(table, source, target):
+        for rule in range(table.rules.shape[0]):
+            if table.rules[rule, _KIND] == _RANGE and _about(table, rule, now_ns, source, target):
+                least_m = min(least_m, _reach_m(table, rule, whole_m))
+    return least_m
+
+
+@kernel
+def _is_lost(
+    table: FaultTable,
+    field: Field,
+    hop: _Hop,
+    robots_m: float,
+    supervisors_m: float,
+    struck: np.ndarray,
+) -> bool:
+    """Whether a receiver is beyond what faults leave of the range; each that does so is counted."""
+    lost = False
+    by_supervisor = field.supervisor in (hop.source, hop.target)
+    whole_m = supervisors_m if by_supervisor else robots_m
+    for rule in range(table.rules.shape[0]):
+        if table.rules[rule, _KIND] != _RANGE:
+            continue
+        if not _about(table, rule, hop.now_ns, hop.source, hop.target):
+            continue
+        if not hears(field, hop.source, hop.target, _reach_m(table, rule, whole_m)):
+            struck[rule, _DROPPED] += 1
+            lost = True
+    return lost
+
+
+@kernel
+def _drops(table: FaultTable, rule: int, hop: _Hop, queued: np.ndarray) -> bool:
+    """Whether a fault drops a copy. queued: of its envelope, see `rule_on`."""
+    row, numbers = table.rules[rule], table.numbers[rule]
+    kind = row[_KIND]
+    if kind == _BANDWIDTH:
+        return queued[row[_AT]] < 0
+    if kind > _PARTITION or not _about(table, rule, hop.now_ns, hop.source, hop.target):
+        return False
+    if kind in (_ONE_WAY, _PARTITION):
+        return _cuts(table, rule, hop.now_ns, hop.source, hop.target)
+    probability = numbers[_PROBABILITY]
+    if kind == _BURST:
+        index, slot = row[FAULT] << FAULT_SHIFT, hop.now_ns // row[_SPAN_NS]
+        bad = in_burst(table.seed, hop.link, index, slot, numbers[_TO_BAD], numbers[_TO_GOOD])
+        probability = numbers[_DROP_BAD] if bad else numbers[_DROP_GOOD]
+    return _draw(table, rule, Purpose.FAULT_DROP.value, hop, hop.copy) < probability
+
+
+@kernel
+def _delays(table: FaultTable, rule: int, hop: _Hop, queued: np.ndarray) -> tuple[int, int]:
+    """How much later a fault has a copy arrive, and before when it does not."""
+    row, numbers = table.rules[rule], table.numbers[rule]
+    kind = row[_KIND]
+    if kind == _BANDWIDTH:
+        return queued[row[_AT]], 0
+    if not _DELAY <= kind <= _CLOG or not _about(table, rule, hop.now_ns, hop.source, hop.target):
+        return 0, 0
+    if kind == _CLOG:
+        return 0, row[_UNTIL_NS]
+    if kind == _DELAY:
+        delay_s = numbers[_DELAY_S]
+        if numbers[_JITTER_S] > 0.0:
+            draw = _draw(table, rule, Purpose.FAULT_DELAY.value, hop, hop.copy)
+            delay_s += draw * numbers[_JITTER_S]
+        return round(delay_s * 1e9), 0
+    draw = _draw(table, rule, Purpose.FAULT_REORDER.value, hop, hop.copy)
+    share = draw / numbers[_PROBABILITY]
+    return (round(share * numbers[_LATER_S] * 1e9) if share < 1.0 else 0), 0
+
+
+@kernel
+def _judge(
+    table: FaultTable, hop: _Hop, due_ns: int, queued: np.ndarray, struck: np.ndarray
+) -> int:
+    """When a copy arrives that the radio has due then, or DROPPED."""
+    if due_ns == DROPPED:
+        return DROPPED
+    dropped = False
+    for rule in range(table.rules.shape[0]):
+        if _drops(table, rule, hop, queued):
+            struck[rule, _DROPPED] += 1
+            dropped = True
+    if dropped:
+        return DROPPED
+    later_ns, not_before_ns = 0, 0
+    for rule in range(table.rules.shape[0]):
+        delay_ns, held_ns = _delays(table, rule, hop, queued)
+        if delay_ns > 0 or held_ns > due_ns:
+            struck[rule, _DELAYED] += 1
+        later_ns += min(delay_ns, NEVER_NS - later_ns)
+        not_before_ns = max(not_before_ns, held_ns)
+    return max(due_ns + min(later_ns, NEVER_NS - due_ns), not_before_ns)
+
+
+@kernel
+def _hop_of(sent: np.ndarray, ruled: np.ndarray, first: int, supervisor: int) -> _Hop:
+    target, row = ruled[first, 0], ruled[first, 1]
+    source = sent[row, 1]
+    return _Hop(sent[row, 0], source, target, link_of(source, target, supervisor), sent[row, 2], 0)
+
+
+@kernel
+def _with(hop: _Hop, copy: int) -> _Hop:
+    return _Hop(hop.now_ns, hop.source, hop.target, hop.link, hop.sequence, copy)
+
+
+@kernel
+def _end_of(ruled: np.ndarray, count: int, first: int) -> int:
+    """The row behind the radio's verdicts on one envelope for one receiver."""
+    end = first + 1
+    while end < count and ruled[end, 0] == ruled[first, 0] and ruled[end, 1] == ruled[first, 1]:
+        end += 1
+    return end
+
+
+@kernel
+def _arrival(ruled: np.ndarray, first: int, end: int) -> int:
+    """When the first copy arrives that the radio itself does not drop; DROPPED if there is none."""
+    for row in range(first, end):
+        if ruled[row, 2] != DROPPED:
+            return ruled[row, 2]
+    return DROPPED
+
+
+@kernel
+def _put(out: np.ndarray, made: int, receiver: int, on_air: int, due_ns: int) -> int:
+    if made < out.shape[0]:
+        out[made, 0], out[made, 1], out[made, 2] = receiver, on_air, due_ns
+    return made + 1
+
+
+@kernel
+def _double(
+    table: FaultTable,
+    hop: _Hop,
+    row: int,
+    arrival_ns: int,
+    queued: np.ndarray,
+    struck: np.ndarray,
+    made: int,
+    out: np.ndarray,
+) -> int:
+    """Make more copies of what arrives; how many verdicts there are then."""
+    for rule in range(table.rules.shape[0]):
+        if table.rules[rule, _KIND] != _DUPLICATE:
+            continue
+        if not _about(table, rule, hop.now_ns, hop.source, hop.target):
+            continue
+        draw = _draw(table, rule, Purpose.FAULT_DUPLICATE.value, hop, 0)
+        if draw >= table.numbers[rule, _PROBABILITY]:
+            continue
+        copy = _FIRST_EXTRA + COPIES_MAX * table.rules[rule, FAULT]
+        for _ in range(table.rules[rule, _COPIES]):
+            struck[rule, _DOUBLED] += 1
+            share = _draw(table, rule, Purpose.FAULT_DELAY.value, hop, copy)
+            due_ns = arrival_ns + round(share * table.numbers[rule, _LATER_S] * 1e9)
+            due_ns = _judge(table, _with(hop, copy), due_ns, queued, struck)
+            made = _put(out, made, hop.target, row, due_ns)
+            copy += 1
+    return made
+
+
+@kernel
+def find_beside(
+    seed: int,
+    rules: np.ndarray,
+    numbers: np.ndarray,
+    named: np.ndarray,
+    severed: np.ndarray,
+    left_m: float,
+    bottom_m: float,
+    resolution_m: float,
+    line_of_sight: bool,
+    loss_m: float,
+    cells: np.ndarray,
+    xy_m: np.ndarray,
+    supervisor: int,
+    supervisor_stands: bool,
+    robots_m: float,
+    supervisors_m: float,
+    sent: np.ndarray,
+    ruled: np.ndarray,
+    count: int,
+    struck: np.ndarray,
+    beside: np.ndarray,
+) -> int:
+    """What else comes beside what the radio delivers: an older message, or a forgery. How many there are.
+
+    beside (rows, 4): first verdict on what it comes beside, rule, and how old an older message must be at
+    least, as the time by which it was sent. What finds no room is only counted. struck: room, see `rule_on`.
+    """
+    table = FaultTable(seed, rules, numbers, named, severed)
+    field = Field(
+        left_m,
+        bottom_m,
+        resolution_m,
+        line_of_sight,
+        loss_m,
+        cells,
+        xy_m,
+        supervisor,
+        supervisor_stands,
+    )
+    found = 0
+    end = 0
+    while end < count:
+        first = end
+        end = _end_of(ruled, count, first)
+        hop = _hop_of(sent, ruled, first, supervisor)
+        if _arrival(ruled, first, end) == DROPPED:
+            continue
+        if _is_lost(table, field, hop, robots_m, supervisors_m, struck):
+            continue
+        for rule in range(rules.shape[0]):
+            kind = rules[rule, _KIND]
+            if kind < _REPLAY or not _about(table, rule, hop.now_ns, hop.source, hop.target):
+                continue
+            replays = kind == _REPLAY
+            purpose = Purpose.FAULT_REPLAY.value if replays else Purpose.FAULT_HOSTILE.value
+            if _draw(table, rule, purpose, hop, 0) >= numbers[rule, _PROBABILITY]:
+                continue
+            latest_ns = hop.now_ns
+            if replays:
+                share = 1.0 - _draw(table, rule, Purpose.FAULT_DELAY.value, hop, 0)
+                latest_ns -= max(1, round(share * rules[rule, _SPAN_NS]))
+            if found < beside.shape[0]:
+                row = beside[found]
+                row[_FIRST], row[_RULE], row[_LATEST_NS] = first, rule, latest_ns
+            found += 1
+    return found
+
+
+@kernel
+def rule_on(
+    seed: int,
+    rules: np.ndarray,
+    numbers: np.ndarray,
+    named: np.ndarray,
+    severed: np.ndarray,
+    left_m: float,
+    bottom_m: float,
+    resolution_m: float,
+    line_of_sight: bool,
+    loss_m: float,
+    cells: np.ndarray,
+    xy_m: np.ndarray,
+    supervisor: int,
+    supervisor_stands: bool,
+    robots_m: float,
+    supervisors_m: float,
+    sent: np.ndarray,
+    ruled: np.ndarray,
+    count: int,
+    queued: np.ndarray,
+    beside: np.ndarray,
+    besides: int,
+    struck: np.ndarray,
+    tolls: np.ndarray,
+    out: np.ndarray,
+) -> tuple[int, int]:
+    """Rule on what the radio has ruled. How many verdicts there are, and how many receivers are lost.
+
+    sent, ruled, count: see `Interference`. queued (envelopes, queues): how long each waits in ns, or
+    DROPPED. beside (besides of its rows count): see `find_beside`; with the row on the air of each, or
+    less than 0 where there is none. struck (n, 5): room. tolls (n, 5): what each fault did is added.
+    out: the verdicts; if they do not fit, nothing else has changed.
+    """
+    table = FaultTable(seed, rules, numbers, named, severed)
+    field = Field(
+        left_m,
+        bottom_m,
+        resolution_m,
+        line_of_sight,
+        loss_m,
+        cells,
+        xy_m,
+        supervisor,
+        supervisor_stands,
+    )
+    struck[:] = 0
+    made = 0
+    lost = 0
+    passed = 0
+    end = 0
+    while end < count:
+        first = end
+        end = _end_of(ruled, count, first)
+        hop = _hop_of(sent, ruled, first, supervisor)
+        to, row = ruled[first, 0], ruled[first, 1]
+        if _is_lost(table, field, hop, robots_m, supervisors_m, struck):
+            lost += 1
+            continue
+        for i in range(first, end):
+            due_ns = _judge(table, _with(hop, i - first), ruled[i, 2], queued[row], struck)
+            made = _put(out, made, to, row, due_ns)
+        arrival_ns = _arrival(ruled, first, end)
+        if arrival_ns == DROPPED:
+            continue
+        made = _double(table, hop, row, arrival_ns, queued[row], struck, made, out)
+        while passed < besides and beside[passed, _FIRST] == first:
+            rule, on_air = beside[passed, _RULE], beside[passed, ON_AIR]
+            passed += 1
+            if on_air >= 0:
+                replays = rules[rule, _KIND] == _REPLAY
+                struck[rule, _REPLAYS if replays else _FORGERIES] += 1
+                copy = (_REPLAYED if replays else _FORGED) + rules[rule, FAULT]
+                due_ns = _judge(table, _with(hop, copy), arrival_ns, queued[row], struck)
+                made = _put(out, made, to, on_air, due_ns)
+    if made <= out.shape[0]:
+        for rule in range(rules.shape[0]):
+            for deed in range(struck.shape[1]):
+                tolls[rule, deed] += struck[rule, deed]
+    return made, lost
+
+
+def until_ns(fault: Fault) -> int:
+    """When it is over, or later than anything happens."""
+    return NEVER_NS if fault.until_ns is None else fault.until_ns
+
+
+class _Row(NamedTuple):
+    """What a table says of a fault by its kind."""
+
+    kind: int
+    numbers: tuple[float, ...] = ()
+    span_ns: int = 0
+    copies: int = 0
+
+
+def _burst(fault: Burst) -> _Row:
+    slot_s = min(fault.good_s, fault.bad_s) / _SLOTS_IN_A_STATE
+    chances = slot_s / fault.good_s, slot_s / fault.bad_s
+    return _Row(_BURST, (fault.drop_good, fault.drop_bad, *chances), round(slot_s * 1e9))
+
+
+def _range(fault: Range) -> _Row:
+    return _Row(_RANGE, (-1.0 if fault.range_m is None else fault.range_m, fault.factor or 0.0))
+
+
+def _partition(fault: Partition) -> _Row:
+    share = fault.flap_share or _FLAP_SHARE
+    return _Row(_PARTITION, (share,), round((fault.flap_s or 0.0) * 1e9))
+
+
+KINDS: dict[type[Fault], Callable[[Any], _Row]] = {
+    Drop: lambda fault: _Row(_DROP, (fault.probability,)),
+    Burst: _burst,
+    OneWay: lambda _: _Row(_ONE_WAY),
+    Partition: _partition,
+    Delay: lambda fault: _Row(_DELAY, (fault.delay_s, fault.jitter_s)),
+    Reorder: lambda fault: _Row(_REORDER, (fault.probability, fault.hold_s)),
+    Clog: lambda _: _Row(_CLOG),
+    Bandwidth: lambda _: _Row(_BANDWIDTH),
+    Range: _range,
+    Duplicate: lambda fault: _Row(
+        _DUPLICATE, (fault.probability, fault.delay_s), copies=fault.copies
+    ),
+    Replay: lambda fault: _Row(_REPLAY, (fault.probability,), round(fault.age_s * 1e9)),
+    Hostile: lambda fault: _Row(_HOSTILE, (fault.probability,)),
+}
+
+
+def table_of(scenario: Scenario, seed: int) -> FaultTable:
+    """The link faults of a scenario, in the order of its list."""
+    roster = scenario.roster
+    faults = [(i, fault) for i, fault in enumerate(scenario.faults) if type(fault) in KINDS]
+    rules = np.zeros((len(faults), _RULE_COLUMNS), dtype=np.int64)
+    numbers = np.zeros((len(faults), _NUMBER_COLUMNS))
+    named = np.ones((len(faults), len(roster)), dtype=np.uint8)
+    severed: list[list[list[bool]]] = []
+    queues = 0
+    for rule, (place, fault) in enumerate(faults):
+        row, at = KINDS[type(fault)](fault), 0
+        if isinstance(fault, OneWay | Partition):
+            at, cuts = len(severed), fault.severs(roster)
+            severed.append([[cuts(one, other) for other in roster] for one in roster])
+        elif isinstance(fault, Bandwidth):
+            at, queues = queues, queues + 1
+        elif isinstance(fault, OnLinks) and fault.robots:
+            named[rule] = [name in fault.robots for name in roster]
+        window_ns = fault.from_ns, until_ns(fault)
+        rules[rule] = row.kind, place, *window_ns, at, row.span_ns, row.copies
+        numbers[rule, : len(row.numbers)] = row.numbers
+    shape = len(severed), len(roster), len(roster)
+    return FaultTable(seed, rules, numbers, named, np.array(severed, dtype=np.uint8).reshape(shape))

@@ -1,0 +1,547 @@
+"""Batches as referees read them: tables of numbers, taken in one compiled pass from the record's bytes.
+
+Metrics and checker follow every act of a run. Walking its Structs in Python costs more than the robots
+do; the encoded record, which the journal needs anyway, holds the same and is read in a microsecond.
+Whoever needs a text (a complaint, a name) still has the record itself.
+
+The kernels here are total: whatever the bytes, they stay inside them and inside the tables.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kantor_protocol.base.incarnations import EPOCHS_MAX
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.machine import SUPERVISOR
+from kantor_protocol.base.varint import take_int, take_uint
+from kantor_protocol.wire.messages import BODY_BYTES_MAX, VERSION, GossipMessage
+from kantor_protocol.wire.weights import WeightsMessage
+from kantor_worldsim.record.records import Batch, Opening, Record, encode_record
+
+NOT_DECODED = -1
+"""Instead of a count: packed pairs that are malformed."""
+
+EVERYBODY_PLACE = -1
+STRANGER = -2
+"""The place of a name that is not in the roster."""
+
+# Columns of Reading.acts. Ranges of other tables are a first row and a count.
+PLACE, NOW_NS, PRESENT, STEP, ENERGY, STATE, REFUSED = 0, 1, 2, 3, 4, 5, 6
+FINDS, VIOLATIONS, VOID, WEIGHTS_BYTES, BODY_BYTES = 7, 8, 9, 10, 11
+HEARD, HEARD_COUNT, SENT, SENT_COUNT = 12, 13, 14, 15
+SPENT, SPENT_COUNT, LOWERED, LOWERED_COUNT = 16, 17, 18, 19
+HEADS, WEIGHTS = 20, 21
+OBSERVED, SKEW_NS, TOO_FAST = 22, 23, 24
+_ACT_COLUMNS = 25
+"""PRESENT: it has outputs and a ruling; all columns from STEP on hold only then, but for HEARD, OBSERVED and
+SKEW_NS. OBSERVED: the step in the observation that it was given. TOO_FAST: 1 + which of the violations
+is of its speed, or 0.
+VOID: the world refused the step, its energy or its units, so that nothing was shipped. HEADS: it has a
+goal. WEIGHTS: where what it publishes begins in the payload."""
+
+# Columns of Reading.heard, Reading.sent, Reading.injected and Reading.verdicts.
+SOURCE, SEQUENCE, TARGET, DUE_NS = 0, 1, 2, 3
+BODY, BODY_END = 3, 4
+
+# Columns of Reading.pairs.
+SAMPLE, UNITS = 0, 1
+
+# Slots of Reading.sizes: rows of acts, verdicts, heard, sent, pairs and injected.
+ACTS, VERDICTS, ALL_HEARD, ALL_SENT, PAIRS, INJECTED = 0, 1, 2, 3, 4, 5
+
+
+class ColumnarBatch(NamedTuple):
+    """One batch in tables; names are places in the roster. Valid until the next one is read."""
+
+    payload: bytes
+    """The encoded record."""
+    sizes: npt.NDArray[np.int64]
+    """(6,): how many rows of each table count."""
+    acts: npt.NDArray[np.int64]
+    """(rows, 25)"""
+    poses_m: npt.NDArray[np.float64]
+    """(rows, 4): x and y of each ruling and of each goal, world frame."""
+    heard: npt.NDArray[np.int64]
+    """(rows, 2): source, sequence."""
+    sent: npt.NDArray[np.int64]
+    """(rows, 5): source, sequence, target, where the body begins and ends in the payload."""
+    verdicts: npt.NDArray[np.int64]
+    """(rows, 4): source, sequence, target, due_ns."""
+    pairs: npt.NDArray[np.int64]
+    """(rows, 2): sample, units."""
+    injected: npt.NDArray[np.int64]
+    """(rows, 5): like sent; what nobody sent."""
+
+
+# Msgpack. Kinds of a value by what its head says; SIMPLE: nil and truth values.
+SIMPLE, NUMBER, FLOAT, SINGLE, TEXT, BYTES, EXTENSION, ARRAY, MAP = 0, 1, 2, 3, 4, 5, 6, 7, 8
+_MALFORMED = -1
+_ANY = 1 << 32
+
+
+@kernel
+def _big_endian(payload: bytes, at: int, size: int) -> int:
+    value = 0
+    for i in range(at, at + size):
+        value = value << 8 | int(payload[i])
+    return value
+
+
+@kernel
+def head_of(payload: bytes, at: int) -> tuple[int, int, int]:
+    """(kind, value, position after it) of what begins at `at`; the position is negative if malformed.
+
+    The value is a number, the bits of a float, the bytes of a content or the items of an array or map.
+    A content stands at the position after the head and ends within the payload.
+    """
+    size = len(payload)
+    if at < 0 or at >= size:
+        return SIMPLE, 0, _MALFORMED
+    first = int(payload[at])
+    at += 1
+    if first < 0x80:
+        return NUMBER, first, at
+    if first >= 0xE0:
+        return NUMBER, first - 256, at
+    kind = _KINDS[first - 0x80]
+    if first < 0xC0:
+        value = first & (31 if first >= 0xA0 else 15)
+    elif 0xD4 <= first <= 0xD8:
+        value = 1 + (1 << (first - 0xD4))
+    else:
+        width = _WIDTHS[first - 0xC0]
+        if at + width > size:
+            return SIMPLE, 0, _MALFORMED
+        value = _big_endian(payload, at, width)
+        at += width
+        if 0xD0 <= first <= 0xD2:  # a signed number of less than 64 bits
+            value -= (value >> (8 * width - 1)) << (8 * width)
+        elif kind == EXTENSION:
+            value += 1  # its type
+    if kind in (TEXT, BYTES, EXTENSION) and at + value > size:
+        return SIMPLE, 0, _MALFORMED
+    return kind, value, at
+
+
+_WIDTHS = np.array([0, 0, 0, 0, 1, 2, 4, 1, 2, 4, 4, 8, 1, 2, 4, 8, 1, 2, 4, 8, 0, 0, 0, 0, 0,
+                    1, 2, 4, 2, 4, 2, 4])  # fmt: skip
+"""Bytes of the number after a first byte of 0xc0 … 0xdf."""
+_KINDS = np.repeat(
+    [
+        MAP,
+        ARRAY,
+        TEXT,
+        SIMPLE,
+        BYTES,
+        EXTENSION,
+        SINGLE,
+        FLOAT,
+        NUMBER,
+        EXTENSION,
+        TEXT,
+        ARRAY,
+        MAP,
+    ],
+    [16, 16, 32, 4, 3, 3, 1, 1, 8, 5, 3, 2, 2],
+)
+"""Kind by a first byte of 0x80 … 0xdf."""
+
+
+@kernel
+def skip(payload: bytes, at: int, values: int) -> int:
+    """The position after so many values, or a negative one."""
+    while values > 0 and at >= 0:
+        kind, size, at = head_of(payload, at)
+        values -= 1
+        if kind in (TEXT, BYTES, EXTENSION):
+            at += size
+        elif kind == ARRAY:
+            values += size
+        elif kind == MAP:
+            values += 2 * size
+    return at
+
+
+@kernel
+def _number(payload: bytes, at: int) -> tuple[int, int]:
+    kind, value, at = head_of(payload, at)
+    return value, at if kind == NUMBER else _MALFORMED
+
+
+@kernel
+def _array(payload: bytes, at: int, room: int) -> tuple[int, int]:
+    """(items, position of the first) of an array of at most `room` items; otherwise (0, malformed)."""
+    kind, items, at = head_of(payload, at)
+    if kind != ARRAY or at < 0 or items > room:
+        return 0, _MALFORMED
+    return items, at
+
+
+class BatchColumns(NamedTuple):
+    """What a batch is read into, for the kernels; see Reading."""
+
+    payload: bytes
+    sizes: npt.NDArray[np.int64]
+    acts: npt.NDArray[np.int64]
+    poses_m: npt.NDArray[np.float64]
+    heard: npt.NDArray[np.int64]
+    sent: npt.NDArray[np.int64]
+    verdicts: npt.NDArray[np.int64]
+    pairs: npt.NDArray[np.int64]
+    injected: npt.NDArray[np.int64]
+    pose_bits: npt.NDArray[np.int64]
+    """The memory of poses_m as integers."""
+    robots: int
+    supervisor: int
+    """Its place, or STRANGER if there is none."""
+
+
+@kernel
+def _read_metres(tables: BatchColumns, row: int, axis: int, at: int) -> int:
+    kind, value, at = head_of(tables.payload, at)
+    if kind == NUMBER:
+        tables.poses_m[row, axis] = float(value)
+    else:
+        tables.pose_bits[row, axis] = value
+    return at if kind in (NUMBER, FLOAT) else _MALFORMED
+
+
+_NEWS_TAG = GossipMessage.__struct_config__.tag
+_WEIGHTS_TAG = WeightsMessage.__struct_config__.tag
+_SUPERVISOR_TEXT = np.frombuffer(SUPERVISOR.encode(), dtype=np.uint8)
+_REFUSALS = tuple(np.frombuffer(text, dtype=np.uint8) for text in (b"step", b"energy", b"units"))
+_SPEED = np.frombuffer(b"speed", dtype=np.uint8)
+
+
+@kernel
+def _reads(payload: bytes, at: int, size: int, text: np.ndarray) -> bool:
+    same = size == text.shape[0]
+    for i in range(text.shape[0] if same else 0):
+        same = same and payload[at + i] == text[i]
+    return same
+
+
+@kernel
+def _place(tables: BatchColumns, at: int) -> tuple[int, int]:
+    """Place in the roster of the name at `at`, see `Scenario.roster`, and the position after it."""
+    payload = tables.payload
+    kind, size, at = head_of(payload, at)
+    if kind != TEXT or at < 0:
+        return STRANGER, _MALFORMED
+    after = at + size
+    if size == 0:
+        return EVERYBODY_PLACE, after
+    if _reads(payload, at, size, _SUPERVISOR_TEXT):
+        return tables.supervisor, after
+    if payload[at] != 114 or size > 5:  # r1, r2, …
+        return STRANGER, after
+    number = 0
+    for i in range(at + 1, after):
+        digit = int(payload[i]) - 48
+        if not 0 <= digit <= 9 or (number == 0 and digit == 0):
+            return STRANGER, after
+        number = 10 * number + digit
+    return (number - 1 if 1 <= number <= tables.robots else STRANGER), after
+
+
+@kernel
+def _read_pairs(tables: BatchColumns, at: int, bound: int) -> tuple[int, int]:
+    """Read a field of packed pairs: (count or NOT_DECODED, position after it)."""
+    kind, size, at = head_of(tables.payload, at)
+    if kind != BYTES:
+        return NOT_DECODED, _MALFORMED
+    end = at + size
+    row, sample = tables.sizes[PAIRS], 0
+    while at < end:
+        step, at = take_int(tables.payload, at)
+        units, at = take_uint(tables.payload, at)
+        sample += step
+        if at < 0 or at > end or sample < 0 or sample >= bound:
+            return NOT_DECODED, end
+        if row >= tables.pairs.shape[0]:
+            return NOT_DECODED, _MALFORMED
+        tables.pairs[row, SAMPLE], tables.pairs[row, UNITS] = sample, units
+        row += 1
+    count = row - tables.sizes[PAIRS]
+    tables.sizes[PAIRS] = row
+    return count, end
+
+
+@kernel
+def _read_heard(tables: BatchColumns, act: np.ndarray, at: int) -> int:
+    act[HEARD] = tables.sizes[ALL_HEARD]
+    act[HEARD_COUNT], at = _array(tables.payload, at, tables.heard.shape[0] - act[HEARD])
+    for row in range(act[HEARD], act[HEARD] + act[HEARD_COUNT]):
+        _, at = _array(tables.payload, at, _ANY)
+        tables.heard[row, SOURCE], at = _place(tables, at)
+        tables.heard[row, SEQUENCE], at = _number(tables.payload, at)
+    tables.sizes[ALL_HEARD] += act[HEARD_COUNT]
+    return at
+
+
+@kernel
+def _read_envelope(tables: BatchColumns, row: np.ndarray, at: int) -> int:
+    _, at = _array(tables.payload, at, _ANY)
+    row[SOURCE], at = _place(tables, at)
+    row[SEQUENCE], at = _number(tables.payload, at)
+    row[TARGET], at = _place(tables, at)
+    kind, size, at = head_of(tables.payload, at)
+    if kind != BYTES or at < 0:
+        return _MALFORMED
+    row[BODY], row[BODY_END] = at, at + size
+    return at + size
+
+
+@kernel
+def _read_outbox(tables: BatchColumns, act: np.ndarray, at: int) -> int:
+    act[SENT] = tables.sizes[ALL_SENT]
+    act[BODY_BYTES] = 0
+    act[SENT_COUNT], at = _array(tables.payload, at, tables.sent.shape[0] - act[SENT])
+    for row in range(act[SENT], act[SENT] + act[SENT_COUNT]):
+        at = _read_envelope(tables, tables.sent[row], at)
+        act[BODY_BYTES] += tables.sent[row, BODY_END] - tables.sent[row, BODY]
+    tables.sizes[ALL_SENT] += act[SENT_COUNT]
+    return at
+
+
+@kernel
+def _read_goal(tables: BatchColumns, act: np.ndarray, row: int, at: int) -> int:
+    kind, numbers, after = head_of(tables.payload, at)
+    act[HEADS] = kind == ARRAY
+    if kind != ARRAY:
+        return after
+    if numbers != 2:
+        return _MALFORMED
+    at = _read_metres(tables, row, 2, after)
+    return _read_metres(tables, row, 3, at)
+
+
+@kernel
+def _read_outputs(tables: BatchColumns, act: np.ndarray, row: int, at: int, samples: int) -> int:
+    kind, fields, at = head_of(tables.payload, at)
+    act[PRESENT] = kind == ARRAY
+    act[SENT_COUNT] = 0
+    if kind != ARRAY:
+        return at
+    act[STEP], at = _number(tables.payload, at)
+    at = skip(tables.payload, at, 1)  # pose
+    at = _read_goal(tables, act, row, at)
+    act[SPENT] = tables.sizes[PAIRS]
+    act[SPENT_COUNT], at = _read_pairs(tables, at, samples)
+    act[LOWERED] = tables.sizes[PAIRS]
+    act[LOWERED_COUNT], at = _read_pairs(tables, at, samples)
+    _, act[WEIGHTS_BYTES], act[WEIGHTS] = head_of(tables.payload, at)
+    at = _read_outbox(tables, act, act[WEIGHTS] + act[WEIGHTS_BYTES])
+    act[ENERGY], at = _number(tables.payload, at)
+    act[STATE], at = _number(tables.payload, at)
+    act[REFUSED], at = _number(tables.payload, at)
+    return skip(tables.payload, at, fields - 10)
+
+
+@kernel
+def _read_ruling(tables: BatchColumns, act: np.ndarray, row: int, at: int) -> int:
+    kind, fields, at = head_of(tables.payload, at)
+    act[PRESENT] &= kind == ARRAY
+    if kind != ARRAY:
+        return at
+    numbers, at = _array(tables.payload, at, _ANY)
+    at = _read_metres(tables, row, 0, at)
+    at = _read_metres(tables, row, 1, at)
+    at = skip(tables.payload, at, numbers - 2)
+    act[FINDS], at = _array(tables.payload, at, _ANY)
+    at = skip(tables.payload, at, act[FINDS])
+    act[VIOLATIONS], at = _array(tables.payload, at, _ANY)
+    act[VOID] = act[TOO_FAST] = 0
+    for item in range(act[VIOLATIONS]):
+        kind, size, at = head_of(tables.payload, at)
+        if kind != TEXT:
+            return _MALFORMED
+        for text in _REFUSALS:
+            act[VOID] |= _reads(tables.payload, at, size, text)
+        if _reads(tables.payload, at, size, _SPEED):
+            act[TOO_FAST] = item + 1
+        at += size
+    return skip(tables.payload, at, fields - 3)
+
+
+@kernel
+def _read_batch(
+    payload: bytes,
+    sizes: np.ndarray,
+    acts: np.ndarray,
+    poses_m: np.ndarray,
+    heard: np.ndarray,
+    sent: np.ndarray,
+    verdicts: np.ndarray,
+    pairs: np.ndarray,
+    injected: np.ndarray,
+    pose_bits: np.ndarray,
+    robots: int,
+    supervisor: int,
+    samples: int,
+) -> int:
+    """Fill the tables; the position after what is read.
+
+    Negative if this is no batch, or if a table has too few rows for it.
+    """
+    tables = BatchColumns(
+        payload,
+        sizes,
+        acts,
+        poses_m,
+        heard,
+        sent,
+        verdicts,
+        pairs,
+        injected,
+        pose_bits,
+        robots,
+        supervisor,
+    )
+    sizes[:] = 0
+    parts, at = _array(payload, 0, _ANY)
+    at = skip(payload, at, 2)  # tag, now_ns
+    sizes[ACTS], at = _array(payload, at, acts.shape[0])
+    for i in range(sizes[ACTS]):
+        act = acts[i]
+        fields, at = _array(payload, at, _ANY)
+        act[PLACE], at = _place(tables, at)
+        act[NOW_NS], at = _number(payload, at)
+        items, at = _array(payload, at, _ANY)  # the observation
+        act[OBSERVED], at = _number(payload, at)
+        at = skip(payload, at, items - 1)
+        at = _read_heard(tables, act, at)
+        at = _read_outputs(tables, act, i, at, samples)
+        at = _read_ruling(tables, act, i, at)
+        act[SKEW_NS] = 0
+        if fields > 6:
+            act[SKEW_NS], at = _number(payload, at)
+        at = skip(payload, at, fields - 7)
+        if at < 0:
+            return _MALFORMED
+    sizes[VERDICTS], at = _array(payload, at, verdicts.shape[0])
+    for i in range(sizes[VERDICTS]):
+        fields, at = _array(payload, at, _ANY)
+        verdicts[i, SOURCE], at = _place(tables, at)
+        verdicts[i, SEQUENCE], at = _number(payload, at)
+        verdicts[i, TARGET], at = _place(tables, at)
+        verdicts[i, DUE_NS], at = _number(payload, at)
+        at = skip(payload, at, fields - 4)
+    if parts < 8:
+        return at
+    at = skip(payload, at, 3)  # out_of_range, absent, tolls
+    sizes[INJECTED], at = _array(payload, at, injected.shape[0])
+    for i in range(sizes[INJECTED]):
+        at = _read_envelope(tables, injected[i], at)
+    return at
+
+
+@kernel
+def _is_finite(kind: int, value: int) -> bool:
+    if kind == FLOAT:
+        return value >> 52 & 0x7FF != 0x7FF
+    return kind == NUMBER or (kind == SINGLE and value >> 23 & 0xFF != 0xFF)
+
+
+@kernel
+def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int, int]:
+    """Epoch of the News in payload[at:end], and where its `have` and `logs` begin and end.
+
+    The last is negative for what `decode_news` would refuse.
+    """
+    refused = (0, 0, 0, 0, _MALFORMED)
+    if end - at > BODY_BYTES_MAX:
+        return refused
+    fields, at = _array(payload, at, _ANY)
+    tag, at = _number(payload, at)
+    version, at = _number(payload, at)
+    step, at = _number(payload, at)
+    kind_x, x, at = head_of(payload, at)
+    kind_y, y, at = head_of(payload, at)
+    if at < 0 or fields < 8 or tag != _NEWS_TAG or version != VERSION or step < 0:
+        return refused
+    if not (_is_finite(kind_x, x) and _is_finite(kind_y, y)):
+        return refused
+    have_kind, size, have = head_of(payload, at)
+    have_end = have + size
+    logs_kind, size, logs = head_of(payload, have_end if have > 0 else have)
+    logs_end = logs + size
+    claims_kind, size, claims = head_of(payload, logs_end if logs > 0 else logs)
+    if claims < 0 or not have_kind == logs_kind == claims_kind == BYTES:
+        return refused
+    at = claims + size
+    if fields > 8:
+        kind, size, at = head_of(payload, at)
+        if kind != BYTES or at < 0:  # the registers
+            return refused
+        at += size
+    epoch = 0
+    if fields > 9:
+        epoch, at = _number(payload, at)
+    if not 0 <= epoch <= EPOCHS_MAX or skip(payload, at, fields - 10) != end:
+        return refused
+    return epoch, have, have_end, logs, logs_end
+
+
+@kernel
+def parts_of_weights(payload: bytes, at: int, end: int) -> tuple[int, int, int, int, int]:
+    """Sequence, base, size of the WeightsMessage in payload[at:end]; where its content begins and ends.
+
+    The last is negative for what `WeightsSubscriber` would not decode.
+    """
+    fields, at = _array(payload, at, _ANY)
+    tag, at = _number(payload, at)
+    version, at = _number(payload, at)
+    sequence, at = _number(payload, at)
+    base, at = _number(payload, at)
+    size, at = _number(payload, at)
+    kind, length, at = head_of(payload, at)
+    sound = fields >= 6 and tag == _WEIGHTS_TAG and version == VERSION and kind == BYTES
+    if not sound or at < 0 or skip(payload, at + length, fields - 6) != end:
+        return 0, 0, 0, 0, _MALFORMED
+    return sequence, base, size, at, at + length
+
+
+class ColumnarDecoder:
+    """Reads the records of a run in order. Several referees may share one; each record is read once."""
+
+    def __init__(self) -> None:
+        self._record: Record | None = None
+        self._reading: tuple[Any, ...] = ()
+        self._bounds = (0, STRANGER, 0)
+        """Robots, place of the supervisor, samples."""
+        self._make_room(1 << 10)
+
+    def read(self, record: Record, payload: bytes = b"") -> tuple[Any, ...]:
+        """The record's bytes and, of a batch, its tables: a Reading as arguments of a kernel.
+
+        The first record must be an opening. payload: the record encoded, if it came so.
+        """
+        if record is self._record:
+            return self._reading
+        payload = payload or encode_record(record)
+        if isinstance(record, Batch):
+            while _read_batch(payload, *self._tables, self._pose_bits, *self._bounds) < 0:
+                assert self._rows <= len(payload), "what msgspec has encoded can be read"
+                self._make_room(2 * self._rows)
+        elif isinstance(record, Opening):
+            scenario = record.scenario
+            supervisor = scenario.robots.count if scenario.centralized else STRANGER
+            self._bounds = (scenario.robots.count, supervisor, record.samples_m.shape[0])
+        self._reading = (payload, *self._tables)
+        self._record = record
+        return self._reading
+
+    def _make_room(self, rows: int) -> None:
+        """Tables of so many rows each; none needs more than its payload has bytes."""
+        self._rows = rows
+        poses_m = np.zeros((rows, 4))
+        self._pose_bits = poses_m.view(np.int64)
+        self._tables = (
+            np.zeros(6, dtype=np.int64),
+            np.zeros((rows, _ACT_COLUMNS), dtype=np.int64),
+            poses_m,
+            *(np.zeros((rows, columns), dtype=np.int64) for columns in (2, 5, 4, 2, 5)),
+        )

@@ -1,0 +1,152 @@
+"""The folder of a run (design, part 7): its files, and what a run that was cut short has left in it."""
+
+import contextlib
+import csv
+import json
+import platform
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import msgspec
+
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.record.journal import read
+from kantor_worldsim.record.records import Ending, Opening, Record
+
+JOURNAL = "run.mcap"
+
+
+MANIFEST = "manifest.json"
+
+
+RESULT = "result.json"
+
+
+SCENARIO = "scenario.toml"
+
+
+METRICS = "metrics.csv"
+
+
+REPORT = "report.png"
+
+
+def folder_for(scenario: Scenario, seed: int, below: Path) -> Path:
+    """Create `<UTC>_<scenario>_s<seed>` below a folder; a number is added if it exists."""
+    stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}_{scenario.name}_s{seed}"
+    for attempt in range(1000):
+        folder = below / (stem if not attempt else f"{stem}_{attempt}")
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        return folder
+    raise FileExistsError(f"{below / stem}: a thousand runs in one second")
+
+
+class ResumeError(ValueError):
+    """A run folder from which no mission can go on; the message is one line with the remedy."""
+
+
+class OverError(ResumeError):
+    """The mission has come to its end, and its files are whole."""
+
+
+class Terms(msgspec.Struct, frozen=True):
+    """How a run is run, in its manifest."""
+
+    run: str
+    """Names it."""
+    exchange: str
+    speed: float
+    exact_every: int | None = None
+
+
+class Past(NamedTuple):
+    """What a run folder holds of a mission that was cut short."""
+
+    terms: Terms
+    opening: Opening
+    records: tuple[Record, ...]
+    """The opening and all that followed, without an ending."""
+    manifest: dict[str, Any]
+
+    @classmethod
+    def of(cls, folder: Path) -> "Past":
+        """Raises ResumeError; OverError if nothing is left to be done."""
+        try:
+            manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+            records = [record for _, record in read(folder / JOURNAL)]
+            terms = msgspec.convert(manifest, Terms)
+        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+            what = error.strerror if isinstance(error, OSError) else str(error)
+            raise ResumeError(f"{folder}: no run to go on with ({what}); give its folder") from None
+        except msgspec.ValidationError as error:
+            raise ResumeError(f"{folder / MANIFEST}: of another version: {error}") from None
+        if not records or not isinstance(records[0], Opening):
+            raise ResumeError(f"{folder / JOURNAL}: nothing has happened in it; start the run anew")
+        last = records[-1]
+        if isinstance(last, Ending):
+            if "digest" in manifest and last.reason != "interrupted":
+                raise OverError(f"{folder}: its mission is over ({last.reason})")
+            records.pop()
+        return cls(terms, records[0], tuple(records), manifest)
+
+
+class MetricsFile:
+    """metrics.csv, written as the run goes; a full disk ends it quietly, the journal says so."""
+
+    def __init__(self, path: Path, columns: tuple[str, ...]) -> None:
+        self._file: IO[str] | None = None
+        try:
+            self._file = path.open("w", newline="", encoding="utf-8", buffering=1)
+            self._writer = csv.writer(self._file)
+            self._writer.writerow(columns)
+        except OSError:
+            self.close()
+
+    def add(self, row: tuple[Any, ...]) -> None:
+        if self._file is None:
+            return
+        try:
+            self._writer.writerow("" if value is None else value for value in row)
+        except OSError:
+            self.close()
+
+    def close(self) -> None:
+        file, self._file = self._file, None
+        if file is not None:
+            with contextlib.suppress(OSError):
+                file.close()
+
+
+def new_manifest(scenario: Scenario, seed: int, exchange: str) -> dict[str, Any]:
+    libraries = ("kantor", "eclipse-zenoh", "numpy", "scipy", "numba", "msgspec", "mcap")
+    return {
+        "format": 1,
+        "scenario": scenario.name,
+        "seed": seed,
+        "exchange": exchange,
+        "started_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": {
+            "python": platform.python_version(),
+            "platform": platform.platform(),
+            **{name: version(name) for name in libraries},
+        },
+    }
+
+
+def write_json(path: Path, tree: dict[str, Any]) -> None:
+    write_text(path, json.dumps(tree, indent=2) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Replace a file whole, so that nobody ever reads half of it; a full disk leaves the old one."""
+    draft = path.with_name(f".{path.name}.draft")
+    try:
+        draft.write_text(text, encoding="utf-8")
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)

@@ -1,0 +1,258 @@
+"""The truth: where robots and targets are, who has energy left, what was consumed and found."""
+
+import math
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from kantor_protocol.base.counter_rng import Purpose
+from kantor_protocol.base.grid import FREE, NOWHERE, free_way
+from kantor_protocol.base.machine import SUPERVISOR, Body, Observation, Outputs, ParticipantId, Pose
+from kantor_protocol.base.random_walk import RandomWalk
+from kantor_protocol.base.varint import sum_pairs
+from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.schema import Domain, Scenario
+from kantor_protocol.wire.weights import Units
+from kantor_worldsim.world.density import samples_of, starts_of, targets_of
+from kantor_worldsim.world.maps import Ground
+from kantor_worldsim.world.sensors import RangeFinder, sense_targets, sense_targets_in_sight
+
+Found = tuple[int, float, float]
+"""A target with the place where it was found."""
+
+SPEED_TOLERANCE = 1e-6
+"""Relative, on the length of one move: rounding, no more."""
+
+STANDOFF_CELLS = 1 / 64
+"""A robot that meets a wall stops so far before it, along its way."""
+
+
+class WorldSetup(NamedTuple):
+    """What a mission starts from, drawn from scenario and seed. All in the world frame, metres."""
+
+    samples_m: npt.NDArray[np.float64]
+    """(N, 2)"""
+    targets_m: npt.NDArray[np.float64]
+    """(T, 2)"""
+    starts_m: npt.NDArray[np.float64]
+    """(n, 2)"""
+
+    ground: Ground | None = None
+    """The true map, if the robots explore one. There are no samples then."""
+    warnings: tuple[str, ...] = ()
+    """What may be wrong with the map's file, a line each."""
+
+    @classmethod
+    def of(cls, scenario: Scenario, seed: int) -> "WorldSetup":
+        """Raises ScenarioError for a file that is no use."""
+        if scenario.mapping:
+            return cls._of_map(scenario, seed)
+        return cls(
+            samples_of(scenario, seed), targets_of(scenario, seed), starts_of(scenario, seed)
+        )
+
+    @classmethod
+    def _of_map(cls, scenario: Scenario, seed: int) -> "WorldSetup":
+        from kantor_worldsim.world.starts import starts_on  # noqa: PLC0415  only where there is a map
+
+        ground, warnings = ground_of(scenario)
+        starts = scenario.starts
+        starts_m = starts_on(
+            ground,
+            poses_m=starts.poses_m,
+            random=starts.random,
+            spread=starts.spread,
+            spots=starts.spots,
+            count=scenario.robots.count,
+            seed=seed,
+        )
+        left_m, right_m, bottom_m, top_m = ground.frame.extent_m
+        over_map = Domain(min_m=(left_m, bottom_m), max_m=(right_m, top_m))
+        targets_m = targets_of(msgspec.structs.replace(scenario, domain=over_map), seed)
+        return cls(np.zeros((0, 2)), targets_m, starts_m, ground, tuple(warnings))
+
+    def poses(self, scenario: Scenario) -> dict[ParticipantId, Pose]:
+        """Where everybody in the roster is at time 0."""
+        robots = zip(scenario.robot_ids, self.starts_m.tolist(), strict=True)
+        poses = {name: Pose(x_m, y_m) for name, (x_m, y_m) in robots}
+        if scenario.centralized:
+            poses[SUPERVISOR] = Pose(*scenario.supervisor_m)
+        return poses
+
+
+def ground_of(scenario: Scenario) -> tuple[Ground, list[str]]:
+    """The true map of a scenario that has one, and warnings about its file. Raises ScenarioError."""
+    from kantor_worldsim.world.layouts import layout  # noqa: PLC0415  only where there is a map
+    from kantor_worldsim.world.maps import read  # noqa: PLC0415
+
+    wanted = scenario.map
+    assert wanted is not None
+    if wanted.file is not None:
+        return read(wanted.file, wanted.resolution_m)
+    assert wanted.layout is not None
+    return layout(wanted.layout, wanted.size_m, wanted.resolution_m, wanted.seed), []
+
+
+def units_of(scenario: Scenario, samples: int) -> Units:
+    """The mass of a run with so many samples; none in a mission with a map."""
+    return Units(0, 0, 0) if scenario.mapping else Units.of(scenario.energy.points, samples)
+
+
+class StepVerdict(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """What the world made of a participant's step."""
+
+    pose: Pose
+    """Where it now truly is."""
+    found: tuple[Found, ...] = ()
+    violations: tuple[str, ...] = ()
+    """Rules it broke: `step`, `speed`, `energy`, `units`. The offending part had no effect."""
+    bumped: bool = False
+    """The move ended at a wall, which breaks no rule."""
+
+
+class _Body:
+    """A participant as the world knows it."""
+
+    def __init__(self, pose: Pose) -> None:
+        self.pose = pose
+        self.step = 0
+        self.epoch = 0
+        self.moved_ns = 0
+        self.energy_spent = 0
+        self.found: tuple[int, ...] = ()
+        self.scan = b""
+        self.bumped = False
+
+
+class World:
+    """Accepts what participants do, as far as the rules allow."""
+
+    def __init__(self, scenario: Scenario, seed: int, site: WorldSetup) -> None:
+        self.found = np.zeros(site.targets_m.shape[0], dtype=bool)
+        self._targets = RandomWalk(
+            site.targets_m,
+            scenario.targets.diffusion_m,
+            scenario.period_ns,
+            seed,
+            Purpose.TARGET_WALK,
+        )
+        self._units = units_of(scenario, site.samples_m.shape[0])
+        self._samples = site.samples_m.shape[0]
+        self._budget = scenario.steps_per_robot
+        self._speed_m_s = scenario.vehicle.speed_m_s
+        self._range_m = scenario.sensor.range_m
+        self._room = np.zeros(site.targets_m.shape[0], dtype=np.int64)
+        self._bodies = {name: _Body(pose) for name, pose in site.poses(scenario).items()}
+        self._ground = site.ground
+        if site.ground is not None:
+            self._range_finder = RangeFinder(scenario.sensor, site.ground, seed)
+            self._places = {name: i for i, name in enumerate(scenario.robot_ids)}
+            for name in scenario.robot_ids:
+                self._enter(name, self._bodies[name])
+
+    def pose(self, name: ParticipantId) -> Pose:
+        """Where a participant truly is."""
+        return self._bodies[name].pose
+
+    def first_look(self) -> dict[ParticipantId, tuple[Found, ...]]:
+        """What the robots see at time 0, before anybody moves."""
+        return {name: self._sense(name) for name in self._bodies if name != SUPERVISOR}
+
+    def observe(self, name: ParticipantId) -> Observation:
+        """What the world tells a participant of its last step, or of the start."""
+        body = self._bodies[name]
+        return Observation(body.step, body.pose, body.found, body.scan, body.bumped)
+
+    def body(self, name: ParticipantId) -> Body:
+        """What whoever takes a participant over has to know."""
+        body = self._bodies[name]
+        return Body(body.pose, body.step, body.energy_spent, body.epoch)
+
+    def begin(self, name: ParticipantId, epoch: int) -> bool:
+        """Note which incarnation drives a body from now on; whether it is another."""
+        body = self._bodies[name]
+        other, body.epoch = epoch != body.epoch, epoch
+        return other
+
+    def accept(self, name: ParticipantId, now_ns: int, outputs: Outputs) -> StepVerdict:
+        """Judge a step that was made at `now_ns` and let its sound parts happen."""
+        body = self._bodies[name]
+        if outputs.step <= body.step or now_ns < body.moved_ns:
+            return StepVerdict(pose=body.pose, violations=("step",))
+        body.bumped, body.found = False, ()
+        violations = [] if self._moves(name, body, now_ns, outputs.pose) else ["speed"]
+        if outputs.spent:
+            violations += self._spend(body, outputs.spent)
+        body.step, body.moved_ns = outputs.step, now_ns
+        self._targets.advance(now_ns)
+        if name == SUPERVISOR:
+            return StepVerdict(body.pose, (), tuple(violations))
+        if self._ground is not None:
+            body.scan = self._range_finder.scan(self._places[name], body.step, body.pose)
+        return StepVerdict(body.pose, self._sense(name), tuple(violations), body.bumped)
+
+    def _moves(self, name: ParticipantId, body: _Body, now_ns: int, pose: Pose) -> bool:
+        limit_m = 0.0 if name == SUPERVISOR else self._speed_m_s * (now_ns - body.moved_ns) * 1e-9
+        start = body.pose
+        way_m = math.hypot(pose.x_m - start.x_m, pose.y_m - start.y_m)
+        if not way_m <= limit_m * (1.0 + SPEED_TOLERANCE):  # nor to nowhere
+            return False
+        body.pose = pose
+        if self._ground is not None and name != SUPERVISOR:
+            body.pose, body.bumped = stopped(self._ground, start, pose)
+        return True
+
+    def _enter(self, name: ParticipantId, body: _Body) -> None:
+        """Check that a robot does not start in a wall, and let it look around."""
+        assert self._ground is not None
+        x_m, y_m = body.pose.x_m, body.pose.y_m
+        if not is_free(self._ground, x_m, y_m):
+            raise ScenarioError(f"starts: {name} at ({x_m:g}, {y_m:g}) is in no free cell; move it")
+        body.scan = self._range_finder.scan(self._places[name], 0, body.pose)
+
+    def _spend(self, body: _Body, spent: bytes) -> list[str]:
+        if not 0 < sum_pairs(spent, self._samples) <= self._units.point:
+            return ["units"]
+        if body.energy_spent >= self._budget:
+            return ["energy"]
+        body.energy_spent += 1
+        return []
+
+    def _sense(self, name: ParticipantId) -> tuple[Found, ...]:
+        body, ground, targets_m = self._bodies[name], self._ground, self._targets.xy_m
+        seen = (targets_m, self.found, body.pose.x_m, body.pose.y_m, self._range_m, self._room)
+        if ground is None:
+            count = sense_targets(*seen)
+        else:
+            frame, cells = ground
+            count = sense_targets_in_sight(cells, *frame.origin_m, frame.resolution_m, *seen)
+        if not count:
+            return ()
+        indices = self._room[:count].tolist()
+        body.found += tuple(indices)
+        return tuple((i, float(targets_m[i, 0]), float(targets_m[i, 1])) for i in indices)
+
+
+def is_free(ground: Ground, x_m: float, y_m: float) -> bool:
+    """Whether a place in the world lies in a free cell."""
+    cell = ground.frame.cell_of(x_m, y_m)
+    return cell != NOWHERE and bool(ground.cells.flat[cell] == FREE)
+
+
+def stopped(ground: Ground, start: Pose, end: Pose) -> tuple[Pose, bool]:
+    """Where a straight move from a free cell ends, and whether a wall ended it.
+
+    A robot that meets a wall stands STANDOFF_CELLS before it, or where it was; it has turned.
+    """
+    frame, cells = ground
+    dx, dy = end.x_m - start.x_m, end.y_m - start.y_m
+    share = free_way(cells, FREE, *frame.uv(start.x_m, start.y_m), *frame.uv(end.x_m, end.y_m))
+    if share >= 1.0 and is_free(ground, end.x_m, end.y_m):
+        return end, False
+    share -= STANDOFF_CELLS * frame.resolution_m / math.hypot(dx, dy)
+    x_m, y_m = start.x_m + share * dx, start.y_m + share * dy
+    if share <= 0.0 or not is_free(ground, x_m, y_m):
+        x_m, y_m = start.x_m, start.y_m
+    return Pose(x_m, y_m, end.heading_rad, 0.0), True
