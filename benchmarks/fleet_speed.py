@@ -13,7 +13,7 @@ from typing import NamedTuple
 from tables import Table, verdict
 
 from kantor_fleet.execution.in_process_team import team
-from kantor_fleet.processes.preload import warm_up
+from kantor_fleet.execution.preload import warm_up
 from kantor_fleet.scenarios.catalog import find
 from kantor_protocol.scenario.dump import to_tree
 from kantor_protocol.scenario.load import from_tree

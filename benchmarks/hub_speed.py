@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 from tables import Table
 
 from kantor_agent.robots.density import DensityRobot
+from kantor_fleet.execution.preload import warm_up
 from kantor_fleet.processes.local import _LIGHT_RUNTIME
-from kantor_fleet.processes.preload import warm_up
 from kantor_fleet.scenarios.catalog import find
 from kantor_fleet.security import authority
 from kantor_protocol.base.machine import Body, Envelope, Inputs, Pose
@@ -132,7 +132,7 @@ class Pace(NamedTuple):
 def measure(*, quick: bool) -> Table:
     """For each number of robots the highest rate that is carried, and what a robot-tick costs there."""
     warm_up()
-    get_context("forkserver").set_forkserver_preload(["kantor_fleet.processes.preloaded"])
+    get_context("forkserver").set_forkserver_preload(["kantor_fleet.execution.preloaded"])
     rows = []
     for link in LINKS:
         for count in COUNTS_QUICK if quick else COUNTS:

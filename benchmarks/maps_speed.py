@@ -12,7 +12,7 @@ from typing import NamedTuple
 from tables import Table, verdict
 
 from kantor_fleet.execution.in_process_team import play
-from kantor_fleet.processes.preload import warm_up
+from kantor_fleet.execution.preload import warm_up
 from kantor_fleet.scenarios.catalog import find
 from kantor_protocol.scenario.schema import MAP_PLANNERS
 from kantor_worldsim.observers.recording import Recording

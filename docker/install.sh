@@ -17,6 +17,6 @@ kantor)
     cd /opt/kantor/lib/python3*/site-packages
     # Without those that only PDF output and tables of sweeps want.
     /opt/kantor/bin/python -m compileall -q -j 0 --invalidation-mode unchecked-hash -x '/(fontTools|pygments|scipy/(io|signal|stats))/' .
-    /opt/kantor/bin/python -c 'from kantor_fleet.processes.preload import warm_up; warm_up()'
+    /opt/kantor/bin/python -c 'from kantor_fleet.execution.preload import warm_up; warm_up()'
     ;;
 esac

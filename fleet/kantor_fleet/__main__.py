@@ -9,7 +9,6 @@ from kantor_fleet.cli.agent import agent
 from kantor_fleet.cli.campaign import campaign
 from kantor_fleet.cli.chaos import chaos
 from kantor_fleet.cli.compose import compose
-from kantor_fleet.cli.exits import Exit, fail
 from kantor_fleet.cli.keys import keys
 from kantor_fleet.cli.reproduce import reproduce
 from kantor_fleet.cli.run import run
@@ -20,6 +19,7 @@ from kantor_fleet.cli.sweep import sweep
 from kantor_fleet.cli.tap import tap
 from kantor_fleet.cli.verify import verify
 from kantor_fleet.cli.worldsim import worldsim
+from kantor_fleet.exits import Exit, fail
 
 VERBS: dict[str, Callable[..., int]] = {
     "run": run,

@@ -16,9 +16,9 @@ from kantor_fleet.campaign.rare_events import RARE_EVENTS
 from kantor_fleet.campaign.run import CampaignConfig, campaign, numbered, replay
 from kantor_fleet.campaign.shrink import shrink
 from kantor_fleet.campaign.totals import ENOUGH, Totals
-from kantor_fleet.cli.exits import Exit
 from kantor_fleet.execution.experiment import Case
 from kantor_fleet.execution.pools import Pool
+from kantor_fleet.exits import Exit
 from kantor_protocol.scenario.load import load
 from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.run_folder import JOURNAL

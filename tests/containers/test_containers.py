@@ -181,7 +181,7 @@ def test_isolated_robots_cannot_reach_each_other(fleet_of: MakeFleet) -> None:
 
 WARM = """
 import gc
-from kantor_fleet.preload import warm_up
+from kantor_fleet.execution.preload import warm_up
 warm_up()
 from numba.core.dispatcher import Dispatcher
 kernels = [o for o in gc.get_objects() if isinstance(o, Dispatcher) and o.py_func.__module__.startswith("kantor")]

@@ -10,9 +10,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
-from kantor_fleet.execution.mission import summary
 from kantor_fleet.report.picture import Run, draw_bumps, draw_known
 from kantor_fleet.report.report import draw
+from kantor_fleet.report.summary import summary
 from kantor_protocol.base.grid import Frame
 from kantor_worldsim.observers.metrics.mapping import MapMetrics
 from kantor_worldsim.record.records import Batch, Record, opening_of

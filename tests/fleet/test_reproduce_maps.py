@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from matplotlib.figure import Figure as Picture
 from PIL import Image
 
-from kantor_fleet.cli.exits import Exit
 from kantor_fleet.execution.experiment import Case, Outcome
 from kantor_fleet.execution.pools import Pool
+from kantor_fleet.exits import Exit
 from kantor_fleet.reproduce import burgard, explored, kabir_lee, kme, papers
 from kantor_fleet.reproduce.claims import (
     MISS,

@@ -15,9 +15,9 @@ import numpy as np
 import psutil
 import pytest
 
-from kantor_fleet.cli.exits import Exit
 from kantor_fleet.execution.experiment import Case, Outcome, run_case
 from kantor_fleet.execution.pools import Pool, local
+from kantor_fleet.exits import Exit
 from kantor_fleet.sweep.journal import Journal
 from kantor_fleet.sweep.plan import Key, SweepError, parse_seeds, plan
 from kantor_fleet.sweep.run import SweepConfig, sweep

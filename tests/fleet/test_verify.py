@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from kantor_fleet.cli.exits import Exit
 from kantor_fleet.execution.in_process_team import team
 from kantor_fleet.execution.verify import verify
+from kantor_fleet.exits import Exit
 from kantor_protocol.base.machine import Exchange, Inputs, Outputs, ParticipantId
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario

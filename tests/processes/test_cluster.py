@@ -15,9 +15,9 @@ import psutil
 import pytest
 import workers
 
-from kantor_fleet.cli.exits import Exit
 from kantor_fleet.execution import pools
 from kantor_fleet.execution.experiment import Case
+from kantor_fleet.exits import Exit
 from kantor_fleet.sweep.plan import SweepPlan, plan
 from kantor_fleet.sweep.run import SweepConfig, sweep
 from support.strategies import mission

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from kantor_fleet.execution.in_process_team import play, team
-from kantor_fleet.execution.mission import summary
+from kantor_fleet.report.summary import summary
 from kantor_fleet.scenarios.catalog import find
 from kantor_protocol.base.machine import (
     EVERYBODY,

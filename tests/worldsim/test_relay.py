@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_protocol.base.machine import Envelope
-from kantor_protocol.node.runner import INBOX_MAX
+from kantor_protocol.node.wall_clock import INBOX_MAX
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.engine.process_faults import schedule_of
 from kantor_worldsim.exchange.config import needs_process_control

@@ -29,15 +29,15 @@ from kantor_fleet.campaign.rss_monitor import (
     grandchildren,
 )
 from kantor_fleet.campaign.run import commit
-from kantor_fleet.cli.exits import Exit
-from kantor_fleet.cli.interrupts import Interrupts
 from kantor_fleet.execution.experiment import code
 from kantor_fleet.execution.in_process_team import play
-from kantor_fleet.execution.mission import read_result
+from kantor_fleet.execution.preload import warm_up
 from kantor_fleet.execution.verify import verdicts
+from kantor_fleet.exits import Exit
+from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.processes.local import Fleet, FleetConfig, local_fleet, watch_progress
-from kantor_fleet.processes.preload import warm_up
 from kantor_fleet.report.progress import printable
+from kantor_fleet.report.summary import read_result
 from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.scenario.dump import to_toml
 from kantor_protocol.scenario.schema import Scenario

@@ -14,11 +14,11 @@ from kantor_fleet.campaign.draw import draw, sort_of
 from kantor_fleet.campaign.mission import Follower, Trial
 from kantor_fleet.campaign.shrink import shrink
 from kantor_fleet.campaign.totals import ENOUGH, Totals
-from kantor_fleet.cli.exits import Exit
-from kantor_fleet.cli.interrupts import Interrupts
 from kantor_fleet.execution.experiment import Case, Outcome, code
 from kantor_fleet.execution.in_process_team import play
 from kantor_fleet.execution.pools import Pool
+from kantor_fleet.exits import Exit
+from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.report.progress import printable
 from kantor_fleet.report.run_progress import RunsView, table_console
 from kantor_fleet.sweep.journal import Journal

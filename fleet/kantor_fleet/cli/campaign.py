@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from kantor_fleet.cli.exits import Exit, fail
 from kantor_fleet.cli.options import check_seed, check_speed
+from kantor_fleet.exits import Exit, fail
 
 
 def campaign(

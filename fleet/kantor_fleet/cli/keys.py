@@ -5,7 +5,7 @@ from typing import Annotated
 
 import tyro
 
-from kantor_fleet.cli.exits import Exit
+from kantor_fleet.exits import Exit
 
 
 def keys(

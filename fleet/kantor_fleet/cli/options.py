@@ -2,18 +2,20 @@
 
 from typing import TYPE_CHECKING
 
-from kantor_fleet.cli.exits import Exit, fail
+from kantor_fleet.exits import Exit, fail
 
 if TYPE_CHECKING:
     from kantor_protocol.scenario.schema import Scenario
 
 
 def check_seed(seed: int) -> None:
+    """Refuse a seed that is not a whole number of 63 bits."""
     if not 0 <= seed < 2**63:
         fail(Exit.USAGE, f"--seed {seed}: give a whole number from 0 to 2^63 - 1")
 
 
 def check_speed(speed: float) -> None:
+    """Refuse a speed factor out of bounds."""
     if not 0.0 < speed <= 1000.0:
         fail(Exit.USAGE, f"--speed {speed:g}: give a factor above 0, at most 1000")
 

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from kantor_fleet.cli.exits import Exit, fail
+from kantor_fleet.exits import Exit, fail
 
 
 def reproduce(

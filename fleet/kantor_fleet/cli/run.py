@@ -35,7 +35,7 @@ def run(
         chaos: A TOML file of [[faults]] that are added to the scenario's own.
         set: Override a key of the scenario, such as radio.range_m=150; any number of times.
     """
-    from kantor_fleet.execution.mission import run as run_mission  # noqa: PLC0415
+    from kantor_fleet.processes.mission import run as run_mission  # noqa: PLC0415
     from kantor_fleet.scenarios.catalog import find  # noqa: PLC0415  each verb imports what it needs
 
     check_seed(seed)

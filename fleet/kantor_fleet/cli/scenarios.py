@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from kantor_fleet.cli.exits import Exit
+from kantor_fleet.exits import Exit
 
 
 def scenarios(

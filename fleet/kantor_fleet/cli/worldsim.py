@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from kantor_fleet.cli.exits import Exit, fail
 from kantor_fleet.cli.options import check_seed, check_speed, exact_period
+from kantor_fleet.exits import Exit, fail
 
 
 def worldsim(
@@ -48,7 +48,7 @@ def worldsim(
             container), it goes on with that run if it was cut short.
         set: Override a key of the scenario.
     """
-    from kantor_fleet.processes.standalone import (
+    from kantor_fleet.processes.standalone import (  # noqa: PLC0415
         go_on_standalone,
         host_standalone,
         resume_standalone,

@@ -21,8 +21,8 @@ from multiprocessing.connection import Connection, wait
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, NamedTuple
 
-from kantor_fleet.cli.exits import Exit, fail
 from kantor_fleet.execution.experiment import Case, Outcome, code, reason, run_case
+from kantor_fleet.exits import Exit, fail
 
 if TYPE_CHECKING:
     from dask_jobqueue import SLURMCluster
@@ -125,7 +125,7 @@ class _Worker:
 
     def __init__(self, work: Work) -> None:
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["kantor_fleet.processes.preloaded"])
+        context.set_forkserver_preload(["kantor_fleet.execution.preloaded"])
         self.pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, work), daemon=True)
         self._process.start()

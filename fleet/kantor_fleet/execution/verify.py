@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from kantor_fleet.cli.exits import Exit, fail
 from kantor_fleet.execution.in_process_team import participant, play
+from kantor_fleet.exits import Exit, fail
 from kantor_protocol.base.machine import WORLD_SIM, Outputs, ParticipantId, StateMachine
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario

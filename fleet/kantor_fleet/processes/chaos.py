@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kantor_fleet.cli.exits import Exit, fail
 from kantor_fleet.execution.verify import verdicts
+from kantor_fleet.exits import Exit, fail
 from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.scenario.faults.base import Fault
 from kantor_protocol.scenario.faults.links import Partition

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from kantor_fleet.cli.exits import Exit, fail
+from kantor_fleet.exits import Exit, fail
 from kantor_protocol.transport.endpoint import check_endpoint
 
 ROBOTS_MAX = 500

@@ -22,8 +22,8 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import NamedTuple
 
-from kantor_fleet.cli.exits import Exit
-from kantor_fleet.cli.interrupts import Interrupts
+from kantor_fleet.exits import Exit
+from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.processes.log import log_to
 from kantor_protocol.base.machine import SUPERVISOR, ParticipantId
 from kantor_protocol.node import wal
@@ -84,7 +84,7 @@ class Fleet:
         self._order = order
         self._secrets = secrets
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["kantor_fleet.processes.preloaded"])
+        self._context.set_forkserver_preload(["kantor_fleet.execution.preloaded"])
         self._logs, self._state = order.folder / "logs", order.folder / STATE
         self._logs.mkdir()
         self._lock = threading.RLock()
@@ -338,8 +338,8 @@ def _be_world_sim(
     stopping: bool,  # noqa: FBT001
 ) -> None:
     from kantor_worldsim.exchange.main import run  # noqa: PLC0415  the fork server has it
-    from kantor_worldsim.observers.recording import Recording
-    from kantor_worldsim.record.run_folder import OverError, Past, ResumeError
+    from kantor_worldsim.observers.recording import Recording  # noqa: PLC0415
+    from kantor_worldsim.record.run_folder import OverError, Past, ResumeError  # noqa: PLC0415
     from kantor_worldsim.world.world import WorldSetup  # noqa: PLC0415
 
     say = log_to(log, "worldsim")

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from kantor_fleet.cli.exits import Exit, fail
-from kantor_fleet.cli.interrupts import Interrupts
+from kantor_fleet.exits import Exit, fail
+from kantor_fleet.interrupts import Interrupts
 from kantor_protocol.transport import credentials
 from kantor_protocol.transport.credentials import Certificate
 from kantor_protocol.transport.endpoint import check_endpoint

@@ -5,8 +5,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from kantor_fleet.cli.exits import Exit, fail, warn
-from kantor_fleet.cli.interrupts import Interrupts
+from kantor_fleet.exits import Exit, fail, warn
+from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.processes import resume_pointer
 from kantor_protocol.base.machine import SUPERVISOR, ParticipantId
 from kantor_protocol.node.runner import RejectedError, StateError
@@ -50,7 +50,7 @@ def host_standalone(
     """
     from kantor_worldsim.exchange.config import MissionConfig  # noqa: PLC0415  robots by hand do not need these
     from kantor_worldsim.observers.recording import Recording  # noqa: PLC0415
-    from kantor_worldsim.record.run_folder import folder_for
+    from kantor_worldsim.record.run_folder import folder_for  # noqa: PLC0415
     from kantor_worldsim.world.world import WorldSetup  # noqa: PLC0415
 
     _check_faults(scenario, exchange)
@@ -99,7 +99,7 @@ def go_on_standalone(state: Path, listen: str, secrets: Path, fleet: str | None)
 
     A mission that was not met is not tried again: whoever starts failed processes anew would do so for ever.
     """
-    from kantor_fleet.execution.mission import conclude, read_result, verdict  # noqa: PLC0415
+    from kantor_fleet.report.summary import conclude, read_result, verdict  # noqa: PLC0415
     from kantor_worldsim.record.run_folder import REPORT, OverError, Past, ResumeError  # noqa: PLC0415
 
     folder = resume_pointer.run_in(state)
@@ -137,9 +137,9 @@ def _host(
     past: "Past | None" = None,
 ) -> Exit:
     """Host a mission. record: opens the run folder, once the bus is there."""
-    from kantor_fleet.execution.mission import conclude, read_result, verdict  # noqa: PLC0415
-    from kantor_fleet.processes.preload import warm_up  # noqa: PLC0415  robots by hand do not need these
+    from kantor_fleet.execution.preload import warm_up  # noqa: PLC0415  robots by hand do not need these
     from kantor_fleet.report.progress import ProgressView  # noqa: PLC0415
+    from kantor_fleet.report.summary import conclude, read_result, verdict  # noqa: PLC0415
     from kantor_worldsim.exchange.main import run  # noqa: PLC0415
 
     scenario = plan.scenario

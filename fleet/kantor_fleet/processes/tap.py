@@ -7,8 +7,8 @@ from typing import Any
 
 import msgpack
 
-from kantor_fleet.cli.exits import Exit, fail
-from kantor_fleet.cli.interrupts import Interrupts
+from kantor_fleet.exits import Exit, fail
+from kantor_fleet.interrupts import Interrupts
 from kantor_protocol.transport import credentials
 from kantor_protocol.transport.client import observer_session
 from kantor_protocol.transport.endpoint import await_endpoint, check_endpoint

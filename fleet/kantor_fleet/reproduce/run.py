@@ -9,11 +9,11 @@ from pathlib import Path
 
 from rich.table import Table as Printed
 
-from kantor_fleet.cli.exits import Exit
-from kantor_fleet.cli.interrupts import Interrupts
 from kantor_fleet.execution.experiment import Case, Outcome
 from kantor_fleet.execution.pools import Pool
-from kantor_fleet.processes.preload import warm_up
+from kantor_fleet.execution.preload import warm_up
+from kantor_fleet.exits import Exit
+from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.report.run_progress import RunsView, table_console
 from kantor_fleet.reproduce.claims import MISS, UNMATCHED, Verdict
 from kantor_fleet.reproduce.figure import Figure, ResultTable, RunRequests

@@ -11,10 +11,10 @@ from typing import Literal, NamedTuple
 
 import msgspec
 
-from kantor_fleet.cli.exits import Exit
-from kantor_fleet.cli.interrupts import Interrupts
 from kantor_fleet.execution.experiment import Case
 from kantor_fleet.execution.pools import ClusterError, Pool
+from kantor_fleet.exits import Exit
+from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.report.progress import printable
 from kantor_fleet.report.run_progress import RunsView, table_console
 from kantor_fleet.sweep import summary, table

@@ -48,10 +48,6 @@ RETRY_S = 0.2
 """After so long, what has not been heard is said again, and what could not be noted is tried again."""
 
 
-INBOX_MAX = 4096
-"""Envelopes that wait for a step of a participant that holds; the oldest make room."""
-
-
 class RejectedError(RuntimeError):
     """World-sim does not let this process take part; the message says why."""
 

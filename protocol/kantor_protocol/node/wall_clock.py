@@ -4,9 +4,11 @@ import time
 from collections import deque
 
 from kantor_protocol.base.machine import Envelope, Inputs
-from kantor_protocol.node.runner import INBOX_MAX
 from kantor_protocol.scenario.clocks import step_clocks
 from kantor_protocol.wire.messages import Mission, StartClock
+
+INBOX_MAX = 4096
+"""Envelopes that wait for a step of a participant that holds; the oldest make room."""
 
 
 class WallClock:

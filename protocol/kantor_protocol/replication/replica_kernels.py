@@ -237,6 +237,7 @@ def _apply_have(
 
 @kernel
 def config_of(law: np.ndarray) -> ReplicaConfig:
+    """Configuration of a replica from its row of integers, as kernels take it."""
     return ReplicaConfig(
         law[0], law[1] != 0, law[2] != 0, law[3] != 0, law[4] != 0, law[5], law[6], law[7], law[8]
     )
@@ -514,5 +515,6 @@ def pack_lowered(
 
 @kernel
 def end_step(counters: np.ndarray) -> None:
+    """Forget the weights that were lowered in this step, and count the step."""
     counters[LOWERED] = 0
     counters[_STEP] += 1

@@ -1,4 +1,6 @@
-"""Scenarios from TOML, with overrides. A key that does not exist, a value of the wrong type or out of bounds is
+"""Scenarios from TOML, with overrides.
+
+A key that does not exist, a value of the wrong type or out of bounds is
 refused with one line that names it.
 """
 

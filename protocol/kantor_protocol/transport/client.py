@@ -130,6 +130,7 @@ def observer_session(
 
 
 def client(connect: str, identity: Identity, patience_s: float) -> zenoh.Session:
+    """Session of a client with an endpoint, once the router admits it. Raises BusError."""
     check_endpoint(connect, identity)
     await_endpoint(connect, patience_s, identity)
     try:

@@ -58,6 +58,7 @@ def _look_in(host: str, port: int, identity: Identity | None) -> str:
 
 
 def parse_endpoint(endpoint: str) -> tuple[str, str, int]:
+    """Protocol, host and port of an endpoint. Raises BusError."""
     protocol, _, place = endpoint.partition("/")
     host, _, port = place.rpartition(":")
     sound = protocol in {"tcp", "tls"} and host and port.isdecimal() and port.isascii()

@@ -51,4 +51,5 @@ def close_session(session: zenoh.Session, held: list[Any]) -> None:
 
 
 def one_line(error: Exception) -> str:
+    """First line of one of Zenoh's errors, without the place in its source."""
     return str(error).splitlines()[0].partition(" at ")[0][:200]

@@ -7,7 +7,7 @@ from itertools import islice
 import msgspec
 
 from kantor_protocol.base.machine import WORLD_SIM, Envelope, Inputs, ParticipantId
-from kantor_protocol.node.runner import INBOX_MAX
+from kantor_protocol.node.wall_clock import INBOX_MAX
 from kantor_protocol.wire.messages import VERSION, Report, StepRequest, encode
 from kantor_worldsim.engine.simulation import Simulation, Step
 from kantor_worldsim.exchange.config import MissionConfig

@@ -108,6 +108,7 @@ class MetricsFile:
             self.close()
 
     def add(self, row: tuple[Any, ...]) -> None:
+        """Append one row."""
         if self._file is None:
             return
         try:
@@ -116,6 +117,7 @@ class MetricsFile:
             self.close()
 
     def close(self) -> None:
+        """Close the file; more rows are ignored."""
         file, self._file = self._file, None
         if file is not None:
             with contextlib.suppress(OSError):
@@ -123,6 +125,7 @@ class MetricsFile:
 
 
 def new_manifest(scenario: Scenario, seed: int, exchange: str) -> dict[str, Any]:
+    """Manifest of a run that begins now."""
     libraries = ("kantor", "eclipse-zenoh", "numpy", "scipy", "numba", "msgspec", "mcap")
     return {
         "format": 1,
@@ -139,6 +142,7 @@ def new_manifest(scenario: Scenario, seed: int, exchange: str) -> dict[str, Any]
 
 
 def write_json(path: Path, tree: dict[str, Any]) -> None:
+    """Replace a file by a JSON tree; see `write_text`."""
     write_text(path, json.dumps(tree, indent=2) + "\n")
 
 

@@ -8,8 +8,6 @@ from kantor_agent.planners.market.costs import Costs, DistanceField, price_of
 from kantor_agent.planners.market.rules import MarketRules, is_open, is_reachable
 from kantor_protocol.base.grid import NOWHERE
 
-# All tours in one place.
-
 
 class CentralMarket:
     """The supervisor's market."""

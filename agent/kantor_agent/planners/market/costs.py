@@ -7,7 +7,6 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_agent.mapping.cost_map import CostMap
-from kantor_agent.planners.market.goals import PER_CELL
 from kantor_protocol.base.grid import NOWHERE
 from kantor_protocol.base.kernels import kernel
 
@@ -21,10 +20,9 @@ DistanceField = npt.NDArray[np.float64]
 NOBODY = -1
 
 
+PER_CELL = 16
+"""Prices and bids are counted in such parts of a cell: closer ones are equal."""
 _PRICE_MAX = 1 << 40
-
-
-# Costs.
 
 
 class Costs:

@@ -19,13 +19,6 @@ _LEAF_RANGES = 2.0
 """quadtree: a part that is no longer than this is not split."""
 
 
-PER_CELL = 16
-"""Prices and bids are counted in such parts of a cell: closer ones are equal."""
-
-
-# Goals.
-
-
 def random_goals(terrain: CostMap, seed: int, robot: int, tick: int, count: int) -> list[int]:
     """So many cells anywhere, drawn anew in every tick; those that are known are left out."""
     cells = terrain.frame.cells

@@ -6,8 +6,6 @@ from typing import NamedTuple
 from kantor_agent.planners.market.costs import NOBODY
 from kantor_protocol.base.grid import NOWHERE
 
-# A tour in every robot.
-
 HEAD = 4
 
 

@@ -27,20 +27,11 @@ let go in turn the heir has to name one later, and so on: the last one to take t
 Words that are lost, late or repeated can only make two hold it for a while.
 """
 
-import numpy as np
-
-from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_agent.planners.map_base import Situation, Task
 from kantor_agent.planners.market.central import CentralMarket
 from kantor_agent.planners.market.rules import MarketRules
 from kantor_agent.planners.market.trader import Trader
 from kantor_protocol.scenario.schema import Scenario
-
-
-def task_is_stale(situation: Situation, member: Member) -> bool:
-    """Whether a member's target is no frontier any more."""
-    frontiers = situation.frontiers
-    at = int(np.searchsorted(frontiers, member.task.target))
-    return at >= frontiers.size or int(frontiers[at]) != member.task.target
 
 
 class Market:

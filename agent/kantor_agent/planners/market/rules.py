@@ -65,3 +65,10 @@ def is_open(terrain: CostMap, goal: int) -> bool:
 def is_reachable(field: DistanceField, goal: int) -> bool:
     """Whether a way may lead to a goal."""
     return bool(field[goal] < math.inf)
+
+
+def task_is_stale(situation: Situation, member: Member) -> bool:
+    """Whether a member's target is no frontier any more."""
+    frontiers = situation.frontiers
+    at = int(np.searchsorted(frontiers, member.task.target))
+    return at >= frontiers.size or int(frontiers[at]) != member.task.target

@@ -6,8 +6,7 @@ from typing import NamedTuple
 from kantor_agent.planners.map_base import Member, Situation, Task, past
 from kantor_agent.planners.market.costs import NOBODY, Costs, DistanceField, near, price_of
 from kantor_agent.planners.market.memo import Memo, packed, unpacked
-from kantor_agent.planners.market.planner import task_is_stale
-from kantor_agent.planners.market.rules import MarketRules, is_open, is_reachable
+from kantor_agent.planners.market.rules import MarketRules, is_open, is_reachable, task_is_stale
 from kantor_protocol.base.grid import NOWHERE
 from kantor_protocol.scenario.schema import Scenario
 

@@ -4,18 +4,14 @@ They are injected where the radio rules (`kantor_worldsim.faults`), so they hold
 message that is under way when a window ends still arrives as ruled.
 """
 
-import math
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Annotated, Literal
+from collections.abc import Callable
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
 from kantor_protocol.base.machine import ParticipantId
-from kantor_protocol.scenario.faults.base import Fault, Names, Share, Span, complaints_of_names
+from kantor_protocol.scenario.faults.base import Fault, Names, Share, Span
 from kantor_protocol.scenario.types import NotNegative, Positive, Probability, Seconds
-
-if TYPE_CHECKING:
-    from kantor_protocol.scenario.schema import Scenario
 
 Severs = Callable[[ParticipantId, ParticipantId], bool]
 """Whether nothing of a sender (first) reaches a receiver (second)."""
@@ -31,11 +27,6 @@ class OnLinks(Fault, frozen=True, kw_only=True):
 
     robots: Names = ()
     """Links with one of these participants at an end; by default every link."""
-
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also names that nobody has."""
-        yield from super().complaints(scenario)
-        yield from complaints_of_names("robots", self.robots, scenario)
 
 
 class Drop(OnLinks, frozen=True, kw_only=True, tag="drop"):
@@ -64,12 +55,6 @@ class Delay(OnLinks, frozen=True, kw_only=True, tag="delay"):
 
     delay_s: Seconds = 0.0
     jitter_s: Seconds = 0.0
-
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also a delay of nothing."""
-        yield from super().complaints(scenario)
-        if not self.delay_s + self.jitter_s > 0.0:
-            yield "delay_s: delays nothing; set it, or jitter_s"
 
 
 class Duplicate(OnLinks, frozen=True, kw_only=True, tag="duplicate"):
@@ -109,16 +94,6 @@ class OneWay(Fault, frozen=True, kw_only=True, tag="one-way"):
         """Which links it cuts."""
         senders, receivers = frozenset(self.senders or roster), frozenset(self.receivers or roster)
         return lambda sender, receiver: sender in senders and receiver in receivers
-
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also names that nobody has, and a cut of nothing or of everything."""
-        yield from super().complaints(scenario)
-        yield from complaints_of_names("senders", self.senders, scenario)
-        yield from complaints_of_names("receivers", self.receivers, scenario)
-        if not self.senders and not self.receivers:
-            yield "senders: missing; set senders, receivers or both"
-        elif not _cuts_any(self.severs(scenario.roster), scenario.roster):
-            yield "receivers: no link leads there from the senders; name others"
 
 
 class Partition(Fault, frozen=True, kw_only=True, tag="partition"):
@@ -164,32 +139,9 @@ class Partition(Fault, frozen=True, kw_only=True, tag="partition"):
         sides = dict.fromkeys(roster, 0)
         return sides | {name: i for i, part in enumerate(parts, 1) for name in part}
 
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also parts that are none, and a cut of nothing."""
-        yield from super().complaints(scenario)
-        for key, shape in (("robots", "isolate"), ("groups", "groups")):
-            if bool(getattr(self, key)) != (self.shape == shape):
-                needs = "missing; set it" if self.shape == shape else f'only with shape = "{shape}"'
-                yield f"{key}: {needs}"
-        yield from complaints_of_names("robots", self.robots, scenario)
-        for i, group in enumerate(self.groups):
-            yield from complaints_of_names(f"groups[{i}]", group, scenario)
-            yield from () if group else (f"groups[{i}]: nobody is in it; name somebody",)
-        yield from complaints_of_names("groups", sum(self.groups, ()), scenario)
-        if self.flap_share is not None and self.flap_s is None:
-            yield "flap_share: only with flap_s; set it"
-        if not _cuts_any(self.severs(scenario.roster), scenario.roster):
-            yield f"shape: {self.shape} cuts no link of a team of {len(scenario.roster)}"
-
 
 class Clog(OnLinks, frozen=True, kw_only=True, tag="clog"):
     """What is sent in the window arrives when it ends, in a burst, in the order of (sender, sequence)."""
-
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also a clog without an end."""
-        yield from super().complaints(scenario)
-        if self.until_s is None:
-            yield "until_s: missing; a clog needs an end"
 
 
 class Bandwidth(Fault, frozen=True, kw_only=True, tag="bandwidth"):
@@ -201,13 +153,6 @@ class Bandwidth(Fault, frozen=True, kw_only=True, tag="bandwidth"):
     """Of message bodies. A message takes its time on the air whether anybody hears it or not."""
     queue_bytes: Annotated[int, Meta(ge=0, le=2**62)] | None = None
     """How much may wait; what finds more before it is dropped. By default everything waits."""
-
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also names that nobody has, and a trickle."""
-        yield from super().complaints(scenario)
-        yield from complaints_of_names("robots", self.robots, scenario)
-        if self.bytes_per_s < 1e-3:
-            yield f"bytes_per_s: {self.bytes_per_s:g} is less than a byte in 1000 s; use drop"
 
 
 class Range(OnLinks, frozen=True, kw_only=True, tag="range"):
@@ -223,21 +168,6 @@ class Range(OnLinks, frozen=True, kw_only=True, tag="range"):
         return (
             range_m * (self.factor or 0.0) if self.range_m is None else min(range_m, self.range_m)
         )
-
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also a range that does not shrink."""
-        yield from super().complaints(scenario)
-        if (self.range_m is None) == (self.factor is None):
-            yield "range_m: set either range_m or factor"
-            return
-        whose = "supervisor" if scenario.centralized else "radio"
-        before_m = scenario.supervisor.range_m if scenario.centralized else scenario.radio.range_m
-        if self.factor is not None and before_m == math.inf:
-            yield f"factor: {whose}.range_m is infinite and stays so; set range_m"
-        if self.range_m is not None and self.range_m >= before_m:
-            yield f"range_m: {whose}.range_m is {before_m:g} m already; set a shorter one"
-        if scenario.centralized and scenario.mapping and scenario.supervisor.pose_m is None:
-            yield "range_m: the supervisor has no place on the map; set supervisor.pose_m"
 
 
 class Hostile(OnLinks, frozen=True, kw_only=True, tag="hostile"):
@@ -264,7 +194,3 @@ LinkFault = (
     | Range
     | Hostile
 )
-
-
-def _cuts_any(severs: Severs, roster: Names) -> bool:
-    return any(severs(one, other) for one in roster for other in roster if one != other)

@@ -4,16 +4,11 @@ In process and in lockstep they are played by whoever runs the mission, with the
 they are real: signals, new processes, limits of the operating system.
 """
 
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from kantor_protocol.base.machine import WORLD_SIM
-from kantor_protocol.scenario.faults.base import Fault, Names, complaints_of_names
-
-if TYPE_CHECKING:
-    from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.scenario.faults.base import Fault, Names
 
 Disk = Literal["kept", "torn", "lost"]
 """What a process that starts again finds of its snapshot: all, all but the end, or nothing."""
@@ -24,14 +19,6 @@ class OnProcesses(Fault, frozen=True, kw_only=True):
 
     who: Annotated[Names, Meta(min_length=1)]
     """Participants, or worldsim where that is said."""
-
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also names that nobody has."""
-        yield from super().complaints(scenario)
-        participants = tuple(
-            name for name in self.who if name != WORLD_SIM or not self.of_world_sim
-        )
-        yield from complaints_of_names("who", participants, scenario)
 
     @property
     def of_world_sim(self) -> bool:
@@ -44,12 +31,8 @@ class OnProcesses(Fault, frozen=True, kw_only=True):
         return True
 
 
-class _WithEnd(OnProcesses, frozen=True, kw_only=True):
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also one that never ends."""
-        yield from super().complaints(scenario)
-        if self.until_s is None:
-            yield f"until_s: missing; a {self.__struct_config__.tag} needs an end"
+class WithEnd(OnProcesses, frozen=True, kw_only=True):
+    """A fault of processes that must end."""
 
 
 class Kill(OnProcesses, frozen=True, kw_only=True, tag="kill"):
@@ -65,17 +48,8 @@ class Kill(OnProcesses, frozen=True, kw_only=True, tag="kill"):
         """It starts again from its journal."""
         return True
 
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also a mission without a world, or a world that forgets."""
-        yield from super().complaints(scenario)
-        if WORLD_SIM in self.who and self.until_s is None:
-            yield "until_s: missing; a mission cannot end without world-sim"
-        if WORLD_SIM in self.who and (self.disk != "kept" or self.mid_step):
-            key = "disk" if self.disk != "kept" else "mid_step"
-            yield f"{key}: only for participants; leave it out for worldsim"
 
-
-class Pause(_WithEnd, frozen=True, kw_only=True, tag="pause"):
+class Pause(WithEnd, frozen=True, kw_only=True, tag="pause"):
     """SIGSTOP at from_s, SIGCONT at until_s."""
 
     @property
@@ -84,16 +58,8 @@ class Pause(_WithEnd, frozen=True, kw_only=True, tag="pause"):
         return True
 
 
-class Late(_WithEnd, frozen=True, kw_only=True, tag="late"):
+class Late(WithEnd, frozen=True, kw_only=True, tag="late"):
     """It is not there from the start and joins at until_s."""
-
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also one that begins later, and a team of which nobody is there."""
-        yield from super().complaints(scenario)
-        if self.from_s > 0.0:
-            yield "from_s: a late joiner is missing from the start; leave it out"
-        if set(scenario.robot_ids) <= set(self.who):
-            yield "who: nobody would be there at the start; leave out a robot"
 
 
 class Slow(OnProcesses, frozen=True, kw_only=True, tag="slow"):
@@ -102,7 +68,7 @@ class Slow(OnProcesses, frozen=True, kw_only=True, tag="slow"):
     every: Annotated[int, Meta(ge=2, le=1000)]
 
 
-class FullDisk(_WithEnd, frozen=True, kw_only=True, tag="full-disk"):
+class FullDisk(WithEnd, frozen=True, kw_only=True, tag="full-disk"):
     """It cannot write its snapshot; what it cannot note it must not do."""
 
 
@@ -123,12 +89,6 @@ class ClockFault(OnProcesses, frozen=True, kw_only=True, tag="clock"):
         drift_ns = (now_ns - self.from_ns) * round(self.rate_ppm) // 1_000_000
         return round(self.offset_s * 1e9) + drift_ns
 
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also a clock that is right."""
-        yield from super().complaints(scenario)
-        if self.offset_s == 0.0 and round(self.rate_ppm) == 0:
-            yield "offset_s: the clock is right; set it, or rate_ppm"
-
 
 class Impostor(OnProcesses, frozen=True, kw_only=True, tag="impostor"):
     """At from_s a second process asks to join under the same id, with the right credentials."""
@@ -137,12 +97,6 @@ class Impostor(OnProcesses, frozen=True, kw_only=True, tag="impostor"):
     def stops(self) -> bool:
         """It is somebody else."""
         return False
-
-    def complaints(self, scenario: "Scenario") -> Iterable[str]:
-        """Also an end, which it does not have."""
-        yield from super().complaints(scenario)
-        if self.until_s is not None:
-            yield "until_s: an impostor asks once, at from_s; leave it out"
 
 
 ProcessFault = Kill | Pause | Late | Slow | FullDisk | ClockFault | Impostor

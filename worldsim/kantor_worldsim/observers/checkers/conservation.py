@@ -32,6 +32,7 @@ from kantor_worldsim.record.columnar import ColumnarBatch
 
 @kernel
 def check_energy(state: CheckerState, law: Limits, reading: ColumnarBatch, row: int) -> None:
+    """A step spends units that are left, one point at a time, within the budget."""
     act = reading.acts[row]
     who = act[of.PLACE]
     book, slot = state.book[who], state.book[who, SLOT]
@@ -60,6 +61,7 @@ def check_energy(state: CheckerState, law: Limits, reading: ColumnarBatch, row: 
 
 @kernel
 def check_weights(state: CheckerState, law: Limits, reading: ColumnarBatch, row: int) -> None:
+    """Weights only fall, and by what was spent or merged."""
     act = reading.acts[row]
     book, view = state.book[act[of.PLACE]], state.views[act[of.PLACE]]
     if act[of.LOWERED_COUNT] == of.NOT_DECODED:

@@ -84,6 +84,7 @@ def check_inbox(
 
 @kernel
 def post(state: CheckerState, reading: ColumnarBatch, row: int) -> None:
+    """Note the envelopes that a step sends; a sequence number is used once."""
     act = reading.acts[row]
     for sent in range(act[of.SENT], act[of.SENT] + act[of.SENT_COUNT]):
         source, sequence = reading.sent[sent, of.SOURCE], reading.sent[sent, of.SEQUENCE]
@@ -99,6 +100,7 @@ def post(state: CheckerState, reading: ColumnarBatch, row: int) -> None:
 
 @kernel
 def post_forged(state: CheckerState, reading: ColumnarBatch) -> None:
+    """Note the envelopes that a fault has put on the air."""
     for row in range(reading.sizes[of.INJECTED]):
         forged, injected = state.forged[0, state.found[FORGED]], reading.injected[row]
         forged[0], forged[1] = injected[of.SOURCE], injected[of.SEQUENCE]
@@ -160,6 +162,7 @@ def check_decision(
     row: int,
     now_ns: int,
 ) -> None:
+    """A delivery decision is about an envelope that was sent, and about a link that stands."""
     verdict = reading.verdicts[row]
     source, sequence = verdict[of.SOURCE], verdict[of.SEQUENCE]
     receiver, due_ns = verdict[of.TARGET], verdict[of.DUE_NS]

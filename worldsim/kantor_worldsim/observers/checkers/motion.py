@@ -52,6 +52,7 @@ def check_verdict(state: CheckerState, law: Limits, reading: ColumnarBatch, row:
 
 @kernel
 def check_order(state: CheckerState, reading: ColumnarBatch, row: int) -> None:
+    """Steps are numbered without gaps, and made with the newest observation."""
     act = reading.acts[row]
     book = state.book[act[of.PLACE]]
     if act[of.STEP] != book[STEPS] + 1:
@@ -77,6 +78,7 @@ def check_refusals(state: CheckerState, reading: ColumnarBatch, row: int) -> Non
 
 @kernel
 def check_speed(state: CheckerState, law: Limits, reading: ColumnarBatch, row: int) -> None:
+    """A participant moves no farther than its speed allows since its last step."""
     act = reading.acts[row]
     who = act[of.PLACE]
     elapsed_ns = act[of.NOW_NS] - state.book[who, MOVED_NS]

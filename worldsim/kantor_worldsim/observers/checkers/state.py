@@ -191,6 +191,7 @@ class Limits(NamedTuple):
 def note_violation(
     state: CheckerState, fault: int, row: int, item: int, a: int, b: int, x_m: float, y_m: float
 ) -> None:
+    """Note a violation as numbers; it is put into words with the record at hand."""
     at = state.found[FAULTS]
     state.found[FAULTS] += 1
     if at < state.faults.shape[0]:

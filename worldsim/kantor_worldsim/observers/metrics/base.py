@@ -12,7 +12,15 @@ from kantor_protocol.base.machine import ParticipantId
 from kantor_protocol.base.random_walk import RandomWalk
 from kantor_protocol.scenario.faults.schedule import kind_of
 from kantor_protocol.transport.rate_limit import Excess
-from kantor_worldsim.observers.metrics.density import (
+from kantor_worldsim.observers.metrics.result import (
+    LINK_COUNTERS,
+    PROCESS_COUNTERS,
+    BytesPerRobotTick,
+    FaultCounts,
+    Rejoining,
+    Result,
+)
+from kantor_worldsim.observers.metrics.tally import (
     BYTES_TOTAL,
     BYTES_WEIGHTS,
     DELIVERIES,
@@ -25,17 +33,9 @@ from kantor_worldsim.observers.metrics.density import (
     REFUSED_BEFORE,
     STEPS,
     VIOLATIONS,
-    DensityTally,
+    RunTally,
     begin_anew,
     follow,
-)
-from kantor_worldsim.observers.metrics.result import (
-    LINK_COUNTERS,
-    PROCESS_COUNTERS,
-    BytesPerRobotTick,
-    FaultCounts,
-    Rejoining,
-    Result,
 )
 from kantor_worldsim.record.columnar import ColumnarDecoder
 from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record
@@ -104,7 +104,7 @@ class RunMetrics:
         )
         names, samples, robots = scenario.roster, site.samples_m.shape[0], scenario.robots.count
         self._targets = site.targets_m.shape[0]
-        self._tally = DensityTally(
+        self._tally = RunTally(
             counts=np.zeros(11, dtype=np.int64),
             shipped=np.zeros(2),
             standing=np.zeros((len(names), 4), dtype=np.int64),

@@ -1,50 +1,15 @@
-"""`kantor run`: a mission from start to picture."""
+"""The end of a run for a person: the picture is drawn, and a summary printed."""
 
 import csv
 import sys
-import time
 from pathlib import Path
 
 import msgspec
 
-from kantor_fleet.cli.exits import Exit, warn
-from kantor_fleet.cli.interrupts import Interrupts
-from kantor_fleet.execution.in_process_team import play
-from kantor_fleet.processes.local import FleetConfig, local_fleet, watch_progress
-from kantor_fleet.processes.preload import warm_up
-from kantor_fleet.report.progress import ProgressView
-from kantor_protocol.scenario.schema import Scenario
-from kantor_protocol.transport.session import BusError
+from kantor_fleet.exits import Exit
 from kantor_worldsim.observers.metrics.result import MapResult, Result
-from kantor_worldsim.observers.progress import progress
-from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.record.journal import read
-from kantor_worldsim.record.records import Record
-from kantor_worldsim.record.run_folder import JOURNAL, METRICS, REPORT, RESULT, folder_for
-from kantor_worldsim.world.world import WorldSetup
-
-_GLANCE_S = 0.2
-
-
-def run(
-    scenario: Scenario, seed: int, exchange: str, speed: float, out: Path, exact_every: int | None
-) -> Exit:
-    """Run a mission and leave its folder; what to exit with. Raises ScenarioError, BusError, OSError.
-
-    exact_every: see Metrics.
-    """
-    site = WorldSetup.of(scenario, seed)
-    warn(site.warnings)
-    folder = folder_for(scenario, seed, out)
-    with Interrupts() as interrupts:
-        if exchange == "in-process":
-            recording = Recording(scenario, seed, exchange, folder, exact_every)
-            code = _run_in_process(scenario, seed, site, recording, interrupts)
-        else:
-            order = FleetConfig(scenario, seed, exchange, speed, folder, exact_every)
-            code = _run_processes(order, interrupts)
-        conclude(folder)
-        return interrupts.code or code
+from kantor_worldsim.record.run_folder import JOURNAL, METRICS, REPORT, RESULT
 
 
 def conclude(folder: Path) -> None:
@@ -171,57 +136,3 @@ def _of_map(result: Result, map_: MapResult) -> list[str]:
     found = [_found(result)] if result.targets else []
     lines = [f"  explored  {explored}", f"  distance  {distance}", f"  8 regions {even}"]
     return [*lines, *found]
-
-
-def _run_in_process(
-    scenario: Scenario, seed: int, site: WorldSetup, recording: Recording, interrupts: Interrupts
-) -> Exit:
-    with ProgressView(scenario.name) as view:
-        warm_up()
-        glanced = time.monotonic()
-
-        def glance(_record: Record) -> None:
-            nonlocal glanced
-            if time.monotonic() - glanced >= _GLANCE_S:
-                glanced = time.monotonic()
-                view.show(progress(recording.metrics, scenario, "running", ""))
-
-        reason = play(scenario, seed, site, [recording.take, glance], stopped=interrupts)
-        view.show(progress(recording.metrics, scenario, "over", reason))
-    return verdict(recording.finish())
-
-
-def _run_processes(order: FleetConfig, interrupts: Interrupts) -> Exit:
-    with ProgressView(order.scenario.name) as view:
-        view.note("starting the fleet (the first time, kernels are compiled: about half a minute)")
-        warm_up()
-        if interrupts():
-            return Exit.INTERRUPTED
-        with local_fleet(order) as fleet:
-            asked = False
-            try:
-                for message in watch_progress(fleet):
-                    if message is not None:
-                        view.show(message)
-                    for name, failure in fleet.newly_failed():
-                        view.note(f"{name} ended with {_told(failure)}; the others go on")
-                    if (ended := fleet.revive()) is not None:
-                        view.note(f"world-sim ended with {ended}; it goes on from its record")
-                    waiting = message is not None and message.phase == "waiting"
-                    if not asked and (interrupts() or (waiting and fleet.deserted)):
-                        asked = True
-                        view.note("ending the mission")
-                        fleet.stop()
-            except BusError:
-                view.note(f"world-sim is not there; see {order.folder / 'logs' / 'worldsim.log'}")
-            fleet.disband()
-            code = fleet.world_sim.exitcode
-            failed = fleet.any_failed
-    result = read_result(order.folder)
-    if code or result is None:
-        return Exit(code) if code in set(Exit) else Exit.PROCESS_FAILED
-    return Exit.PROCESS_FAILED if failed else verdict(result)
-
-
-def _told(code: int) -> str:
-    return f"signal {-code}" if code < 0 else f"exit code {code}"

@@ -4,7 +4,7 @@ import signal
 from types import FrameType
 from typing import Self
 
-from kantor_fleet.cli.exits import Exit
+from kantor_fleet.exits import Exit
 
 
 class Interrupts:

@@ -1,0 +1,159 @@
+"""The tally of a run: counters that every batch changes, in one compiled pass."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.machine import State
+from kantor_worldsim.radio.channel import DROPPED
+from kantor_worldsim.record import columnar as of
+
+# Slots of Tally.counts and Tally.shipped.
+VIOLATIONS, STEPS, BYTES_WEIGHTS, BYTES_TOTAL, ENERGY, UNITS = 0, 1, 2, 3, 4, 5
+
+
+DELIVERIES, DROPS, FIRST_CONTACT, LEAST, REFUSED_BEFORE = 6, 7, 8, 9, 10
+
+
+_EVER, NOW = 0, 1
+
+
+NEVER = -1
+
+
+class RunTally(NamedTuple):
+    """What is counted batch by batch. n participants, of them m robots; N samples."""
+
+    counts: npt.NDArray[np.int64]
+    """(11,): violations, robot-steps, bytes on weights keys and in all, points and units shipped,
+    deliveries, drops, step of the first contact or _NEVER, units in `least`, messages that
+    incarnations refused that are no more."""
+    shipped: npt.NDArray[np.float64]
+    """(2,) mass times metres: since the start, in this tick."""
+    standing: npt.NDArray[np.int64]
+    """(n, 4): refused messages; whether it rests; step in which it saw no weight left, or _NEVER; how far
+    its clock was ahead in its last step."""
+    shipped_by: npt.NDArray[np.float64]
+    """(m,) since the start."""
+    xy_m: npt.NDArray[np.float64]
+    """(m, 2) where robots are, world frame."""
+    views: npt.NDArray[np.int64]
+    """(n, N) the weight vector of each, in units."""
+    least: npt.NDArray[np.int64]
+    """(N,) the least of all views."""
+    true_left: npt.NDArray[np.int64]
+    """(N,) first weight minus everybody's spending; negative where a sample was filled twice."""
+
+
+@kernel
+def _lower(tally: RunTally, place: int, sample: int, left: int) -> None:
+    """Put an entry into a view. A record that is not sound may let it rise."""
+    before, least = tally.views[place, sample], tally.least[sample]
+    tally.views[place, sample] = left
+    lower = min(left, least)
+    if left > before == least:
+        lower = left
+        for other in range(tally.views.shape[0]):
+            lower = min(lower, tally.views[other, sample])
+    tally.least[sample] = lower
+    tally.counts[LEAST] += lower - least
+
+
+@kernel
+def begin_anew(
+    counts: np.ndarray,
+    shipped: np.ndarray,
+    standing: np.ndarray,
+    shipped_by: np.ndarray,
+    xy_m: np.ndarray,
+    views: np.ndarray,
+    least: np.ndarray,
+    true_left: np.ndarray,
+    place: int,
+    units: int,
+) -> None:
+    """Who drives a body has forgotten all: its view is full, it rests no more, it has refused nothing."""
+    tally = RunTally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left)
+    counts[REFUSED_BEFORE] += standing[place, 0]
+    standing[place, 0], standing[place, 1], standing[place, 2] = 0, 0, NEVER
+    for sample in range(least.shape[0]):
+        _lower(tally, place, sample, units)
+
+
+@kernel
+def _ship(
+    tally: RunTally, samples_m: np.ndarray, place: int, sample: int, units: int, whole: int
+) -> None:
+    dx = samples_m[sample, 0] - tally.xy_m[place, 0]
+    dy = samples_m[sample, 1] - tally.xy_m[place, 1]
+    cost = units * math.hypot(dx, dy) / whole
+    tally.shipped[_EVER] += cost
+    tally.shipped[NOW] += cost
+    tally.shipped_by[place] += cost
+    tally.counts[UNITS] += units
+    tally.true_left[sample] -= units
+
+
+@kernel
+def follow(
+    _payload: bytes,
+    sizes: np.ndarray,
+    acts: np.ndarray,
+    poses_m: np.ndarray,
+    _heard: np.ndarray,
+    _sent: np.ndarray,
+    verdicts: np.ndarray,
+    pairs: np.ndarray,
+    _injected: np.ndarray,
+    counts: np.ndarray,
+    shipped: np.ndarray,
+    standing: np.ndarray,
+    shipped_by: np.ndarray,
+    xy_m: np.ndarray,
+    views: np.ndarray,
+    least: np.ndarray,
+    true_left: np.ndarray,
+    samples_m: np.ndarray,
+    whole: int,
+) -> int:
+    """Count one batch, see Reading and Tally; how many targets were found in it.
+
+    samples_m: (N, 2) as they are now.
+    """
+    tally = RunTally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left)
+    finds = 0
+    for row in range(sizes[of.VERDICTS]):
+        counts[DROPS if verdicts[row, of.DUE_NS] == DROPPED else DELIVERIES] += 1
+    for row in range(sizes[of.ACTS]):
+        act = acts[row]
+        place = act[of.PLACE]
+        if place < 0 or not act[of.PRESENT]:
+            continue
+        counts[VIOLATIONS] += act[of.VIOLATIONS]
+        if act[of.TOO_FAST] > 0 and act[of.SKEW_NS] > standing[place, 3]:  # see the checker's rule
+            counts[VIOLATIONS] -= 1
+        standing[place, 3] = act[of.SKEW_NS]
+        standing[place, 0] = act[of.REFUSED]
+        for i in range(act[of.LOWERED], act[of.LOWERED] + max(0, act[of.LOWERED_COUNT])):
+            _lower(tally, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS])
+        if place >= xy_m.shape[0]:  # the supervisor
+            continue
+        xy_m[place, 0], xy_m[place, 1] = poses_m[row, 0], poses_m[row, 1]
+        counts[STEPS] += 1
+        counts[BYTES_WEIGHTS] += act[of.WEIGHTS_BYTES]
+        counts[BYTES_TOTAL] += act[of.WEIGHTS_BYTES] + act[of.BODY_BYTES]
+        finds += act[of.FINDS]
+        if act[of.HEARD_COUNT] > 0 and counts[FIRST_CONTACT] == NEVER:
+            counts[FIRST_CONTACT] = act[of.STEP]
+        if act[of.STATE] != State.EXPLORING.value:
+            standing[place, 1] = 1
+        if act[of.STATE] == State.FINISHED.value and standing[place, 2] == NEVER:
+            standing[place, 2] = act[of.STEP]
+        if act[of.SPENT_COUNT] > 0 and not act[of.VOID]:
+            counts[ENERGY] += 1
+            for i in range(act[of.SPENT], act[of.SPENT] + act[of.SPENT_COUNT]):
+                _ship(tally, samples_m, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS], whole)
+    return finds
