@@ -66,7 +66,7 @@ $(VENV)/.developing: $(VENV)/.installed
 	@touch $@
 
 # Numba keeps a kernel until its own file changes; one that has another file's code inlined goes stale.
-$(VENV)/.kernels: $(wildcard */kantor_*/*.py */kantor_*/*/*.py) | $(VENV)/.installed
+$(VENV)/.kernels: $(shell find $(wildcard */kantor_*) -name "*.py") | $(VENV)/.installed
 	find $(wildcard */kantor_*) -name '*.nb[ic]' -delete
 	@touch $@
 

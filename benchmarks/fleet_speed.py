@@ -151,10 +151,10 @@ def _run(setting: Setting, site: WorldSetup, *, recorded: bool) -> Cost:
     """One run, without setting up its robots."""
     scenario = setting.scenario
     recording = Recording(scenario, 0, "in-process") if recorded else None
-    stage = Simulation(scenario, 0, site, [recording.take] if recording else [])
+    simulation = Simulation(scenario, 0, site, [recording.observe] if recording else [])
     exchange = in_process(team(scenario, 0, site))
     start_s = time.process_time()
-    simulate(stage, exchange, 0, lambda: False)
+    simulate(simulation, exchange, 0, lambda: False)
     cpu_s = time.process_time() - start_s
     steps = setting.ticks * scenario.robots.count
     return Cost(steps / cpu_s, _heard(recording.finish()) if recording else 0.0)

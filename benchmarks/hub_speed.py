@@ -359,7 +359,7 @@ def _be_robots(names: Sequence[str], endpoint: str, place: Path, pipe: Connectio
         robots = [stack.enter_context(_robot(name, endpoint, place)) for name in names]
         gc.freeze()
         while not pipe.poll():
-            acted = [robot.act() for robot in robots]
+            acted = [robot.step_record() for robot in robots]
             if not any(acted):
                 time.sleep(POLL_S)
         pipe.send(([answer for r in robots for answer in r.answers_s], sum(r.held for r in robots)))
@@ -387,17 +387,17 @@ class _Robot:
         self.held = 0
         self.over = False
 
-    def act(self) -> bool:
+    def step_record(self) -> bool:
         """Take what has come, and step if that is due; whether there was anything to do."""
         busy = False
         while (payload := self._line.next(0.0)) is not None:
-            self._take(decode_to_participant(payload))
+            self._handle(decode_to_participant(payload))
             busy = True
         if self._life is not None and self._go is not None and not self.over:
             busy = self._step(self._life) or busy
         return busy
 
-    def _take(self, message: object) -> None:
+    def _handle(self, message: object) -> None:
         if isinstance(message, Mission):
             self._prepare(message)
         elif isinstance(message, StartClock):

@@ -90,7 +90,7 @@ def _run(name: str, overrides: tuple[str, ...], seed: int) -> Cost:
     site = WorldSetup.of(scenario, seed)
     recording = Recording(scenario, seed, "in-process")
     start_s = time.process_time()
-    play(scenario, seed, site, [recording.take])
+    play(scenario, seed, site, [recording.observe])
     spent_s = time.process_time() - start_s
     result = recording.finish()
     assert result.map is not None

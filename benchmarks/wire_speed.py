@@ -34,8 +34,8 @@ def measure(*, quick: bool) -> Table:
         scenario = find(name)
         site = WorldSetup.of(scenario, 0)
         recording = Recording(scenario, 0, "in-process")
-        stage = Simulation(scenario, 0, site, [recording.take])
-        simulate(stage, in_process(team(scenario, 0, site)), 0, lambda: False)
+        simulation = Simulation(scenario, 0, site, [recording.observe])
+        simulate(simulation, in_process(team(scenario, 0, site)), 0, lambda: False)
         wire = recording.finish().bytes_per_robot_tick
         whole = 8 * site.samples_m.shape[0]
         reached = wire.weights <= WEIGHTS_MAX

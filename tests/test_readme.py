@@ -30,7 +30,7 @@ def example(name: str) -> Any:
 def played(scenario: Scenario) -> Result:
     """A mission in process, with every referee."""
     recording = Recording(scenario, 0, "in-process")
-    play(scenario, 0, WorldSetup.of(scenario, 0), [recording.take])
+    play(scenario, 0, WorldSetup.of(scenario, 0), [recording.observe])
     return recording.finish()
 
 

@@ -16,8 +16,8 @@ class DensitySupervisor:
     def __init__(self, me: ParticipantId, scenario: Scenario, body: Body, samples: int) -> None:
         """body: what it takes over. samples: N."""
         units = Units.of(scenario.energy.points, samples)
-        self._replica = build_replica(me, scenario, units, samples, body.epoch)
-        self._radio = Gossip(me, scenario, body.epoch)
+        self._replica = build_replica(me, scenario, units, samples, body.incarnation)
+        self._radio = Gossip(me, scenario, body.incarnation)
         self._publisher = WeightsPublisher(
             self._replica.weights,
             scenario.publish.weights_every,

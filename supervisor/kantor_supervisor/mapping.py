@@ -29,10 +29,10 @@ class MappingSupervisor:
         """body: what it takes over. frame: how the cells lie, not what is in them."""
         self._frame = frame
         self._robots = scenario.robots.count
-        self._replica = build_replica(me, scenario, None, entries(frame), body.epoch)
-        self._radio = Gossip(me, scenario, body.epoch)
-        self._chart = FusedMap(frame, self._replica.slots)
-        self._dispatch = Assignment(scenario, CostMap(scenario, self._chart), seed, None)
+        self._replica = build_replica(me, scenario, None, entries(frame), body.incarnation)
+        self._radio = Gossip(me, scenario, body.incarnation)
+        self._fused_map = FusedMap(frame, self._replica.slots)
+        self._dispatch = Assignment(scenario, CostMap(scenario, self._fused_map), seed, None)
         self._tasks: dict[int, Task] = {}
         self._since: dict[int, int] = {}
         self._step, self._pose = body.step, body.pose
@@ -43,7 +43,7 @@ class MappingSupervisor:
         """Take in what the robots sent, give targets, tell everybody what they lack."""
         self._step += 1
         self._radio.hear(inputs.inbox, self._replica.learn)
-        self._chart.fold(self._replica)
+        self._fused_map.fold(self._replica)
         tick = inputs.now_ns // self._period_ns
         for robot, task in self._dispatch.decide(*self._roll_call(tick), tick).items():
             self._tasks[robot], self._since[robot] = task, tick

@@ -164,8 +164,8 @@ def test_last_point_ships_what_is_left() -> None:
     one, other = (belief_over(scattered(1), 5, me=me, origins=2) for me in range(2))
     for _ in range(4):
         spend(other, 0.0, 0.0)
-    have, logs, claims = other.replica.compose(0)
-    one.replica.learn(1, have, logs, claims)
+    version_vector, logs, claims = other.replica.compose(0)
+    one.replica.learn(1, version_vector, logs, claims)
     one.advance(0)
 
     assert one.weights.tolist() == [1]
@@ -185,8 +185,8 @@ def test_belief_holds_when_logs_outgrow_their_room(*, ledger: bool) -> None:
             plan.extend(spend(belief, x_m if belief is one else 100.0 - x_m, y_m))
             belief.advance(0)
             belief.replica.end_step()
-    have, logs, claims = other.replica.compose(0)
-    assert one.replica.learn(1, have, logs, claims)
+    version_vector, logs, claims = other.replica.compose(0)
+    assert one.replica.learn(1, version_vector, logs, claims)
     one.advance(0)
     left = [min(a, b) for a, b in zip(one.weights.tolist(), other.weights.tolist(), strict=True)]
     if ledger:
@@ -205,26 +205,30 @@ def test_belief_holds_when_logs_outgrow_their_room(*, ledger: bool) -> None:
     count=st.integers(1, 12),
     ledger=st.booleans(),
     diffusion_m=st.sampled_from([0.0, 30.0]),
-    acts=st.lists(
+    step_records=st.lists(
         st.tuples(st.sampled_from(["spend", "other", "news", "time"]), PLACES_M), max_size=25
     ),
 )
 def test_exactly_the_samples_with_weight_can_be_found(
-    *, count: int, ledger: bool, diffusion_m: float, acts: list[tuple[str, tuple[float, float]]]
+    *,
+    count: int,
+    ledger: bool,
+    diffusion_m: float,
+    step_records: list[tuple[str, tuple[float, float]]],
 ) -> None:
     """The invariant of a belief, through spending, news, and samples that walk."""
     belief, other = (
         belief_over(scattered(count), 10, me=me, origins=2, ledger=ledger, diffusion_m=diffusion_m)
         for me in range(2)
     )
-    for now_ns, (act, (x_m, y_m)) in enumerate(acts):
-        if act == "spend":
+    for now_ns, (step_record, (x_m, y_m)) in enumerate(step_records):
+        if step_record == "spend":
             belief.spend(x_m, y_m)
-        elif act == "other":
+        elif step_record == "other":
             other.spend(x_m, y_m)
-        elif act == "news":
-            have, logs, claims = other.replica.compose(0)
-            belief.replica.learn(1, have, logs, claims)
+        elif step_record == "news":
+            version_vector, logs, claims = other.replica.compose(0)
+            belief.replica.learn(1, version_vector, logs, claims)
         belief.advance(now_ns)
         alive = {j for j, weight in enumerate(belief.weights.tolist()) if weight > 0}
 

@@ -144,8 +144,8 @@ def test_utilities_are_multiplied_or_lessened() -> None:
 def test_coverage_is_learned_from_measured_ranges() -> None:
     """Eq. 4: three of four were at least as long as bin 10, two came back from the end or not at all."""
     floor = drawn(CORRIDOR)
-    floor.chart.ranges[[0, 10, RANGE_BINS - 1]] = 1, 1, 2
-    shares = Burgard(floor.scenario, 0, None)._shares(floor.chart.ranges)
+    floor.fused_map.ranges[[0, 10, RANGE_BINS - 1]] = 1, 1, 2
+    shares = Burgard(floor.scenario, 0, None)._shares(floor.fused_map.ranges)
     ten = 10 / RANGE_BINS
 
     assert coverage(0.0, 1.0, shares) == 1.0
@@ -157,7 +157,7 @@ def test_coverage_is_learned_from_measured_ranges() -> None:
 def test_where_nothing_was_measured_coverage_falls_evenly() -> None:
     """The same as without learning."""
     floor = drawn(CORRIDOR)
-    shares = Burgard(floor.scenario, 0, None)._shares(floor.chart.ranges)
+    shares = Burgard(floor.scenario, 0, None)._shares(floor.fused_map.ranges)
 
     assert [coverage(d, 4.0, shares) for d in (0.0, 1.0, 4.0, 5.0)] == [1.0, 0.75, 0.0, 0.0]
 
@@ -166,8 +166,8 @@ def test_where_nothing_was_measured_coverage_falls_evenly() -> None:
 def test_coverage_that_is_not_learned(kind: str, at_2: float) -> None:
     """Whatever was measured."""
     floor = drawn(CORRIDOR, f"planner.coverage={kind}")
-    floor.chart.ranges[0] = 7
-    shares = Burgard(floor.scenario, 0, None)._shares(floor.chart.ranges)
+    floor.fused_map.ranges[0] = 7
+    shares = Burgard(floor.scenario, 0, None)._shares(floor.fused_map.ranges)
 
     assert coverage(2.0, 3.0, shares) == pytest.approx(at_2)
     assert coverage(3.1, 3.0, shares) == 0.0
@@ -200,7 +200,7 @@ def test_one_robot_needs_no_coordination(data: st.DataObject, options: tuple[str
     """To the last bit the cheapest frontier, whatever the options; of equal ones the lowest."""
     floor, situation = data.draw(crowded(*options))
     alone = situation._replace(members=situation.members[:1], others=(), absent=())
-    travel = floor.terrain.travel(alone.members[0].cell)[alone.frontiers]
+    travel = floor.cost_map.travel(alone.members[0].cell)[alone.frontiers]
     nearest = int(alone.frontiers[travel.argmin()]) if np.isfinite(travel).any() else NOWHERE
 
     assert targets(floor, alone) == [nearest]
@@ -213,18 +213,18 @@ def test_the_assignment_is_that_of_the_table(
 ) -> None:
     """On any floor, to the last bit: the kernel against the paper's loop in plain numbers."""
     floor, situation = data.draw(crowded(*options))
-    floor.chart.ranges[: len(ranges)] = ranges
+    floor.fused_map.ranges[: len(ranges)] = ranges
 
     assert targets(floor, situation) == by_the_table(floor, situation)
 
 
 def by_the_table(floor: Floor, situation: Situation) -> list[int]:
     """Table 1, literally."""
-    planner, columns = floor.scenario.planner, floor.chart.frame.columns
-    reach = floor.terrain.sensor_cells
+    planner, columns = floor.scenario.planner, floor.fused_map.frame.columns
+    reach = floor.cost_map.sensor_cells
     frontiers, robots = situation.frontiers.tolist(), range(len(situation.members))
     cost = {
-        (i, t): float(floor.terrain.travel(situation.members[i].cell)[t]) / reach
+        (i, t): float(floor.cost_map.travel(situation.members[i].cell)[t]) / reach
         for i in robots
         for t in frontiers
     }
@@ -263,7 +263,7 @@ def by_the_table(floor: Floor, situation: Situation) -> list[int]:
 
 def share_of(floor: Floor, d: float, reach: float) -> float:
     """P(d)."""
-    counts, kind = floor.chart.ranges.tolist(), floor.scenario.planner.coverage
+    counts, kind = floor.fused_map.ranges.tolist(), floor.scenario.planner.coverage
     if d > reach:
         return 0.0
     if kind == "disc":
@@ -276,10 +276,10 @@ def share_of(floor: Floor, d: float, reach: float) -> float:
 
 def sees(floor: Floor, one: int, other: int) -> bool:
     """Whether the line between two cells' middles touches no wall, its border included, in exact numbers."""
-    columns = floor.chart.frame.columns
+    columns = floor.fused_map.frame.columns
     half = Fraction(1, 2)
     places = [(Fraction(c // columns) + half, Fraction(c % columns) + half) for c in (one, other)]
-    for wall in np.flatnonzero(floor.chart.cells == OCCUPIED).tolist():
+    for wall in np.flatnonzero(floor.fused_map.cells == OCCUPIED).tolist():
         enter, leave = Fraction(0), Fraction(1)
         for axis, low in enumerate((wall // columns, wall % columns)):
             start, step = places[0][axis], places[1][axis] - places[0][axis]
@@ -299,12 +299,12 @@ def sees(floor: Floor, one: int, other: int) -> bool:
 def test_sight_is_exact(data: st.DataObject) -> None:
     """A line that touches a wall, were it with a corner, is blocked; either end may ask."""
     floor, _ = data.draw(crowded())
-    cells = floor.chart.cells
+    cells = floor.fused_map.cells
     open_floor = np.flatnonzero(cells != OCCUPIED).tolist()
     if not open_floor:
         return
     one, other = (data.draw(st.sampled_from(open_floor)) for _ in range(2))
-    columns = floor.chart.frame.columns
+    columns = floor.fused_map.frame.columns
 
     assert in_sight(cells, columns, one, other) == sees(floor, one, other)
     assert in_sight(cells, columns, other, one) == sees(floor, one, other)

@@ -29,15 +29,15 @@ def chart_of(*logs: list[int]) -> FusedMap:
         other.append(np.array(log, dtype=np.int64))
         other.registers.end_step()
         assert held.learn(origin, *_said(other))
-    chart = FusedMap(FRAME, ORIGINS)
-    chart.fold(held)
-    return chart
+    fused_map = FusedMap(FRAME, ORIGINS)
+    fused_map.fold(held)
+    return fused_map
 
 
 def _said(other: Replica) -> tuple[bytes, bytes, bytes]:
     """All that a participant holds, told into the dark."""
-    have, logs, claims = other.compose(0)
-    return have, logs, claims
+    version_vector, logs, claims = other.compose(0)
+    return version_vector, logs, claims
 
 
 def free(*cells: int) -> list[int]:
@@ -52,19 +52,26 @@ def wall(*cells: int) -> list[int]:
 
 def test_one_layer_is_the_map() -> None:
     """A cell is what its last entry says."""
-    chart = chart_of(free(0, 1, 2) + wall(7) + wall(2))
+    fused_map = chart_of(free(0, 1, 2) + wall(7) + wall(2))
 
-    assert chart.cells.tolist() == [FREE, FREE, OCCUPIED, *[UNKNOWN] * 4, OCCUPIED, *[UNKNOWN] * 12]
-    assert chart.p_occ()[[0, 2, 5]].tolist() == pytest.approx([0.05, 0.95, 0.5], abs=1e-3)
+    assert fused_map.cells.tolist() == [
+        FREE,
+        FREE,
+        OCCUPIED,
+        *[UNKNOWN] * 4,
+        OCCUPIED,
+        *[UNKNOWN] * 12,
+    ]
+    assert fused_map.p_occ()[[0, 2, 5]].tolist() == pytest.approx([0.05, 0.95, 0.5], abs=1e-3)
 
 
 def test_layers_are_summed_and_doubt_is_a_wall() -> None:
     """Two against one decide; one against one is explored, and not to be driven on."""
-    chart = chart_of(free(0, 1), free(0) + wall(1), wall(0))
+    fused_map = chart_of(free(0, 1), free(0) + wall(1), wall(0))
 
-    assert chart.cells[:3].tolist() == [FREE, OCCUPIED, UNKNOWN]
-    assert chart.p_occ()[1] == 0.5
-    assert chart.explored()[:3].tolist() == [True, True, False]
+    assert fused_map.cells[:3].tolist() == [FREE, OCCUPIED, UNKNOWN]
+    assert fused_map.p_occ()[1] == 0.5
+    assert fused_map.explored()[:3].tolist() == [True, True, False]
 
 
 @examples(60)
@@ -103,12 +110,12 @@ def test_folding_bit_by_bit_is_folding_at_once(logs: list[list[int]], cuts: list
 
 def test_frontiers_are_free_cells_beside_the_unknown() -> None:
     """Four neighbours count, diagonal ones do not; the border of the map is no unknown."""
-    chart = chart_of(free(0, 1, 5, 6) + wall(2, 7))
+    fused_map = chart_of(free(0, 1, 5, 6) + wall(2, 7))
 
-    assert chart.frontiers.tolist() == [5, 6]
-    assert chart.is_frontier(5)
-    assert not chart.is_frontier(0)
-    assert not chart.is_frontier(19)
+    assert fused_map.frontiers.tolist() == [5, 6]
+    assert fused_map.is_frontier(5)
+    assert not fused_map.is_frontier(0)
+    assert not fused_map.is_frontier(19)
 
 
 def test_what_was_found_void_is_no_frontier() -> None:
@@ -119,7 +126,7 @@ def test_what_was_found_void_is_no_frontier() -> None:
 def test_measured_ranges_are_counted() -> None:
     """Everybody's, by bins."""
     first = 3 * FRAME.cells
-    chart = chart_of([first, first, first + RANGE_BINS - 1], [first + 3])
+    fused_map = chart_of([first, first, first + RANGE_BINS - 1], [first + 3])
 
-    assert chart.ranges[[0, 3, RANGE_BINS - 1]].tolist() == [2, 1, 1]
-    assert chart.ranges.sum() == 4
+    assert fused_map.ranges[[0, 3, RANGE_BINS - 1]].tolist() == [2, 1, 1]
+    assert fused_map.ranges.sum() == 4

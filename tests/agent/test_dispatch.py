@@ -67,14 +67,14 @@ class World:
         self.asked = Asked()
         monkeypatch.setitem(assignment.ALLOCATORS, "frontier", lambda *_: self.asked)
         scenario = mission(*overrides)
-        self.chart = FusedMap(FRAME, 3)
+        self.fused_map = FusedMap(FRAME, 3)
         self.log = Replica(0, 3, entries(FRAME), None, ledger=True, claims=False)
-        self.dispatch = Assignment(scenario, CostMap(scenario, self.chart), 0, me)
+        self.dispatch = Assignment(scenario, CostMap(scenario, self.fused_map), 0, me)
 
     def see(self, *cells: int) -> None:
         """Cells are free."""
         self.log.append(np.array([2 * cell for cell in cells]))
-        self.chart.fold(self.log)
+        self.fused_map.fold(self.log)
 
     def decide(self, *group: Member, tick: int = 10) -> dict[int, Task]:
         """New tasks."""

@@ -33,7 +33,7 @@ def test_everybody_takes_the_cheapest_frontier(data: st.DataObject) -> None:
     floor, situation = data.draw(crowded())
     expected = []
     for member in situation.members:
-        travel = floor.terrain.travel(member.cell)
+        travel = floor.cost_map.travel(member.cell)
         reached = [(travel[t], t) for t in situation.frontiers.tolist() if np.isfinite(travel[t])]
         expected.append(min(reached)[1] if reached else NOWHERE)
 
@@ -94,22 +94,22 @@ def test_a_robot_asks_for_itself_alone() -> None:
 def test_an_inaccessible_frontier_is_left_for_another(replan_on: str) -> None:
     """It is void as soon as a robot has made no progress for a while: nobody heads for it any more."""
     floor = drawn(CORRIDOR, "planner=frontier", f"planner.replan_on={replan_on}")
-    dispatch = Assignment(floor.scenario, floor.terrain, 0, None)
+    dispatch = Assignment(floor.scenario, floor.cost_map, 0, None)
     stuck = robot(0, 2, 1)
     assert dispatch.decide([stuck], (), 10) == {}
-    floor.chart.void[1] = True
-    floor.chart.revision += 1
+    floor.fused_map.void[1] = True
+    floor.fused_map.revision += 1
 
     assert dispatch.decide([stuck], (), 10)[0].target == 7
-    floor.chart.void[7] = True
-    floor.chart.revision += 1
+    floor.fused_map.void[7] = True
+    floor.fused_map.revision += 1
     assert dispatch.decide([stuck], (), 20)[0].target == NOWHERE
 
 
 def test_a_robot_has_been_everywhere_before_it_returns() -> None:
     """Four frontiers that stay what they are, and a robot that arrives at one after the other."""
     floor = drawn(["## ##", "##.##", " ... ", "##.##", "## ##"], "planner=frontier")
-    dispatch = Assignment(floor.scenario, floor.terrain, 0, 0)
+    dispatch = Assignment(floor.scenario, floor.cost_map, 0, 0)
     member, visits = robot(0, 12), []
     for tick in range(10, 60, 10):
         task = dispatch.decide([member], (), tick)[0]

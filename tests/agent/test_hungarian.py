@@ -129,10 +129,10 @@ def test_everybody_that_can_reach_something_gets_something(data: st.DataObject) 
     held = [member.task.target for member in situation.others if member.task.target != NOWHERE]
     taken = [*held, *situation.absent]
     for member, target in zip(situation.members, targets(floor, situation), strict=True):
-        travel = floor.terrain.travel(member.cell)[situation.frontiers]
+        travel = floor.cost_map.travel(member.cell)[situation.frontiers]
         if not np.isfinite(travel).any():
             assert target == NOWHERE
             continue
         assert np.isfinite(travel[situation.frontiers == target]).all()
-        away = min((floor.terrain.cells_between(target, cell) for cell in taken), default=math.inf)
+        away = min((floor.cost_map.cells_between(target, cell) for cell in taken), default=math.inf)
         assert target == situation.frontiers[travel.argmin()] or away >= 1.5

@@ -72,7 +72,7 @@ class Rehearsal:
     def lose_all(self, name: ParticipantId) -> None:
         """A new incarnation takes over; what was under way to the one before is lost."""
         body = self.bodies[name]
-        body = Body(body.pose, body.step, body.energy_spent, body.epoch + 1)
+        body = Body(body.pose, body.step, body.energy_spent, body.incarnation + 1)
         self.bodies[name], self._inboxes[name] = body, []
         self.births[name].append(len(self.told[name]))
         if name == SUPERVISOR:
@@ -100,7 +100,9 @@ class Rehearsal:
             outputs = machine.step(Inputs(now_ns, look, tuple(self._inboxes[name])))
             self.told[name].append(outputs)
             self._inboxes[name] = []
-            self.bodies[name] = Body(outputs.pose, outputs.step, outputs.energy_spent, body.epoch)
+            self.bodies[name] = Body(
+                outputs.pose, outputs.step, outputs.energy_spent, body.incarnation
+            )
             sent += outputs.outbox
         for envelope in sent:
             for name in self.machines:
@@ -174,17 +176,17 @@ def check_life(played: Rehearsal, name: ParticipantId) -> None:
     assert spent[-1] <= played.scenario.steps_per_robot
     assert {outputs.refused for outputs in told} == {0}
     subscriber = WeightsSubscriber()
-    for epoch, (born, died) in enumerate(zip(births, [*births[1:], len(told)], strict=True)):
+    for incarnation, (born, died) in enumerate(zip(births, [*births[1:], len(told)], strict=True)):
         left = [UNITS.sample] * N
         for i in range(born, died):
-            assert decode_gossip(told[i].outbox[0].body).epoch == epoch
+            assert decode_gossip(told[i].outbox[0].body).incarnation == incarnation
             for sample, weight in pairs(told[i].lowered):
                 assert weight < left[sample]
                 left[sample] = weight
             assert (
                 i > born or told[i].weights
             )  # a keyframe: nothing goes on from what was forgotten
-            assert not told[i].weights or subscriber.take(told[i].weights)
+            assert not told[i].weights or subscriber.apply(told[i].weights)
         assert died == born or subscriber.weights is not None
 
 
@@ -335,15 +337,15 @@ class Troubled:
         self._build = lambda body: participant(name, scenario, 1, site, body)
         self.machine = self._build(Body(site.poses(scenario)[name]))
         self._deaths, self._silent, self._skew_s = deaths, silent, skew_s
-        self._step, self._epoch = 0, 0
+        self._step, self._incarnation = 0, 0
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """The next step of whichever incarnation."""
         self._step += 1
         if self._step in self._deaths:
-            self._epoch += 1
+            self._incarnation += 1
             look = inputs.observation
-            self.machine = self._build(Body(look.pose, look.step, 0, self._epoch))
+            self.machine = self._build(Body(look.pose, look.step, 0, self._incarnation))
         now_ns = inputs.now_ns + round(self._skew_s(self._step) * 1e9)
         outputs = self.machine.step(Inputs(now_ns, inputs.observation, inputs.inbox))
         first, last = self._silent
@@ -368,11 +370,11 @@ def explore(scenario: Scenario, troubled: dict[ParticipantId, Troubled]) -> list
     machines = team(scenario, 1, site) | troubled
     play(scenario, 1, site, [records.append], machines=machines)
     for batch in records:
-        for act in batch.acts if isinstance(batch, Batch) else ():
-            assert act.ruling is not None
-            assert act.outputs is not None
-            assert act.ruling.violations == ()
-            assert act.outputs.refused == 0
+        for step_record in batch.step_records if isinstance(batch, Batch) else ():
+            assert step_record.verdict is not None
+            assert step_record.outputs is not None
+            assert step_record.verdict.violations == ()
+            assert step_record.outputs.refused == 0
     return records
 
 
@@ -391,8 +393,8 @@ def test_map_is_explored_whoever_is_born_again(planner: str, coordination: str) 
     assert isinstance(records[-1], Ending)
     assert records[-1].reason == "done"
     assert isinstance(robot, MappingRobot)
-    assert robot._chart._layers.shape[0] == 3 * len(scenario.roster)
-    assert int((robot._chart.cells != 0).sum()) > 120
+    assert robot._fused_map._layers.shape[0] == 3 * len(scenario.roster)
+    assert int((robot._fused_map.cells != 0).sum()) > 120
 
 
 @pytest.mark.parametrize("planner", MAP_PLANNERS)
@@ -420,9 +422,9 @@ def test_map_is_explored_by_a_clock_that_jumps_and_comes_back(
         assert isinstance(records[-1], Ending)
         assert records[-1].reason == "done"
         resting = {
-            act.name: act.outputs.state
+            step_record.name: step_record.outputs.state
             for batch in records
-            for act in (batch.acts if isinstance(batch, Batch) else ())
-            if act.outputs
+            for step_record in (batch.step_records if isinstance(batch, Batch) else ())
+            if step_record.outputs
         }
         assert all(resting[name] is State.FINISHED for name in scenario.robot_ids)

@@ -45,21 +45,21 @@ def mission(*overrides: str) -> Scenario:
 
 def terrain_of(kinds: np.ndarray, range_m: float = 3.0) -> CostMap:
     """A chart of these kinds, (rows, columns), for a sensor that sees so far; cells of a metre."""
-    chart = FusedMap(Frame(1.0, (0.0, 0.0), *kinds.shape), 1)
-    chart.cells[:] = kinds.ravel()
-    chart.revision += 1
-    return CostMap(mission(f"sensor.range_m={range_m}"), chart)
+    fused_map = FusedMap(Frame(1.0, (0.0, 0.0), *kinds.shape), 1)
+    fused_map.cells[:] = kinds.ravel()
+    fused_map.revision += 1
+    return CostMap(mission(f"sensor.range_m={range_m}"), fused_map)
 
 
 def scene(*rows: str, memos: tuple[tuple[int, ...], ...] = ()) -> Situation:
     """Row 0 first: free floor, #, ?, and robots a, b, c … on free floor."""
     drawn = np.array([list(row) for row in rows])
-    terrain = terrain_of(np.vectorize(lambda sign: KINDS.get(sign, FREE))(drawn))
+    cost_map = terrain_of(np.vectorize(lambda sign: KINDS.get(sign, FREE))(drawn))
     signs = sorted(set(drawn.ravel()) - set(KINDS))
     cells = [int(np.flatnonzero(drawn.ravel() == sign)[0]) for sign in signs]
     told = [*memos, *[()] * len(cells)]
     members = tuple(member(i, cell, memo=told[i]) for i, cell in enumerate(cells))
-    return Situation(terrain, terrain.chart.frontiers, members, (), (), 7)
+    return Situation(cost_map, cost_map.fused_map.frontiers, members, (), (), 7)
 
 
 def member(
@@ -81,9 +81,9 @@ def regions_of(situation: Situation, *columns: int) -> Regions:
     starts = np.array([(0, PARTS * column) for column in columns])
     cells = np.array([m.cell for m in situation.members])
     travel = np.stack(
-        [situation.terrain.travel(m.cell)[situation.frontiers] for m in situation.members]
+        [situation.cost_map.travel(m.cell)[situation.frontiers] for m in situation.members]
     )
-    return Regions(situation.terrain, situation.frontiers, cells, starts, travel)
+    return Regions(situation.cost_map, situation.frontiers, cells, starts, travel)
 
 
 # Equations 1 to 5: robots and regions.
@@ -269,9 +269,9 @@ def test_what_walls_enclose_belongs_to_no_region() -> None:
 def test_an_unknown_part_without_a_frontier_belongs_to_no_region() -> None:
     # Somebody stood before the right one and saw nothing new.
     situation = scene("?..a..?")
-    situation.terrain.chart.void[5] = True
-    situation.terrain.chart.revision += 1
-    situation = situation._replace(frontiers=situation.terrain.chart.frontiers)
+    situation.cost_map.fused_map.void[5] = True
+    situation.cost_map.fused_map.revision += 1
+    situation = situation._replace(frontiers=situation.cost_map.fused_map.frontiers)
     assert regions_of(situation, 6).places == [[0, PARTS // 2]]
     assert targets_of(situation) == [1]
 
@@ -417,9 +417,9 @@ class Plain:
 
     def __init__(self, situation: Situation, seed: int) -> None:
         self.situation, self.seed = situation, seed
-        frame = situation.terrain.frame
+        frame = situation.cost_map.frame
         self.shape = (frame.rows, frame.columns)
-        self.kinds = situation.terrain.chart.cells.reshape(self.shape)
+        self.kinds = situation.cost_map.fused_map.cells.reshape(self.shape)
         self.diagonal = math.sqrt(frame.rows**2 + frame.columns**2)
         self.frontiers = situation.frontiers.tolist()
         self.group = plain_group(situation)
@@ -445,7 +445,7 @@ class Plain:
         return any(self.kinds[place] == OCCUPIED for place in line)
 
     def travel(self, robot: Member, cell: int) -> float:
-        return float(self.situation.terrain.travel(robot.cell)[cell])
+        return float(self.situation.cost_map.travel(robot.cell)[cell])
 
     def points(self) -> list[int]:
         labels, _ = label(self.kinds == UNKNOWN)
@@ -486,7 +486,7 @@ class Plain:
 
     def spaced(self, robots: list[Member]) -> list[int]:
         cheapest = {f: min(self.travel(m, f) for m in robots) for f in self.frontiers}
-        far, kept = self.situation.terrain.sensor_cells**2, []
+        far, kept = self.situation.cost_map.sensor_cells**2, []
         for f in sorted(self.frontiers, key=lambda f: (cheapest[f], f)):
             if math.isfinite(cheapest[f]) and all(self.squared(f, k) >= far for k in kept):
                 kept.append(f)
@@ -538,7 +538,7 @@ class Plain:
         if cc is not None:
             cost += math.sqrt(self.squared(f, cc))
             cost += self.diagonal if self.walled(f, cc) else 0.0
-        far = self.situation.terrain.sensor_cells**2
+        far = self.situation.cost_map.sensor_cells**2
         if any(f == t or self.squared(f, t) < far for t in taken):
             cost += 2.0 * self.diagonal
         return cost
@@ -563,7 +563,7 @@ def situations(draw: st.DrawFn) -> Situation:
     n = rows * columns
     kinds = draw(st.lists(st.sampled_from(crowded), min_size=n, max_size=n))
     grid = np.array(kinds, dtype=np.uint8).reshape(rows, columns)
-    terrain = terrain_of(grid, draw(st.sampled_from([0.5, 1.0, 2.5, 4.0])))
+    cost_map = terrain_of(grid, draw(st.sampled_from([0.5, 1.0, 2.5, 4.0])))
     cells, targets = st.integers(0, n - 1), st.integers(NOWHERE, n - 1)
     robots = draw(st.lists(st.tuples(cells, targets, MEMOS), min_size=1, max_size=5))
     group = [member(i, cell, target, memo) for i, (cell, target, memo) in enumerate(robots)]
@@ -571,7 +571,7 @@ def situations(draw: st.DrawFn) -> Situation:
     members = tuple(m for m, now in zip(group, due, strict=True) if now) or tuple(group)
     others = tuple(m for m in group if m not in members)
     absent = tuple(draw(st.lists(cells, max_size=2)))
-    return Situation(terrain, terrain.chart.frontiers, members, others, absent, 3)
+    return Situation(cost_map, cost_map.fused_map.frontiers, members, others, absent, 3)
 
 
 @examples(300)
@@ -592,7 +592,7 @@ def test_the_kernels_do_what_the_equations_say(situation: Situation, seed: int) 
 def test_nobody_who_can_reach_a_frontier_idles(situation: Situation, seed: int) -> None:
     tasks = KMeans(mission(), seed, None).assign(situation)
     for m, task in zip(situation.members, tasks, strict=True):
-        reached = np.isfinite(situation.terrain.travel(m.cell)[situation.frontiers])
+        reached = np.isfinite(situation.cost_map.travel(m.cell)[situation.frontiers])
         assert (task.target != NOWHERE) == reached.any()
         assert task.target in {NOWHERE, *situation.frontiers[reached].tolist()}
 
@@ -610,7 +610,7 @@ def test_distances_and_contour_cells_are_those_of_the_equations(
     starts = np.array([plain.start(m) for m in plain.group])
     cells = np.array([m.cell for m in plain.group])
     travel = np.array([[plain.travel(m, f) for f in plain.frontiers] for m in plain.group])
-    regions = Regions(situation.terrain, situation.frontiers, cells, starts, travel)
+    regions = Regions(situation.cost_map, situation.frontiers, cells, starts, travel)
     distance, nearest, accessible = zip(*itertools.chain(*plain.measured), strict=True)
     assert regions.distance.ravel().tolist() == list(distance)
     assert regions.nearest.ravel().tolist() == list(nearest)
@@ -686,5 +686,5 @@ def test_four_robots_explore_all_there_is_to_see(layout: str, coordination: str)
     assert play(scenario, 3, site, (), machines=machines) == "done"
     ground, _ = ground_of(scenario)
     seen = observable(ground, site.starts_m).ravel()
-    known = machines["r1"]._chart.explored()
+    known = machines["r1"]._fused_map.explored()
     assert known[seen].mean() > 0.99

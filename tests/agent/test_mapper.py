@@ -106,7 +106,7 @@ class Played:
 
     def cells(self, name: str = "r1") -> np.ndarray:
         """What a robot knows at the end."""
-        return np.asarray(self.machines[name]._chart.cells)
+        return np.asarray(self.machines[name]._fused_map.cells)
 
     def assert_explored(self) -> None:
         """Everybody rests and knows everything that can be seen, as it is."""
@@ -126,10 +126,10 @@ def test_every_planner_explores_it_all_and_rests(planner: str, coordination: str
 
     played.assert_explored()
     assert not any(
-        act.ruling.violations or act.ruling.bumped
+        step_record.verdict.violations or step_record.verdict.bumped
         for batch in played.batches
-        for act in batch.acts
-        if act.ruling
+        for step_record in batch.step_records
+        if step_record.verdict
     )
 
 
@@ -232,7 +232,11 @@ def test_bodies_keep_apart_on_the_way_to_the_same_target() -> None:
 
     def merged(played: Played) -> int:
         poses = [
-            {(act.ruling.pose.x_m, act.ruling.pose.y_m) for act in batch.acts if act.ruling}
+            {
+                (step_record.verdict.pose.x_m, step_record.verdict.pose.y_m)
+                for step_record in batch.step_records
+                if step_record.verdict
+            }
             for batch in played.batches
         ]
         return sum(len(places) < 3 for places in poses)
@@ -246,10 +250,10 @@ def test_one_robot_needs_no_coordination() -> None:
     one = ("robots.count=1", "coordination=decentralized")
     records = [
         [
-            (act.outputs.pose, act.outputs.goal)
+            (step_record.outputs.pose, step_record.outputs.goal)
             for batch in Played(mission(*one, f"planner.coordinated={flag}")).batches
-            for act in batch.acts
-            if act.outputs
+            for step_record in batch.step_records
+            if step_record.outputs
         ]
         for flag in ("true", "false")
     ]
@@ -262,15 +266,15 @@ def test_rest_is_final() -> None:
     played = Played(mission("radio.range_m=6"))
     resting: dict[str, Pose] = {}
     for batch in played.batches:
-        for act in batch.acts:
-            assert act.outputs is not None
-            if act.name in resting:
-                assert act.outputs.pose == resting[act.name]
-                assert act.outputs.state is State.FINISHED
-            if act.outputs.state is State.FINISHED:
-                resting[act.name] = act.outputs.pose
-                assert act.outputs.goal is None
-                assert len(act.outputs.outbox) == 1
+        for step_record in batch.step_records:
+            assert step_record.outputs is not None
+            if step_record.name in resting:
+                assert step_record.outputs.pose == resting[step_record.name]
+                assert step_record.outputs.state is State.FINISHED
+            if step_record.outputs.state is State.FINISHED:
+                resting[step_record.name] = step_record.outputs.pose
+                assert step_record.outputs.goal is None
+                assert len(step_record.outputs.outbox) == 1
 
 
 def test_a_late_word_moves_nobody() -> None:

@@ -52,10 +52,10 @@ def mission(*overrides: str) -> Scenario:
 
 def terrain_of(*rows: str, range_m: float = 4.0) -> CostMap:
     """A chart as it is drawn, row 0 first: `?` unknown, `.` free, `#` wall."""
-    chart = FusedMap(Frame(1.0, (0.0, 0.0), len(rows), len(rows[0])), 4)
-    chart.cells[:] = [KINDS[kind] for row in rows for kind in row]
-    chart.revision = 1
-    return CostMap(mission(f"sensor.range_m={range_m}"), chart)
+    fused_map = FusedMap(Frame(1.0, (0.0, 0.0), len(rows), len(rows[0])), 4)
+    fused_map.cells[:] = [KINDS[kind] for row in rows for kind in row]
+    fused_map.revision = 1
+    return CostMap(mission(f"sensor.range_m={range_m}"), fused_map)
 
 
 CORRIDOR = "????............????"
@@ -71,10 +71,12 @@ def member(robot: int, cell: int, task: Task = IDLE) -> Member:
 
 
 def situation(
-    terrain: CostMap, members: Sequence[Member], others: Sequence[Member] = (), tick: int = 10
+    cost_map: CostMap, members: Sequence[Member], others: Sequence[Member] = (), tick: int = 10
 ) -> Situation:
     """What is known."""
-    return Situation(terrain, terrain.chart.frontiers, tuple(members), tuple(others), (), tick)
+    return Situation(
+        cost_map, cost_map.fused_map.frontiers, tuple(members), tuple(others), (), tick
+    )
 
 
 # Goals.
@@ -82,9 +84,9 @@ def situation(
 
 def test_quadtree_splits_until_leaves_are_two_ranges_long() -> None:
     """8 x 8 cells, range 1: sixteen leaves of 2 x 2, and a goal in the middle of each."""
-    terrain = terrain_of(*["?" * 8] * 8, range_m=1.0)
+    cost_map = terrain_of(*["?" * 8] * 8, range_m=1.0)
 
-    assert quadtree_goals(terrain) == [
+    assert quadtree_goals(cost_map) == [
         8 * row + column for row in (1, 3, 5, 7) for column in (1, 3, 5, 7)
     ]
 
@@ -112,42 +114,42 @@ def test_quadtree_ends_when_ranges_are_tiny() -> None:
 
 def test_greedy_takes_the_cheapest_a_range_apart() -> None:
     """From cell 2, range 4: cell 3 costs 1, then 7 and 11 are the next at least 4 away."""
-    terrain = terrain_of("...????????????")
-    field = terrain.optimistic(2)
+    cost_map = terrain_of("...????????????")
+    field = cost_map.optimistic(2)
 
-    assert greedy_goals(terrain, field, [], 5) == [3, 7, 11]
-    assert greedy_goals(terrain, field, [], 2) == [3, 7]
+    assert greedy_goals(cost_map, field, [], 5) == [3, 7, 11]
+    assert greedy_goals(cost_map, field, [], 2) == [3, 7]
 
 
 def test_greedy_leaves_out_what_is_within_half_a_range_of_a_held_goal() -> None:
     """Goal 4 is held: 3 and up to 6 are as good as taken; 7 is not."""
-    terrain = terrain_of("...????????????")
+    cost_map = terrain_of("...????????????")
 
-    assert greedy_goals(terrain, terrain.optimistic(2), [4], 5) == [7, 11]
+    assert greedy_goals(cost_map, cost_map.optimistic(2), [4], 5) == [7, 11]
 
 
 def test_greedy_of_equals_takes_the_lowest_cell() -> None:
     """Both sides of the robot are as near."""
-    terrain = terrain_of("??.??")
+    cost_map = terrain_of("??.??")
 
-    assert greedy_goals(terrain, terrain.optimistic(2), [], 1) == [1]
+    assert greedy_goals(cost_map, cost_map.optimistic(2), [], 1) == [1]
 
 
 def test_greedy_does_not_propose_what_walls_enclose() -> None:
     """Behind the wall everything is unknown, and stays so."""
-    terrain = terrain_of("..#???")
+    cost_map = terrain_of("..#???")
 
-    assert greedy_goals(terrain, terrain.optimistic(0), [], 5) == []
+    assert greedy_goals(cost_map, cost_map.optimistic(0), [], 5) == []
 
 
 def test_random_goals_are_keyed_draws_without_known_cells() -> None:
     """Cells anywhere, by seed, robot and tick; the known and repeated ones are left out."""
-    terrain = terrain_of("????????........")
+    cost_map = terrain_of("????????........")
     drawn = [int(uniform(3, Purpose.MARKET, 1, 20, i) * 16) for i in range(64)]
     left = [cell for cell in dict.fromkeys(drawn) if cell < 8]
 
-    assert random_goals(terrain, 3, 1, 20, 64) == left
-    assert random_goals(terrain, 3, 1, 21, 64) != left
+    assert random_goals(cost_map, 3, 1, 20, 64) == left
+    assert random_goals(cost_map, 3, 1, 21, 64) != left
 
 
 @pytest.mark.parametrize("rule", ["random", "greedy", "quadtree"])
@@ -157,20 +159,20 @@ def test_proposed_goals_are_unknown_reachable_apart_and_not_too_many(rule: str, 
     """Every rule: at most goal_count, none within half a range of another or of a held goal."""
     rng = np.random.default_rng(seed)
     rows = ["".join(rng.choice(list("??.#"), 20)) for _ in range(20)]
-    terrain = terrain_of(*rows)
-    here = int(np.flatnonzero(terrain.chart.cells == FREE)[0])
-    held = [int(cell) for cell in np.flatnonzero(terrain.chart.cells == UNKNOWN)[::50]]
-    field = terrain.optimistic(here)
+    cost_map = terrain_of(*rows)
+    here = int(np.flatnonzero(cost_map.fused_map.cells == FREE)[0])
+    held = [int(cell) for cell in np.flatnonzero(cost_map.fused_map.cells == UNKNOWN)[::50]]
+    field = cost_map.optimistic(here)
     rules = MarketRules(mission(f"planner.goals={rule}"), seed)
 
-    goals = rules.propose(terrain, field, 0, 7, held)
+    goals = rules.propose(cost_map, field, 0, 7, held)
 
     assert len(goals) <= 5
     assert [field[goal] for goal in goals] == sorted(field[goal] for goal in goals)
     for goal in goals:
-        assert terrain.chart.cells[goal] == UNKNOWN
+        assert cost_map.fused_map.cells[goal] == UNKNOWN
         assert field[goal] < math.inf
-        assert all(terrain.cells_between(goal, h) > 2.0 for h in {*held, *goals} - {goal})
+        assert all(cost_map.cells_between(goal, h) > 2.0 for h in {*held, *goals} - {goal})
 
 
 @given(st.integers(0, 99), st.floats(0.1, 30.0), st.integers(1, 10))
@@ -210,11 +212,11 @@ def length(costs: Costs, place: int, tour: Sequence[int]) -> float:
 @examples(60)
 def test_insertion_is_the_cheapest_of_all_places(seed: int, tour: list[int], goal: int) -> None:
     """Against tours written out; among equals the first; no insertion shortens a tour."""
-    terrain = scattered_walls(seed)
-    here = int(np.flatnonzero(terrain.chart.cells == FREE)[0])
-    field = terrain.optimistic(here)
+    cost_map = scattered_walls(seed)
+    here = int(np.flatnonzero(cost_map.fused_map.cells == FREE)[0])
+    field = cost_map.optimistic(here)
     tour = [cell for cell in tour if field[cell] < math.inf]
-    costs = Costs(terrain, [field], [*tour, goal])
+    costs = Costs(cost_map, [field], [*tour, goal])
     tours = [[*tour[:i], goal, *tour[i:]] for i in range(len(tour) + 1)]
     longer = [length(costs, 0, one) - length(costs, 0, tour) for one in tours]
 
@@ -234,13 +236,13 @@ def test_saving_is_what_the_tour_gets_shorter(
     seed: int, tour: list[int], data: st.DataObject
 ) -> None:
     """Against tours written out."""
-    terrain = scattered_walls(seed)
-    field = terrain.optimistic(int(np.flatnonzero(terrain.chart.cells == FREE)[0]))
+    cost_map = scattered_walls(seed)
+    field = cost_map.optimistic(int(np.flatnonzero(cost_map.fused_map.cells == FREE)[0]))
     tour = [cell for cell in tour if field[cell] < math.inf]
     if not tour:
         return
     goal = data.draw(st.sampled_from(tour))
-    costs = Costs(terrain, [field], tour)
+    costs = Costs(cost_map, [field], tour)
     rest = [cell for cell in tour if cell != goal]
 
     saved = length(costs, 0, tour) - length(costs, 0, rest)
@@ -250,8 +252,8 @@ def test_saving_is_what_the_tour_gets_shorter(
 
 def test_saving_of_an_unreachable_goal_is_infinite() -> None:
     """Whoever gets there may have it."""
-    terrain = terrain_of("..#???..")
-    costs = Costs(terrain, [terrain.optimistic(0)], [4, 5])
+    cost_map = terrain_of("..#???..")
+    costs = Costs(cost_map, [cost_map.optimistic(0)], [4, 5])
 
     assert costs.saving(0, [4, 5], 4) == math.inf
 
@@ -262,19 +264,19 @@ def test_distances_between_goals_are_a_metric_and_no_way_is_shorter(
     seed: int, goals: list[int], places: int
 ) -> None:
     """The kernel against a plain reference; the triangle inequality; a bound on the true ways."""
-    terrain = scattered_walls(seed)
-    free = np.flatnonzero(terrain.chart.cells == FREE)[:places].tolist()
-    fields = [terrain.optimistic(cell) for cell in free]
+    cost_map = scattered_walls(seed)
+    free = np.flatnonzero(cost_map.fused_map.cells == FREE)[:places].tolist()
+    fields = [cost_map.optimistic(cell) for cell in free]
     cells = np.array(goals, dtype=np.int64)
     between = np.zeros((cells.size, cells.size))
     separate(np.array([field[cells] for field in fields]), cells, 20, between)
 
     for (i, a), (j, b) in itertools.product(enumerate(goals), repeat=2):
         reached = [(f[a], f[b]) for f in fields if min(f[a], f[b]) < math.inf]
-        plain = max([terrain.cells_between(a, b), *(abs(p - q) for p, q in reached)])
+        plain = max([cost_map.cells_between(a, b), *(abs(p - q) for p, q in reached)])
         assert between[i, j] == plain
-        if terrain.chart.cells[a] != OCCUPIED:
-            assert plain <= terrain.optimistic(a)[b] + 1e-9
+        if cost_map.fused_map.cells[a] != OCCUPIED:
+            assert plain <= cost_map.optimistic(a)[b] + 1e-9
         for k in range(cells.size):
             assert between[i, j] <= between[i, k] + between[k, j] + 1e-9
 
@@ -284,9 +286,9 @@ def test_distances_between_goals_are_a_metric_and_no_way_is_shorter(
 
 def test_robot_drives_to_the_frontier_on_the_way_to_its_goal() -> None:
     """The nearest frontier is at the left end, the goal at the right."""
-    terrain = terrain_of(CORRIDOR)
+    cost_map = terrain_of(CORRIDOR)
     rules = MarketRules(mission(), 0)
-    asked = situation(terrain, [member(0, 6)])
+    asked = situation(cost_map, [member(0, 6)])
 
     assert rules.heading(asked, asked.members[0], 17) == 15
     assert rules.heading(asked, asked.members[0], NOWHERE) == 4
@@ -294,7 +296,7 @@ def test_robot_drives_to_the_frontier_on_the_way_to_its_goal() -> None:
 
 def test_way_to_a_goal_leads_round_what_is_known_to_be_a_wall() -> None:
     """As the crow flies the frontier at the wall is nearest to the goal, but it leads the long way."""
-    terrain = terrain_of(
+    cost_map = terrain_of(
         "????????",
         "########",
         "........",
@@ -304,16 +306,16 @@ def test_way_to_a_goal_leads_round_what_is_known_to_be_a_wall() -> None:
         "??....??",
     )
     rules = MarketRules(mission(), 0)
-    asked = situation(terrain, [member(0, 8 * 2)])
+    asked = situation(cost_map, [member(0, 8 * 2)])
 
     assert rules.heading(asked, asked.members[0], 8 * 5 + 7) == 8 * 6 + 5
 
 
 def test_without_a_way_to_any_frontier_there_is_no_target() -> None:
     """A goal changes nothing about it."""
-    terrain = terrain_of("..#...??")
+    cost_map = terrain_of("..#...??")
     rules = MarketRules(mission(), 0)
-    asked = situation(terrain, [member(0, 0)])
+    asked = situation(cost_map, [member(0, 0)])
 
     assert rules.heading(asked, asked.members[0], 7) == NOWHERE
     assert rules.heading(asked, asked.members[0], NOWHERE) == NOWHERE
@@ -370,13 +372,13 @@ def test_goals_are_auctioned_again_as_positions_change() -> None:
 
 def test_robots_together_divide_what_is_unknown() -> None:
     """Nobody proposes what another holds; together they hold every leaf once."""
-    terrain = terrain_of(*["?" * 24] * 11, "?" * 10 + "...." + "?" * 10, *["?" * 24] * 12)
+    cost_map = terrain_of(*["?" * 24] * 11, "?" * 10 + "...." + "?" * 10, *["?" * 24] * 12)
     market = Market(mission("planner.goal_count=8"), 0, None)
 
-    market.assign(situation(terrain, [member(i, 24 * 11 + 11) for i in range(3)]))
+    market.assign(situation(cost_map, [member(i, 24 * 11 + 11) for i in range(3)]))
 
     tours = market._form._tours
-    assert sorted(goal for tour in tours.values() for goal in tour) == quadtree_goals(terrain)
+    assert sorted(goal for tour in tours.values() for goal in tour) == quadtree_goals(cost_map)
     assert all(tours.values())
 
 
@@ -410,8 +412,8 @@ def test_robots_that_keep_their_targets_trade_as_well() -> None:
 
 def test_idle_robot_drives_to_the_nearest_frontier() -> None:
     """What is unknown is too little for a goal; without this the mission would never end."""
-    terrain = terrain_of("..................?.")
-    [task] = Market(mission(), 0, None).assign(situation(terrain, [member(0, 3)]))
+    cost_map = terrain_of("..................?.")
+    [task] = Market(mission(), 0, None).assign(situation(cost_map, [member(0, 3)]))
 
     assert task == Task(17)
 
@@ -420,9 +422,9 @@ def test_idle_robot_drives_to_the_nearest_frontier() -> None:
 @examples(40)
 def test_every_sale_shortens_the_tours(seed: int, tours: list[list[int]]) -> None:
     """A pass never makes the sum longer, and loses and doubles nothing."""
-    terrain = scattered_walls(seed)
-    free = np.flatnonzero(terrain.chart.cells == FREE)[:3].tolist()
-    fields = [terrain.optimistic(cell) for cell in free]
+    cost_map = scattered_walls(seed)
+    free = np.flatnonzero(cost_map.fused_map.cells == FREE)[:3].tolist()
+    fields = [cost_map.optimistic(cell) for cell in free]
     reached = [cell for cell in range(400) if all(field[cell] < math.inf for field in fields)]
     taken: set[int] = set()
     market = exchange(r0=[], r1=[], r2=[])
@@ -430,7 +432,7 @@ def test_every_sale_shortens_the_tours(seed: int, tours: list[list[int]]) -> Non
         goals = [cell for cell in tour if cell in reached and cell not in taken]
         market._form._tours[robot] = goals
         taken.update(goals)
-    costs = Costs(terrain, fields, taken)
+    costs = Costs(cost_map, fields, taken)
     before = sum(length(costs, i, tour) for i, tour in market._form._tours.items())
 
     market._form._sell(costs, [0, 1, 2])
@@ -482,11 +484,11 @@ def test_prices_are_bounded() -> None:
 @examples(50)
 def test_robot_stands_whatever_others_announce(told: list[list[int]]) -> None:
     """It has a target, and its own memo fits."""
-    terrain, scenario = terrain_of(CORRIDOR), mission()
+    cost_map, scenario = terrain_of(CORRIDOR), mission()
     market, task = Market(scenario, 0, 1), Task()
     for tick, memo in enumerate(told):
         others = [member(robot, 5, Task(4, tuple(memo))) for robot in (0, 2)]
-        [task] = market.assign(situation(terrain, [member(1, 7 + tick, task)], others, tick))
+        [task] = market.assign(situation(cost_map, [member(1, 7 + tick, task)], others, tick))
 
         assert task.target in (4, 15)
         assert len(task.memo) <= scenario.register_width - 4
@@ -512,10 +514,10 @@ def nobody(_speaker: int, _listener: int, _step: int) -> Sequence[int]:
 class Net:
     """Robots that hear of one another's registers: late, twice or not at all, the newest wins."""
 
-    def __init__(self, terrain: CostMap, cells: Sequence[int], *overrides: str) -> None:
+    def __init__(self, cost_map: CostMap, cells: Sequence[int], *overrides: str) -> None:
         self.robots = len(cells)
         scenario = mission(f"robots.count={self.robots}", *overrides)
-        self.terrains = [terrain] * self.robots
+        self.terrains = [cost_map] * self.robots
         self.markets = [Market(scenario, 0, robot) for robot in range(self.robots)]
         self.members = [member(robot, cell) for robot, cell in enumerate(cells)]
         self.told: list[dict[int, tuple[int, int, Member]]] = [{} for _ in cells]
@@ -817,8 +819,8 @@ def test_winner_does_not_take_what_it_knows() -> None:
     net = hall()
     net.terrains[1] = terrain_of(*HALL)
     net.until(lambda: sold(net))
-    net.terrains[1].chart.cells[E] = FREE
-    net.terrains[1].chart.revision += 1
+    net.terrains[1].fused_map.cells[E] = FREE
+    net.terrains[1].fused_map.revision += 1
     net.play(3)
 
     assert net.holders(E) == [0]
@@ -827,8 +829,8 @@ def test_winner_does_not_take_what_it_knows() -> None:
 
 def test_robots_that_start_at_once_end_up_with_every_goal_once() -> None:
     """All propose the same before they hear of one another."""
-    terrain = terrain_of(*["?" * 24] * 11, "." * 24, *["?" * 24] * 12)
-    net = Net(terrain, [24 * 11 + 11] * 3)
+    cost_map = terrain_of(*["?" * 24] * 11, "." * 24, *["?" * 24] * 12)
+    net = Net(cost_map, [24 * 11 + 11] * 3)
     net.play(1)
     assert net.tour(0) == net.tour(1) == net.tour(2)
 
@@ -881,12 +883,12 @@ def faulty(seed: int, robots: int) -> Hears:
     return hears
 
 
-def fresh(terrain: CostMap) -> CostMap:
+def fresh(cost_map: CostMap) -> CostMap:
     """A chart of its own."""
-    chart = FusedMap(terrain.frame, 4)
-    chart.cells[:] = terrain.chart.cells
-    chart.revision = 1
-    return CostMap(mission(), chart)
+    fused_map = FusedMap(cost_map.frame, 4)
+    fused_map.cells[:] = cost_map.fused_map.cells
+    fused_map.revision = 1
+    return CostMap(mission(), fused_map)
 
 
 def strolling(net: Net, rng: np.random.Generator) -> None:
@@ -931,17 +933,17 @@ def test_no_goal_is_lost_while_robots_explore(seed: int, robots: int) -> None:
     radio, goals = faulty(seed, robots), set[int]()
     for _ in range(80):
         net.play(1, radio)
-        unknown_to_all = np.all([t.chart.cells == UNKNOWN for t in net.terrains], axis=0)
+        unknown_to_all = np.all([t.fused_map.cells == UNKNOWN for t in net.terrains], axis=0)
         held = {goal for robot in range(robots) for goal in net.tour(robot)}
         goals = {goal for goal in goals | held if unknown_to_all[goal]}
         assert goals <= held
         strolling(net, rng)
         if held and rng.random() < 0.2:
             seen = sorted(held)[int(rng.integers(len(held)))]
-            for terrain in net.terrains:
+            for cost_map in net.terrains:
                 if rng.random() < 0.5:
-                    terrain.chart.cells[seen] = FREE
-                    terrain.chart.revision += 1
+                    cost_map.fused_map.cells[seen] = FREE
+                    cost_map.fused_map.revision += 1
 
 
 @pytest.mark.parametrize("rule", ["random", "greedy"])
@@ -1003,10 +1005,10 @@ def targets_of(scenario: Scenario, seed: int) -> tuple[str, dict[str, list[tuple
     targets: dict[str, list[tuple[float, float]]] = {name: [] for name in scenario.robot_ids}
 
     def note(record: Record) -> None:
-        for act in record.acts if isinstance(record, Batch) else ():
-            goal = act.outputs and act.outputs.goal
-            if goal and targets[act.name][-1:] != [goal]:
-                targets[act.name].append(goal)
+        for step_record in record.step_records if isinstance(record, Batch) else ():
+            goal = step_record.outputs and step_record.outputs.goal
+            if goal and targets[step_record.name][-1:] != [goal]:
+                targets[step_record.name].append(goal)
 
     return play(scenario, seed, WorldSetup.of(scenario, seed), [note]), targets
 

@@ -16,7 +16,7 @@ from support.strategies import examples
 
 def drive(floor: Floor, start: int, target: int, stride_m: float) -> list[tuple[Pose, float]]:
     """Where the robot is, and how far it still is, until it is there."""
-    navigator, frame = Navigator(floor.terrain), floor.chart.frame
+    navigator, frame = Navigator(floor.cost_map), floor.fused_map.frame
     pose, end_m = Pose(*frame.centre_of(start)), frame.centre_of(target)
     passed = []
     for _ in range(10_000):
@@ -40,7 +40,7 @@ def test_a_robot_gets_there_and_what_is_left_never_rises(
     """However slow it is, and however far ahead it sees: otherwise it would seem to be stuck."""
     floor, situation = data.draw(crowded())
     start = situation.members[0].cell
-    reached = [c for c, v in enumerate(floor.terrain.travel(start).tolist()) if v < math.inf]
+    reached = [c for c, v in enumerate(floor.cost_map.travel(start).tolist()) if v < math.inf]
     if not reached:
         return
     target = data.draw(st.sampled_from(reached))
@@ -48,11 +48,11 @@ def test_a_robot_gets_there_and_what_is_left_never_rises(
     left = [cells for _, cells in passed]
 
     assert left[-1] == 0.0
-    assert left[0] <= floor.terrain.travel(start)[target] + 1e-9
+    assert left[0] <= floor.cost_map.travel(start)[target] + 1e-9
     assert all(after <= before + 1e-9 for before, after in pairwise(left))
     for pose, _ in passed[1:]:  # a robot stands where it stands
-        cell = floor.chart.frame.cell_of(pose.x_m, pose.y_m)
-        assert cell == start or floor.chart.cells[cell] == FREE
+        cell = floor.fused_map.frame.cell_of(pose.x_m, pose.y_m)
+        assert cell == start or floor.fused_map.cells[cell] == FREE
 
 
 def test_what_is_left_is_measured_along_the_way() -> None:
@@ -67,17 +67,17 @@ def test_there_is_no_way_through_walls_or_the_unknown() -> None:
     """Nor to where nothing leads."""
     for kind in (OCCUPIED, UNKNOWN):
         floor = drawn(["...", "...", "..."])
-        floor.chart.cells[3:6] = kind
-        floor.chart.revision += 1
-        assert Navigator(floor.terrain).head(Pose(0.5, 0.5), 8) is None
+        floor.fused_map.cells[3:6] = kind
+        floor.fused_map.revision += 1
+        assert Navigator(floor.cost_map).head(Pose(0.5, 0.5), 8) is None
 
 
 def test_a_wall_that_appears_is_driven_round() -> None:
     """The way is found anew."""
     floor = drawn(["...", "...", "..."])
-    navigator, pose = Navigator(floor.terrain), Pose(0.5, 0.5)
+    navigator, pose = Navigator(floor.cost_map), Pose(0.5, 0.5)
     assert navigator.head(pose, 6) == (0.5, 2.5)
-    floor.chart.cells[3:5] = OCCUPIED
-    floor.chart.revision += 1
+    floor.fused_map.cells[3:5] = OCCUPIED
+    floor.fused_map.revision += 1
 
     assert navigator.head(pose, 6) == (2.5, 0.5)

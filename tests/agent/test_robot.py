@@ -160,7 +160,7 @@ def test_published_weights_are_the_robot_s_own(name: str) -> None:
                 assert weight < left[sample]
                 left[sample] = weight
             if outputs.weights:
-                assert subscriber.take(outputs.weights)
+                assert subscriber.apply(outputs.weights)
                 assert subscriber.weights is not None
                 assert subscriber.weights.tolist() == left
 
@@ -301,7 +301,9 @@ def test_malformed_envelopes_are_counted_and_change_nothing(name: str) -> None:
     bodies=st.lists(
         st.binary(max_size=60)
         | st.builds(
-            lambda have, logs, claims: encode(GossipMessage(1, 1, 0.0, 0.0, have, logs, claims)),
+            lambda version_vector, logs, claims: encode(
+                GossipMessage(1, 1, 0.0, 0.0, version_vector, logs, claims)
+            ),
             st.binary(max_size=8),
             st.binary(max_size=20),
             st.binary(max_size=12),

@@ -22,7 +22,7 @@ from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Ou
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.cosine_basis import VISIT
 from kantor_protocol.replication.registers import read_register
-from kantor_protocol.replication.replica import read_have
+from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import GossipMessage, decode_gossip
@@ -123,12 +123,12 @@ class Stage:
     def _says(self, envelope: Envelope) -> str:
         news = decode_gossip(envelope.body)
         logs = read_logs(news.logs)
-        have = read_have(news.have, len(self.scenario.roster))
+        version_vector = read_version_vector(news.version_vector, len(self.scenario.roster))
         assert logs is not None
         entries = " ".join(f"r{o + 1}#{at}={j}:{u}" for o, at, j, u in logs.tolist())
         claims = "claims " if news.claims else ""
         to = envelope.target or "everybody"
-        return f"to {to}: {claims}has {have}, tells {entries or 'nothing'}{self._registers(news)}"
+        return f"to {to}: {claims}has {version_vector}, tells {entries or 'nothing'}{self._registers(news)}"
 
     def _registers(self, news: GossipMessage) -> str:
         """Visits by origin, for those that the message has: the first number counts them."""
@@ -144,10 +144,10 @@ class Stage:
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.txt")), ids=lambda path: path.stem)
 def test_transcript(path: Path, request: pytest.FixtureRequest) -> None:
     """Robots do what the transcript says, to the letter."""
-    stage, lines = Stage(), []
+    simulation, lines = Stage(), []
     for line in path.read_text(encoding="utf-8").splitlines():
         if line.startswith("> "):
-            lines += [line, *(f"  {told}" for told in stage.run(line[2:]))]
+            lines += [line, *(f"  {told}" for told in simulation.run(line[2:]))]
         elif not line.startswith("  "):
             lines.append(line)
     text = "\n".join(lines) + "\n"

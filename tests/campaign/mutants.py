@@ -177,9 +177,11 @@ def _merging(
     """After each message: merge(replica, weights and lengths before, rows of its log entries)."""
 
     def make(learn: Any) -> Any:
-        def learnt(self: Replica, source: int, have: bytes, logs: bytes, *rest: bytes) -> bool:
+        def learnt(
+            self: Replica, source: int, version_vector: bytes, logs: bytes, *rest: bytes
+        ) -> bool:
             weights, lengths = self.weights.copy(), self.store.length.copy()
-            taken: bool = learn(self, source, have, logs, *rest)
+            taken: bool = learn(self, source, version_vector, logs, *rest)
             rows = read_logs(logs) if taken and self.weights.size else None
             if rows is not None and rows.size:
                 merge(self, weights, lengths, rows)
@@ -197,7 +199,7 @@ def _merging(
 def maximum_instead_of_minimum(patch: Patch) -> None:
     def merge(self: Replica, weights: np.ndarray, _: np.ndarray, rows: np.ndarray) -> None:
         for _, _, index, value in rows.tolist():
-            if value > self.weights[index] and not self.manner.ledger:
+            if value > self.weights[index] and not self.config.ledger:
                 _set(self.store, index, value)
 
     _merging(patch, merge)
@@ -227,7 +229,7 @@ def additive_delta_without_dedupe(patch: Patch) -> None:
     def merge(self: Replica, _: np.ndarray, lengths: np.ndarray, rows: np.ndarray) -> None:
         for origin, position, index, value in rows.tolist():
             held = lengths[origin] if origin < lengths.shape[0] else 0
-            if position < held and origin != self.manner.me and self.weights[index] > 0:
+            if position < held and origin != self.config.me and self.weights[index] > 0:
                 _set(self.store, index, max(0, int(self.weights[index]) - value))
 
     _merging(patch, merge)
@@ -236,7 +238,7 @@ def additive_delta_without_dedupe(patch: Patch) -> None:
 @mutant("ledger: what another has spent is put into the own log as well", _ledger)
 def accepting_anothers_log_as_own(patch: Patch) -> None:
     def merge(self: Replica, _: np.ndarray, lengths: np.ndarray, rows: np.ndarray) -> None:
-        me = self.manner.me
+        me = self.config.me
         for origin, position, index, value in rows.tolist():
             held = lengths[origin] if origin < lengths.shape[0] else 0
             if position >= held and origin != me:
@@ -262,8 +264,8 @@ def dropping_the_newest_entry(patch: Patch) -> None:
     def make(spend: Any) -> Any:
         def spent(self: Belief, x_m: float, y_m: float) -> bytes:
             packed: bytes = spend(self, x_m, y_m)
-            store, me = self.replica.store, self.replica.manner.me
-            if packed and store.length[me] % 20 == 0 and self.replica.manner.ledger:
+            store, me = self.replica.store, self.replica.config.me
+            if packed and store.length[me] % 20 == 0 and self.replica.config.ledger:
                 store.length[me] -= 1
             return packed
 
@@ -305,7 +307,7 @@ def inventing_acknowledgements(patch: Patch) -> None:
 def forgetting_to_forward(patch: Patch) -> None:
     def make(compose: Any) -> Any:
         def composed(self: Replica, target: int = -1) -> tuple[bytes, bytes, bytes]:
-            slots, me = self.slots, self.manner.me
+            slots, me = self.slots, self.config.me
             foreign = np.arange(slots) != me
             known = self.store.known[:, :slots]
             known[:, foreign] = np.maximum(known[:, foreign], self.store.length[foreign])
@@ -425,9 +427,9 @@ def letters_to_the_dead_arrive(patch: Patch) -> None:
 def world_sim_forgets_what_was_under_way(patch: Patch) -> None:
     def make(rebuilt: Any) -> Any:
         def forgetful(self: Simulation) -> Simulation:
-            stage: Simulation = rebuilt(self)
-            stage.channel.clear()
-            return stage
+            simulation: Simulation = rebuilt(self)
+            simulation.channel.clear()
+            return simulation
 
         return forgetful
 
@@ -645,24 +647,32 @@ def register_off_by_one(patch: Patch) -> None:
 def late_write(patch: Patch) -> None:
     def kill(self: KillableNode) -> None:
         self._life = None
-        del self._diary._inputs[-1:]
+        del self._wal._inputs[-1:]
 
     patch.setattr(KillableNode, "kill", kill)
-    patch.setattr(recovery, "_covers", lambda pages, body: pages.birth.epoch == body.epoch)
+    patch.setattr(
+        recovery,
+        "_covers",
+        lambda entries, body: entries.initial_state.incarnation == body.incarnation,
+    )
 
 
 @mutant("a torn diary is taken for whole", _has(Kill, disk=("torn",)))
 def torn_diary_taken_for_whole(patch: Patch) -> None:
-    patch.setattr(recovery, "_covers", lambda pages, body: pages.birth.epoch == body.epoch)
+    patch.setattr(
+        recovery,
+        "_covers",
+        lambda entries, body: entries.initial_state.incarnation == body.incarnation,
+    )
 
 
 @mutant("who starts again knows nothing, not even that it has lived", _has(Kill))
 def amnesia(patch: Patch) -> None:
     def start(self: KillableNode, body: Body, disk: str) -> tuple[int, int]:
-        self._diary = InMemoryLog()
-        newborn = Body(body.pose, 0, 0, body.epoch)
-        self._life = RecoverableNode(self._build, self._diary, newborn)
-        return body.epoch, body.step
+        self._wal = InMemoryLog()
+        newborn = Body(body.pose, 0, 0, body.incarnation)
+        self._life = RecoverableNode(self._build, self._wal, newborn)
+        return body.incarnation, body.step
 
     patch.setattr(KillableNode, "start", start)
 
@@ -685,9 +695,9 @@ def needless_incarnation(patch: Patch) -> None:
 
 @mutant("asked again, a robot does its step once more", _has(Kill, mid_step=(True,)))
 def answering_a_turn_twice(patch: Patch) -> None:
-    def take(self: RecoverableNode, page: bytes) -> Any:
-        self._diary.note(page)
-        return self._live(decode_inputs(page))
+    def take(self: RecoverableNode, entry: bytes) -> Any:
+        self._wal.note(entry)
+        return self._live(decode_inputs(entry))
 
     patch.setattr(RecoverableNode, "take", take)
 
@@ -751,9 +761,9 @@ def impostor_let_in(patch: Patch) -> None:
     lambda s: any(f.__struct_config__.tag == "clock" for f in s.faults),
 )
 def clock_skew_leaks_into_physics(patch: Patch) -> None:
-    def make(act: Any) -> Any:
+    def make(step_record: Any) -> Any:
         def acted(self: Simulation, step: Any) -> Any:
-            return act(self, msgspec.structs.replace(step, skew_ns=0))
+            return step_record(self, msgspec.structs.replace(step, skew_ns=0))
 
         return acted
 

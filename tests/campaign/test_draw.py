@@ -53,9 +53,9 @@ def test_the_same_seed_is_the_same_scenario() -> None:
 @given(seed=SEEDS)
 @examples(100)
 def test_dice_stay_within_bounds(seed: int) -> None:
-    dice = KeyedDraws(seed, 7)
-    assert 2.0 <= dice.between(2.0, 3.0) <= 3.0
-    assert 0.1 <= dice.scale(0.1, 10.0) <= 10.0
-    assert dice.whole(3, 5) in {3, 4, 5}
-    assert dice.one_of("abc", [1.0, 0.0, 2.0]) in "ac"
-    assert 1 <= len(dice.some_of("abc")) <= 3
+    draws = KeyedDraws(seed, 7)
+    assert 2.0 <= draws.between(2.0, 3.0) <= 3.0
+    assert 0.1 <= draws.scale(0.1, 10.0) <= 10.0
+    assert draws.whole(3, 5) in {3, 4, 5}
+    assert draws.one_of("abc", [1.0, 0.0, 2.0]) in "ac"
+    assert 1 <= len(draws.some_of("abc")) <= 3

@@ -35,7 +35,7 @@ def rate_in_process(*overrides: str) -> float:
     """Detection of the same mission in one process."""
     scenario = find("fleet", overrides)
     recording = Recording(scenario, 0, "in-process")
-    play(scenario, 0, WorldSetup.of(scenario, 0), [recording.take])
+    play(scenario, 0, WorldSetup.of(scenario, 0), [recording.observe])
     rate = recording.finish().detection_rate
     assert rate is not None
     return rate

@@ -69,8 +69,8 @@ def play(*overrides: str, seed: int = 1) -> list[Record]:
     scenario = parse(MISSION, "small", overrides)
     site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    stage = Simulation(scenario, seed, site, [records.append])
-    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    simulation = Simulation(scenario, seed, site, [records.append])
+    simulate(simulation, in_process(team(scenario, seed, site)), seed, lambda: False)
     return records
 
 
@@ -110,13 +110,13 @@ def in_one_point(records: list[Record]) -> list[Record]:
 def garbled(records: list[Record]) -> list[Record]:
     """The record with packed pairs that cannot be read."""
 
-    def garble(act: StepRecord) -> StepRecord:
-        assert act.outputs is not None
-        outputs = msgspec.structs.replace(act.outputs, lowered=b"\xff", spent=b"\xff")
-        return msgspec.structs.replace(act, outputs=outputs)
+    def garble(step_record: StepRecord) -> StepRecord:
+        assert step_record.outputs is not None
+        outputs = msgspec.structs.replace(step_record.outputs, lowered=b"\xff", spent=b"\xff")
+        return msgspec.structs.replace(step_record, outputs=outputs)
 
     return [
-        msgspec.structs.replace(record, acts=tuple(map(garble, record.acts)))
+        msgspec.structs.replace(record, step_records=tuple(map(garble, record.step_records)))
         if isinstance(record, Batch)
         else record
         for record in records
@@ -226,8 +226,8 @@ def test_drawing_leaves_matplotlib_as_it_was(tmp_path: Path) -> None:
 def test_drawing_needs_no_display(tmp_path: Path) -> None:
     """Reports are drawn on servers, and beside a program that draws: pyplot stays out."""
     code = (
-        "import sys; from pathlib import Path; from kantor_fleet.report import draw; "
-        "from kantor_worldsim.records import decode_record; "
+        "import sys; from pathlib import Path; from kantor_fleet.report.report import draw; "
+        "from kantor_worldsim.record.records import decode_record; "
         "draw([decode_record(Path(sys.argv[1]).read_bytes())], Path(sys.argv[2])); "
         "sys.exit('matplotlib.pyplot' in sys.modules)"
     )
@@ -278,7 +278,7 @@ def test_targets_walk_as_in_the_world() -> None:
     assert walked_m[target].tolist() != run.site.targets_m[target].tolist()
 
 
-def act(
+def step_record(
     name: str, now_s: float, state: State, *, heard: bool = False, x_m: float = 1.0
 ) -> StepRecord:
     """A step of one robot, at a place on the x axis."""
@@ -289,7 +289,7 @@ def act(
         observation=Observation(0, pose),
         heard=(("r9", 1),) if heard else (),
         outputs=Outputs(step=round(now_s * 10), pose=pose, state=state),
-        ruling=StepVerdict(pose),
+        verdict=StepVerdict(pose),
     )
 
 
@@ -298,10 +298,20 @@ def test_moments_are_in_time_not_in_steps() -> None:
     opening = play()[0]
     exploring, finished = State.EXPLORING, State.FINISHED
     batches = [
-        Batch(100_000_000, (act("r1", 0.1, exploring), act("r2", 0.1, exploring)), (), 0),
-        Batch(300_000_000, (act("r1", 0.3, finished),), (), 0),
-        Batch(700_000_000, (act("r2", 0.7, finished, heard=True),), (), 0),
-        Batch(900_000_000, (act("r1", 0.9, finished, heard=True), act("r2", 0.9, finished)), (), 0),
+        Batch(
+            100_000_000,
+            (step_record("r1", 0.1, exploring), step_record("r2", 0.1, exploring)),
+            (),
+            0,
+        ),
+        Batch(300_000_000, (step_record("r1", 0.3, finished),), (), 0),
+        Batch(700_000_000, (step_record("r2", 0.7, finished, heard=True),), (), 0),
+        Batch(
+            900_000_000,
+            (step_record("r1", 0.9, finished, heard=True), step_record("r2", 0.9, finished)),
+            (),
+            0,
+        ),
     ]
 
     assert followed([opening, *batches[:2]]).contact_s is None
@@ -326,10 +336,12 @@ def test_outages_are_when_processes_did_nothing() -> None:
     records = play(*STRUCK)
     run = followed(records)
     where = next(
-        act.ruling.pose
+        step_record.verdict.pose
         for record in reversed(records)
-        for act in (record.acts if isinstance(record, Batch) and record.now_ns < 10**9 else ())
-        if act.name == "r2" and act.ruling
+        for step_record in (
+            record.step_records if isinstance(record, Batch) and record.now_ns < 10**9 else ()
+        )
+        if step_record.name == "r2" and step_record.verdict
     )
 
     assert [
@@ -359,7 +371,7 @@ def test_very_long_record_is_drawn(tmp_path: Path) -> None:
     batches = (
         Batch(
             step * 100_000_000,
-            (act("r1", step / 10, State.EXPLORING, x_m=100.0 * (step % 2)),),
+            (step_record("r1", step / 10, State.EXPLORING, x_m=100.0 * (step % 2)),),
             (),
             0,
         )

@@ -42,10 +42,10 @@ def with_bumps(records: Records) -> Records:
     """The records with all moves of r1 ended by walls."""
 
     def bumped(batch: Batch) -> Batch:
-        first, *others = batch.acts
-        ruling = msgspec.structs.replace(first.ruling, bumped=True)
+        first, *others = batch.step_records
+        verdict = msgspec.structs.replace(first.verdict, bumped=True)
         return msgspec.structs.replace(
-            batch, acts=(msgspec.structs.replace(first, ruling=ruling), *others)
+            batch, step_records=(msgspec.structs.replace(first, verdict=verdict), *others)
         )
 
     return [bumped(record) if isinstance(record, Batch) else record for record in records]
@@ -106,10 +106,10 @@ def test_colours_are_those_of_the_stamps() -> None:
     """A cell's colour tells when it was first seen; walls are darker, what nobody saw is pale."""
     run, exploration = followed(explored()[:12])
     axes = Figure().subplots()
-    draw_known(axes, exploration.survey, 0.1)
+    draw_known(axes, exploration.map_tracker, 0.1)
     (image,) = axes.images
     colours = np.asarray(image.get_array())
-    ticks = exploration.survey.books.first_tick.reshape(ROOMS.cells.shape)
+    ticks = exploration.map_tracker.state.first_tick.reshape(ROOMS.cells.shape)
     free = ROOMS.cells == 1
 
     assert run.site.ground is not None
@@ -129,7 +129,7 @@ def test_outlines_are_the_borders_of_what_is_free() -> None:
     """Every side of a cell between free and not free, once."""
     _, exploration = followed(explored())
     axes = Figure().subplots()
-    draw_known(axes, exploration.survey, 0.1)
+    draw_known(axes, exploration.map_tracker, 0.1)
     (outlines,) = [made for made in axes.collections if isinstance(made, LineCollection)]
     free = np.pad(ROOMS.cells == 1, 1)
 
@@ -142,11 +142,11 @@ def test_bumps_stand_where_they_happened() -> None:
     """A mark for each."""
     _, exploration = followed(with_bumps(explored()))
     axes = Figure().subplots()
-    draw_bumps(axes, exploration.survey)
+    draw_bumps(axes, exploration.map_tracker)
     (marks,) = axes.collections
 
-    assert marks.get_offsets().tolist() == [list(xy) for xy in exploration.survey.bumps]
-    assert len(exploration.survey.bumps) > 10
+    assert marks.get_offsets().tolist() == [list(xy) for xy in exploration.map_tracker.bumps]
+    assert len(exploration.map_tracker.bumps) > 10
 
 
 def test_summary_of_a_map_tells_what_was_explored() -> None:

@@ -76,8 +76,8 @@ def recorded(scenario: Scenario, folder: Path, machines: Exchange | None = None)
     """Play a mission into a run folder."""
     recording = Recording(scenario, 1, "in-process", folder)
     site = WorldSetup.of(scenario, 1)
-    stage = Simulation(scenario, 1, site, [recording.take])
-    simulate(stage, machines or in_process(team(scenario, 1, site)), 1, lambda: False)
+    simulation = Simulation(scenario, 1, site, [recording.observe])
+    simulate(simulation, machines or in_process(team(scenario, 1, site)), 1, lambda: False)
     return recording.finish()
 
 

@@ -80,11 +80,11 @@ class Played:
             if isinstance(record, Batch):
                 mailbag.post(record)
         for record in self.records:
-            for act in record.acts if isinstance(record, Batch) else ():
-                if act.outputs is not None:
-                    self.inputs.append(mailbag.inputs(act))
-                    self.outputs.append(act.outputs)
-                    self.acted.append(act.name)
+            for step_record in record.step_records if isinstance(record, Batch) else ():
+                if step_record.outputs is not None:
+                    self.inputs.append(mailbag.inputs(step_record))
+                    self.outputs.append(step_record.outputs)
+                    self.acted.append(step_record.name)
 
     @property
     def opening(self) -> Opening:
@@ -163,11 +163,13 @@ def news_fields(name: str) -> Framed:
     """The sender's place, and what it tells: have, logs, claims, registers."""
     told = [decode_gossip(body) for body in pick(played(name).bodies(), GOODS, 2000)]
     goods = [
-        (bytes((i % 3 + 1,)), n.have, n.logs, n.claims, n.registers) for i, n in enumerate(told)
+        (bytes((i % 3 + 1,)), n.version_vector, n.logs, n.claims, n.registers)
+        for i, n in enumerate(told)
     ]
     # Whoever knows of reborn participants has twice as many numbers.
     reborn = [
-        (slot, have + bytes(len(number_spans(have))), *rest) for slot, have, *rest in goods[::4]
+        (slot, version_vector + bytes(len(number_spans(version_vector))), *rest)
+        for slot, version_vector, *rest in goods[::4]
     ]
     return Framed([*goods, *reborn], LEB_TOKENS)
 
@@ -330,7 +332,7 @@ def journals() -> Mutations:
             path = Path(folder) / name
             journal = Journal(path)
             for record in played(name).records[:4]:
-                journal.take(record)
+                journal.append(record)
             journal.close()
             contents.append(path.read_bytes())
     return files(contents)

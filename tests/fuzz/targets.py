@@ -32,7 +32,7 @@ from kantor_protocol.node.wal import WalFile
 from kantor_protocol.replication.gossip import build_replica
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
 from kantor_protocol.replication.registers import NUMBER_MAX, read_register
-from kantor_protocol.replication.replica import Replica, read_have
+from kantor_protocol.replication.replica import Replica, read_version_vector
 from kantor_protocol.scenario.dump import to_toml, to_tree
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.load import from_tree, parse, with_chaos
@@ -161,7 +161,7 @@ def _weights(_folder: Path) -> Decode:
 
     def take(content: bytes) -> bool:
         before = subscriber.weights
-        taken = subscriber.take(content)
+        taken = subscriber.apply(content)
         assert taken or subscriber.weights is None or subscriber.weights is before
         assert not taken or (subscriber.weights is not None and subscriber.weights.min() >= 0)
         return taken
@@ -209,10 +209,10 @@ def _learning(name: str, me: str = "r1", samples: int | None = None) -> Callable
         registers = replica.registers
 
         def take(content: bytes) -> bool:
-            source, have, logs, claims, written = unframe(content)
+            source, version_vector, logs, claims, written = unframe(content)
             place = source[0] % (3 * len(scenario.roster)) if source else 0
             before = _state(replica)
-            taken = replica.learn(place, have, logs, claims, written)
+            taken = replica.learn(place, version_vector, logs, claims, written)
             if not taken:
                 assert _state(replica) == before, "a refused message has changed something"
                 return False
@@ -238,12 +238,12 @@ def _state(replica: Replica) -> list[bytes]:
 
 
 def _is_sound(replica: Replica) -> None:
-    store, manner = replica.store, replica.manner
+    store, config = replica.store, replica.config
     rows, capacity, _ = store.logs.shape
-    written = store.length if manner.ledger else store.length[manner.me : manner.me + 1]
+    written = store.length if config.ledger else store.length[config.me : config.me + 1]
     assert (written >= 0).all(), "a log of negative length"
     assert (written <= capacity).all(), "a log longer than its room"
-    assert rows == (store.length.shape[0] if manner.ledger else 1)
+    assert rows == (store.length.shape[0] if config.ledger else 1)
     if store.weights.size:
         assert store.weights.min() >= 0, "a negative weight"
         assert store.counters[2] == np.count_nonzero(store.weights), "weights are not counted"
@@ -282,8 +282,8 @@ def _register_inputs() -> Inventive:
 
 
 def _reading_have(content: bytes) -> bool:
-    _source, have, *_ = unframe(content)
-    lengths = read_have(have, 3)
+    _source, version_vector, *_ = unframe(content)
+    lengths = read_version_vector(version_vector, 3)
     assert lengths is None or min(lengths) >= 0
     return lengths is not None
 
@@ -298,7 +298,7 @@ def _evidence(_folder: Path) -> Decode:
     def take(content: bytes) -> bool:
         scan, place = unframe(content)
         x_m, y_m, heading_rad = struct.unpack("<3d", place[:24].ljust(24, b"\0"))
-        news = evidence.take(scan, Pose(x_m, y_m, heading_rad), moved=True)
+        news = evidence.observe(scan, Pose(x_m, y_m, heading_rad), moved=True)
         if news.size:
             assert 0 <= news.min() <= news.max() < bound
         assert evidence.kinds.max() <= OCCUPIED
@@ -330,7 +330,9 @@ def _reader(_folder: Path) -> Decode:
 
 
 def _parts_of_news(content: bytes) -> bool:
-    epoch, have, have_end, logs, end = columnar.parts_of_news(content, 0, len(content))
+    incarnation, version_vector, have_end, logs, end = columnar.parts_of_gossip(
+        content, 0, len(content)
+    )
     assert end <= len(content)
     try:
         news = decode_gossip(content)
@@ -338,8 +340,11 @@ def _parts_of_news(content: bytes) -> bool:
         assert end < 0, "a referee takes for news what robots refuse"
         return False
     if end >= 0:
-        assert epoch == news.epoch
-        assert (content[have:have_end], content[logs:end]) == (news.have, news.logs)
+        assert incarnation == news.incarnation
+        assert (content[version_vector:have_end], content[logs:end]) == (
+            news.version_vector,
+            news.logs,
+        )
     return end >= 0
 
 

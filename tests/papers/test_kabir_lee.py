@@ -49,7 +49,7 @@ def flown(name: str, overrides: tuple[str, ...], seed: int) -> Flight:
     scenario = find(name, overrides)
     site = WorldSetup.of(scenario, seed)
     recording = Recording(scenario, seed, "in-process")
-    play(scenario, seed, site, [recording.take])
+    play(scenario, seed, site, [recording.observe])
     result = recording.finish()
     assert result.complaints == ()
     return Flight(result, recording.metrics.rows)
@@ -318,14 +318,18 @@ def small(*overrides: str) -> Small:
     told: list[tuple[int, list[tuple[float, float]], Places]] = [(0, [], robots_m.copy())]
 
     def follow(record: Record) -> None:
-        metrics.take(record)
-        for act in record.acts if isinstance(record, Batch) else ():
-            if act.outputs is None or act.ruling is None or act.name not in scenario.robot_ids:
+        metrics.observe(record)
+        for step_record in record.step_records if isinstance(record, Batch) else ():
+            if (
+                step_record.outputs is None
+                or step_record.verdict is None
+                or step_record.name not in scenario.robot_ids
+            ):
                 continue
-            place = act.ruling.pose.x_m, act.ruling.pose.y_m
-            robots_m[scenario.robot_ids.index(act.name)] = place
-            shipped.extend([place] if act.outputs.spent else [])
-            told.append((act.now_ns // scenario.period_ns, shipped.copy(), robots_m.copy()))
+            place = step_record.verdict.pose.x_m, step_record.verdict.pose.y_m
+            robots_m[scenario.robot_ids.index(step_record.name)] = place
+            shipped.extend([place] if step_record.outputs.spent else [])
+            told.append((step_record.now_ns // scenario.period_ns, shipped.copy(), robots_m.copy()))
 
     play(scenario, 1, site, [follow])
     at_end_of = {tick: (points, places) for tick, points, places in told}
@@ -433,12 +437,12 @@ def shipments(scenario: Scenario) -> Iterator[tuple[Places, dict[int, int], Plac
     left = [5] * 12
     pairs = Pairs()
     for record in records:
-        for act in record.acts if isinstance(record, Batch) else ():
-            assert act.outputs is not None
-            filled = pairs.decode(act.outputs.spent, 12)
+        for step_record in record.step_records if isinstance(record, Batch) else ():
+            assert step_record.outputs is not None
+            filled = pairs.decode(step_record.outputs.spent, 12)
             assert filled is not None
             plan = dict(zip(filled[0].tolist(), filled[1].tolist(), strict=True))
-            place = np.array([act.outputs.pose.x_m, act.outputs.pose.y_m])
+            place = np.array([step_record.outputs.pose.x_m, step_record.outputs.pose.y_m])
             yield place, plan, site.samples_m, left.copy()
             for sample, units in plan.items():
                 left[sample] -= units

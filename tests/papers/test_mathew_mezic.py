@@ -35,7 +35,7 @@ class Flight(NamedTuple):
     scenario: Scenario
     detected: float
     """Percent of the targets."""
-    acts: list[StepRecord]
+    step_records: list[StepRecord]
 
 
 @functools.cache
@@ -43,15 +43,19 @@ def flown(overrides: tuple[str, ...], seed: int) -> Flight:
     """Section VI-A's mission, run once in process."""
     scenario = find("paper-centralized", overrides)
     site, metrics, checker = WorldSetup.of(scenario, seed), DensityMetrics(), Checker()
-    acts: list[StepRecord] = []
+    step_records: list[StepRecord] = []
 
     def keep(record: Record) -> None:
         if isinstance(record, Batch):
-            acts.extend(act for act in record.acts if act.outputs and act.outputs.spent)
+            step_records.extend(
+                step_record
+                for step_record in record.step_records
+                if step_record.outputs and step_record.outputs.spent
+            )
 
-    play(scenario, seed, site, [metrics.take, checker.take, keep])
+    play(scenario, seed, site, [metrics.observe, checker.observe, keep])
     assert checker.complaints == []
-    return Flight(scenario, 100.0 * len(metrics.finds) / len(site.targets_m), acts)
+    return Flight(scenario, 100.0 * len(metrics.finds) / len(site.targets_m), step_records)
 
 
 def median_detected(*overrides: str) -> float:
@@ -64,8 +68,8 @@ def distance_from_ergodic(flight: Flight, visits: int) -> float:
     scenario, modes = flight.scenario, flight.scenario.planner.modes
     rectangle, order = rectangle_of(scenario.domain), np.arange(modes)
     total: npt.NDArray[np.float64] = np.zeros(modes * modes)
-    for act in flight.acts[:visits]:
-        pose = act.observation.pose
+    for step_record in flight.step_records[:visits]:
+        pose = step_record.observation.pose
         total += visit_at(pose.x_m, pose.y_m, rectangle, modes)
     norm = np.where(order > 0, 0.5, 1.0)
     weight = (1.0 + order[:, None] ** 2 + order[None, :] ** 2) ** -1.5 / np.outer(norm, norm)

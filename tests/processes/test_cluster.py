@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import psutil
 import pytest
-import workers
+from support import workers
 
 from kantor_fleet.execution import pools
 from kantor_fleet.execution.experiment import Case

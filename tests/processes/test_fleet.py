@@ -28,7 +28,7 @@ LOSSY = (
 def detection(scenario: Scenario, seed: int) -> float:
     """The detection rate in virtual time."""
     site, metrics = WorldSetup.of(scenario, seed), DensityMetrics()
-    play(scenario, seed, site, [metrics.take])
+    play(scenario, seed, site, [metrics.observe])
     return len(metrics.finds) / len(site.targets_m)
 
 
@@ -172,13 +172,16 @@ def test_a_robot_may_come_late(kantor: "Kantor") -> None:
     from kantor_worldsim.record.records import Batch
 
     (folder,) = kantor.runs()
-    acts = [
-        act
+    step_records = [
+        step_record
         for _, record in read(folder / "run.mcap")
         if isinstance(record, Batch)
-        for act in record.acts
+        for step_record in record.step_records
     ]
-    first = {name: min(act.now_ns for act in acts if act.name == name) for name in ("r1", "r5")}
+    first = {
+        name: min(step_record.now_ns for step_record in step_records if step_record.name == name)
+        for name in ("r1", "r5")
+    }
     assert first["r5"] > first["r1"] + 1_000_000_000
 
 
@@ -260,7 +263,7 @@ def test_a_robot_process_imports_only_what_it_uses(kantor: "Kantor") -> None:
 
     script = (
         "import sys; from kantor_fleet.__main__ import main; "
-        "import kantor_agent.process, kantor_fleet.by_hand; print('\\n'.join(sys.modules))"
+        "import kantor_agent.process, kantor_fleet.processes.standalone; print('\\n'.join(sys.modules))"
     )
     modules = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=True

@@ -201,10 +201,15 @@ def test_robots_hold_while_their_site_is_gone(place: Place) -> None:
     assert {incident.who for incident in incidents_of(folder)} == {"r1", "r2"}
     records = records_of(folder)
     for leaving, joining in zip(left, joined, strict=True):
-        acts = acts_of(records, leaving.who)
+        step_records = acts_of(records, leaving.who)
         # The step that was under way is taken in when it is said again.
-        assert sum(leaving.now_ns < act.now_ns < joining.now_ns for act in acts) <= 1
-        assert acts[-1].now_ns > joining.now_ns
+        assert (
+            sum(
+                leaving.now_ns < step_record.now_ns < joining.now_ns for step_record in step_records
+            )
+            <= 1
+        )
+        assert step_records[-1].now_ns > joining.now_ns
     assert kantor("verify", folder).code == 0
 
 

@@ -130,7 +130,7 @@ def test_whatever_befalls_processes_the_record_is_the_same_over_the_bus(doomed: 
 
     alone, bus = doomed.runs()
     assert result_of(alone)["digest"] == result_of(bus)["digest"]
-    starts = [(i.who, i.epoch) for i in incidents_of(bus) if i.what == "start"]
+    starts = [(i.who, i.incarnation) for i in incidents_of(bus) if i.what == "start"]
     assert sorted(starts) == sorted(STARTS)
     log = (bus / "logs" / "worldsim.log").read_text()
     assert log.count("resumed") == 2
@@ -151,7 +151,7 @@ def test_whatever_befalls_processes_they_go_on_by_their_own_clocks(doomed: "Kant
     assert "all rules held" in finished.out, finished.out + finished.err
     incidents = incidents_of(folder)
     starts = [incident for incident in incidents if incident.what == "start"]
-    assert sorted((i.who, i.epoch) for i in starts) == sorted(STARTS)
+    assert sorted((i.who, i.incarnation) for i in starts) == sorted(STARTS)
     assert {i.what for i in incidents} >= {
         "kill", "start", "pause", "resume", "fill", "free", "slow", "quicken", "pretend",
     }  # fmt: skip
@@ -195,9 +195,9 @@ def test_robots_go_on_without_the_supervisor_and_with_it_again(kantor: "Kantor")
     kill, start = incidents_of(folder)
     records = records_of(folder)
     meanwhile = [a for a in acts_of(records, "r1") if kill.now_ns < a.now_ns < start.now_ns]
-    assert any(act.outputs and act.outputs.spent for act in meanwhile)
+    assert any(step_record.outputs and step_record.outputs.spent for step_record in meanwhile)
     assert [a for a in acts_of(records, "supervisor") if a.now_ns > start.now_ns]
-    assert start.epoch == 0
+    assert start.incarnation == 0
 
 
 @pytest.mark.parametrize("exchange", ["lockstep", "wall"])
@@ -279,16 +279,16 @@ class ByHand:
 
 def test_a_robot_that_is_killed_and_started_again_goes_on_where_it_was(by_hand: ByHand) -> None:
     """With its diary as the same incarnation; without, as the next one; r1 goes on meanwhile."""
-    for epoch in (0, 1):
+    for incarnation in (0, 1):
         by_hand.robots["r2"].kill()
-        left = await_incident(by_hand.folder, "r2", "leave", epoch + 1)
-        if epoch:
+        left = await_incident(by_hand.folder, "r2", "leave", incarnation + 1)
+        if incarnation:
             (by_hand.kantor.folder / "state" / "r2.diary").unlink()
         by_hand.robots["r2"] = by_hand.start_robot("r2")
-        joined = await_incident(by_hand.folder, "r2", "join", epoch + 1)
+        joined = await_incident(by_hand.folder, "r2", "join", incarnation + 1)
         before = acts_of(records_of(by_hand.folder), "r2")
-        assert (joined.epoch, joined.fault) == (epoch, -1)
-        assert joined.step >= sum(act.now_ns < left.now_ns for act in before)
+        assert (joined.incarnation, joined.fault) == (incarnation, -1)
+        assert joined.step >= sum(step_record.now_ns < left.now_ns for step_record in before)
         await_act(by_hand.folder, "r2", joined.step + 3)
 
     by_hand.end()
@@ -302,14 +302,14 @@ def test_of_a_frozen_robot_and_its_successor_one_goes_on(by_hand: ByHand) -> Non
     frozen.send_signal(signal.SIGSTOP)
     await_incident(by_hand.folder, "r2", "leave")
     frozen.send_signal(signal.SIGCONT)
-    assert await_incident(by_hand.folder, "r2", "join").epoch == 0
+    assert await_incident(by_hand.folder, "r2", "join").incarnation == 0
     steps = len(acts_of(records_of(by_hand.folder), "r2"))
     await_act(by_hand.folder, "r2", steps + 2)
 
     frozen.send_signal(signal.SIGSTOP)
     await_incident(by_hand.folder, "r2", "leave", 2)
     by_hand.robots["r2"] = by_hand.start_robot("r2")
-    assert await_incident(by_hand.folder, "r2", "join", 2).epoch == 1
+    assert await_incident(by_hand.folder, "r2", "join", 2).incarnation == 1
     frozen.send_signal(signal.SIGCONT)
     _, complaint = frozen.communicate(timeout=30)
     assert frozen.returncode == 2

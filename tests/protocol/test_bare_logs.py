@@ -35,9 +35,9 @@ def test_an_entry_is_one_number_on_the_air() -> None:
     """Origin, start, span, count; then a folded difference for each, and no values."""
     one = replica(0, 2)
     one.append(np.array([7, 8, 5]))
-    have, logs, claims = one.compose(1)
+    version_vector, logs, claims = one.compose(1)
 
-    assert (have, logs, claims) == (bytes([3, 0]), bytes([0, 0, 3, 3, 14, 2, 5]), b"")
+    assert (version_vector, logs, claims) == (bytes([3, 0]), bytes([0, 0, 3, 3, 14, 2, 5]), b"")
     rows = read_logs(logs, valued=False)
     assert rows is not None
     assert rows[:, :3].tolist() == [[0, 0, 7], [0, 1, 8], [0, 2, 5]]

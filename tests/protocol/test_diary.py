@@ -20,32 +20,32 @@ from kantor_protocol.node.wal import _MAGIC, WalFile, _frame, tear
 from kantor_protocol.wire.messages import encode
 from support.strategies import INPUTS, examples
 
-BIRTH = Body(Pose(1.0, 2.0), step=3, energy_spent=2, epoch=1)
+BIRTH = Body(Pose(1.0, 2.0), step=3, energy_spent=2, incarnation=1)
 
 
-def page(step: int) -> bytes:
+def entry(step: int) -> bytes:
     """What is noted before the step after this one."""
     return encode(Inputs(step * 10, Observation(step, Pose(float(step), 0.0))))
 
 
-PAGES = [page(step) for step in range(3, 9)]
+PAGES = [entry(step) for step in range(3, 9)]
 
 
-def written(path: Path, pages: list[bytes], run: str = "run") -> None:
+def written(path: Path, entries: list[bytes], run: str = "run") -> None:
     """A diary that somebody left."""
-    diary = WalFile(path, run)
-    diary.begin(BIRTH)
-    for content in pages:
-        diary.note(content)
-    diary.close()
+    wal = WalFile(path, run)
+    wal.begin(BIRTH)
+    for content in entries:
+        wal.note(content)
+    wal.close()
 
 
 def found(path: Path, run: str = "run") -> WalContents | None:
     """What whoever comes next finds."""
-    diary = WalFile(path, run)
-    pages = diary.read()
-    diary.close()
-    return pages
+    wal = WalFile(path, run)
+    entries = wal.read()
+    wal.close()
+    return entries
 
 
 @given(st.lists(INPUTS, max_size=6))
@@ -86,7 +86,7 @@ def test_any_cut_and_any_flipped_bit_leave_a_prefix(data: st.DataObject) -> None
         path.write_bytes(content[: data.draw(st.integers(0, len(content)))] + tail)
 
         first = found(path)
-        assert first is None or (first.birth, first.inputs) == (
+        assert first is None or (first.initial_state, first.inputs) == (
             BIRTH,
             PAGES[: len(first.inputs)],
         )
@@ -158,8 +158,8 @@ def found_beside(path: Path) -> list[bytes]:
     """The pages in a diary that is still being written."""
     copy = path.with_name("copy")
     copy.write_bytes(path.read_bytes())
-    pages = found(copy)
-    return [] if pages is None else list(pages.inputs)
+    entries = found(copy)
+    return [] if entries is None else list(entries.inputs)
 
 
 @contextmanager
@@ -177,15 +177,15 @@ def room_for(size: int) -> Iterator[None]:
 def test_a_full_disk_takes_no_page_and_no_half_of_one(tmp_path: Path, spare: int) -> None:
     """The page is refused with an error, and fits when there is room again."""
     path = tmp_path / "r1.diary"
-    diary = WalFile(path, "run")
-    diary.begin(BIRTH)
-    diary.note(PAGES[0])
+    wal = WalFile(path, "run")
+    wal.begin(BIRTH)
+    wal.note(PAGES[0])
     with room_for(path.stat().st_size + spare), pytest.raises(OSError, match="File too large"):
-        diary.note(PAGES[1])
+        wal.note(PAGES[1])
     assert found_beside(path) == PAGES[:1]
-    diary.note(PAGES[1])
-    diary.note(PAGES[2])
-    diary.close()
+    wal.note(PAGES[1])
+    wal.note(PAGES[2])
+    wal.close()
 
     assert found(path) == WalContents(BIRTH, PAGES[:3])
 
@@ -193,9 +193,9 @@ def test_a_full_disk_takes_no_page_and_no_half_of_one(tmp_path: Path, spare: int
 def test_a_full_disk_keeps_the_old_diary_when_a_new_one_does_not_fit(tmp_path: Path) -> None:
     path = tmp_path / "r1.diary"
     written(path, PAGES[:1])
-    diary = WalFile(path, "run")
+    wal = WalFile(path, "run")
     with room_for(20), pytest.raises(OSError, match="File too large"):
-        diary.begin(BIRTH)
+        wal.begin(BIRTH)
 
     assert found(path) == WalContents(BIRTH, PAGES[:1])
     assert [file.name for file in tmp_path.iterdir()] == ["r1.diary"]
@@ -231,12 +231,12 @@ def test_two_writers_never_share_a_diary(tmp_path: Path) -> None:
     try:
         body = Body(Pose(0.0, 0.0), step=1)
         successor = RecoverableNode(Counter, WalFile(path, "run"), body)
-        assert (successor.epoch, successor.step_count) == (1, 1)
+        assert (successor.incarnation, successor.step_count) == (1, 1)
         os.kill(frozen.pid or 0, signal.SIGKILL)
         frozen.join()
         successor.step(Inputs(2, Observation(1, Pose(0.0, 0.0))))
         third = RecoverableNode(Counter, WalFile(path, "run"), body)
-        assert (third.epoch, third.step_count) == (1, 1)
+        assert (third.incarnation, third.step_count) == (1, 1)
     finally:
         frozen.kill()
         frozen.join()

@@ -53,7 +53,7 @@ def scanned(ground: Ground, sensor: SensorOptions, *poses: Pose) -> OccupancyLog
     finder = RangeFinder(sensor, ground, 1)
     evidence = OccupancyLog(ground.frame, sensor, ranges=False)
     for step, pose in enumerate(poses):
-        evidence.take(finder.scan(0, step, pose), pose, moved=True)
+        evidence.observe(finder.scan(0, step, pose), pose, moved=True)
     return evidence
 
 
@@ -190,7 +190,7 @@ def test_scan_says_what_its_beams_say_in_sum(hits: int, passes: int, evidence: i
     evidences = [OccupancyLog(ground.frame, sensor, ranges=False) for _ in range(2)]
     for times in (1, 2):
         for layer, scan in zip(evidences, (beams, beams[::-1]), strict=True):
-            layer.take(codes(*scan), Pose(0.0, 0.5), moved=True)
+            layer.observe(codes(*scan), Pose(0.0, 0.5), moved=True)
             told = [*(3 * [PASS]), evidence, *(4 * [PASS])]
 
             assert layer.odds.tolist() == [times * step for step in told]
@@ -202,8 +202,8 @@ def test_later_evidence_turns_a_cell() -> None:
     sensor = sensor_of(ground, 4.0, 1)
     evidence = OccupancyLog(ground.frame, sensor, ranges=False)
     pose, cell = Pose(0.5, 0.5), 2
-    told = [evidence.take(codes(round(1.5 / 4.0 * CODES)), pose, moved=True).tolist()]
-    told += [evidence.take(codes(NO_RETURN), pose, moved=True).tolist() for _ in range(3)]
+    told = [evidence.observe(codes(round(1.5 / 4.0 * CODES)), pose, moved=True).tolist()]
+    told += [evidence.observe(codes(NO_RETURN), pose, moved=True).tolist() for _ in range(3)]
 
     assert told == [[0, 2, 2 * cell + 1], [6], [], [2 * cell]]
 
@@ -223,7 +223,7 @@ def test_entries_are_the_changes_of_kind(place: Place, data: st.DataObject) -> N
         st.lists(st.lists(st.integers(0, NO_RETURN), min_size=24, max_size=24), max_size=6)
     )
     for scan in scans:
-        news = evidence.take(codes(*scan), pose, moved=True)
+        news = evidence.observe(codes(*scan), pose, moved=True)
         assert (np.diff(news // 2) > 0).all()
         kinds = np.where(news % 2 == 1, OCCUPIED, FREE)
         assert (told[news // 2] != kinds).all()
@@ -243,9 +243,9 @@ def test_ranges_are_told_after_a_move_only() -> None:
     near, none = codes(*16 * [round(1.5 / 4.0 * CODES)]), codes(*16 * [NO_RETURN])
     first, base = 3 * ground.frame.cells, RANGE_BINS
 
-    assert evidence.take(near, Pose(0.5, 0.5), moved=True)[-4:].tolist() == 4 * [first + 11]
-    assert evidence.take(near, Pose(0.5, 0.5), moved=False).tolist() == []
-    assert (evidence.take(none, Pose(0.5, 0.5), moved=True)[-4:] == first + base - 1).all()
+    assert evidence.observe(near, Pose(0.5, 0.5), moved=True)[-4:].tolist() == 4 * [first + 11]
+    assert evidence.observe(near, Pose(0.5, 0.5), moved=False).tolist() == []
+    assert (evidence.observe(none, Pose(0.5, 0.5), moved=True)[-4:] == first + base - 1).all()
     assert dead_frontier(ground.frame, 2) < first < entries(ground.frame) == first + base
 
 
@@ -255,7 +255,7 @@ def test_scan_of_another_size_is_void(scan: bytes) -> None:
     ground = drawn("...")
     evidence = OccupancyLog(ground.frame, sensor_of(ground, 4.0), ranges=True)
 
-    assert evidence.take(scan, Pose(0.5, 0.5), moved=True).size == 0
+    assert evidence.observe(scan, Pose(0.5, 0.5), moved=True).size == 0
     assert not evidence.odds.any()
 
 
@@ -272,7 +272,7 @@ def test_from_outside_a_scan_says_nothing(
     """A pose that is not on the map adds no evidence, however absurd it is."""
     ground = drawn("...", "...")
     evidence = OccupancyLog(ground.frame, sensor_of(ground, 4.0, 8, 360.0, noise), ranges=False)
-    evidence.take(codes(*scan), Pose(x_m, y_m), moved=True)
+    evidence.observe(codes(*scan), Pose(x_m, y_m), moved=True)
     inside = 0.0 <= x_m < 3.0 and 0.0 <= y_m < 2.0
 
     assert evidence.odds.any() == inside

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import replicas
+from support import replicas
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.base.incarnations import EPOCHS_MAX, known_to
+from kantor_protocol.base.incarnations import INCARNATIONS_MAX, known_to
 from kantor_protocol.replication.registers import Registers, read_register
-from kantor_protocol.replication.replica import Replica, read_have
+from kantor_protocol.replication.replica import Replica, read_version_vector
 from kantor_protocol.replication.replica_kernels import NOBODY, spend
 from kantor_protocol.wire.version_vector import slots_told
 from kantor_protocol.wire.weights import Units
@@ -45,7 +45,7 @@ def buy(held: Replica, sample: int, units: int) -> None:
     units = min(units, int(held.weights[sample]))
     if units > 0:
         held.reserve(1)
-        spend(held.store, held.manner, sample, units)
+        spend(held.store, held.config, sample, units)
 
 
 def tell(held: Replica, *others: Replica, target: int = NOBODY) -> None:
@@ -53,13 +53,13 @@ def tell(held: Replica, *others: Replica, target: int = NOBODY) -> None:
     word = (*held.compose(target), held.registers.compose(target))
     held.end_step()
     for other in others:
-        assert other.learn(held.manner.me, *word)
+        assert other.learn(held.config.me, *word)
 
 
 def whole_log(held: Replica) -> bytes:
     """The own log as one suffix: origin, start, span, count, then (folded difference, units); small numbers."""
-    entries = replicas.entries(held, held.manner.me)
-    content, before = [held.manner.me, 0, len(entries), len(entries)], 0
+    entries = replicas.entries(held, held.config.me)
+    content, before = [held.config.me, 0, len(entries), len(entries)], 0
     for sample, units in entries:
         step, before = sample - before, sample
         content += [2 * step if step >= 0 else -2 * step - 1, units]
@@ -76,7 +76,7 @@ def snapshot(held: Replica) -> list[Any]:
 def test_slots_come_in_blocks_of_the_roster() -> None:
     """One for each incarnation, up to the last that there may be."""
     assert [known_to(slot, 3) for slot in (0, 2, 3, 8, 47)] == [3, 3, 6, 9, 48]
-    for slot in (-1, 3 * (EPOCHS_MAX + 1)):
+    for slot in (-1, 3 * (INCARNATIONS_MAX + 1)):
         with pytest.raises(ValueError, match="incarnation"):
             known_to(slot, 3)
     with pytest.raises(ValueError, match="incarnation 16"):
@@ -87,7 +87,7 @@ def test_slots_come_in_blocks_of_the_roster() -> None:
 def test_a_vector_tells_for_how_many_slots_it_is(*, claims: bool) -> None:
     """As many numbers as slots, twice as many with claims, whatever their length."""
     parts = 2 if claims else 1
-    for blocks in range(1, EPOCHS_MAX + 2):
+    for blocks in range(1, INCARNATIONS_MAX + 2):
         numbers = b"\x85\x01" + bytes(parts * 3 * blocks - 1)
         assert slots_told(numbers, 3, claims=claims) == 3 * blocks
     for content in (b"", bytes(parts * 3 - 1), bytes(parts * 3 * 17), b"\x80" * 3, b"\xff" * 12):
@@ -98,10 +98,10 @@ def test_a_new_incarnation_speaks_of_twice_as_many_slots() -> None:
     """Its own log is in its own slot; its predecessor's is another's."""
     one = replica(ROSTER + 1)
     buy(one, 2, 3)
-    have = one.compose(0)[0]
+    version_vector = one.compose(0)[0]
 
-    assert have == bytes([0, 0, 0, 0, 1, 0]) + bytes(6)
-    assert read_have(have, 6) == [0, 0, 0, 0, 1, 0]
+    assert version_vector == bytes([0, 0, 0, 0, 1, 0]) + bytes(6)
+    assert read_version_vector(version_vector, 6) == [0, 0, 0, 0, 1, 0]
 
 
 @CLAIMS
@@ -110,7 +110,7 @@ def test_shorter_vectors_are_of_who_holds_nothing_beyond(*, ledger: bool, claims
     """Who has not heard of an incarnation holds nothing of it, and is told."""
     young, old, other = (replica(slot, ledger=ledger, claims=claims) for slot in (4, 0, 2))
     for held in (young, old):
-        buy(held, held.manner.me, 1)
+        buy(held, held.config.me, 1)
     young.claim(4, 5)
     old.claim(0, 7)
     tell(old, young, other)
@@ -138,7 +138,7 @@ def test_vectors_of_odd_lengths_change_nothing(*, ledger: bool, claims: bool) ->
     held = replica(0, ledger=ledger, claims=claims, width=WIDTH)
     buy(held, 1, 2)
     before = snapshot(held)
-    for numbers in range(parts * ROSTER * (EPOCHS_MAX + 2) + 2):
+    for numbers in range(parts * ROSTER * (INCARNATIONS_MAX + 2) + 2):
         sound = numbers > 0 and numbers % (parts * ROSTER) == 0 and numbers <= parts * ROSTER * 16
         if not sound:
             assert not held.learn(1, bytes(numbers), b"", b"", bytes(numbers))
@@ -308,8 +308,8 @@ def test_all_end_with_all_that_the_living_know(
         if deed == "spend":
             buy(held, sample, 1 + sample % 3)
             held.registers.add(np.array([2, sample - 3 if sample > 0 else 0]))
-        elif deed == "die" and held.manner.me < 4 * ROSTER:
-            made[who] = replica(held.manner.me + ROSTER, ledger=ledger, width=WIDTH)
+        elif deed == "die" and held.config.me < 4 * ROSTER:
+            made[who] = replica(held.config.me + ROSTER, ledger=ledger, width=WIDTH)
         else:
             tell(held, *(other for other in made if other is not held and luck.random() >= drop))
         for one in made:

@@ -21,7 +21,7 @@ class Rememberer:
 
     def __init__(self, body: Body) -> None:
         self._step = body.step
-        self._memory = 1000 * body.epoch + body.energy_spent
+        self._memory = 1000 * body.incarnation + body.energy_spent
 
     def step(self, inputs: Inputs, /) -> Outputs:
         self._step += 1
@@ -41,9 +41,9 @@ def told(
     return [machine.step(turn(step + i, now_ns)).refused for i, now_ns in enumerate(times_ns)]
 
 
-def at(step: int, epoch: int = 0) -> Body:
+def at(step: int, incarnation: int = 0) -> Body:
     """What the world knows of a body after so many steps; each has cost a point."""
-    return Body(Pose(float(step), 0.0), step, step, epoch)
+    return Body(Pose(float(step), 0.0), step, step, incarnation)
 
 
 TIMES = st.lists(st.integers(1, 10**6), min_size=1, max_size=8)
@@ -53,11 +53,11 @@ TIMES = st.lists(st.integers(1, 10**6), min_size=1, max_size=8)
 @given(before=TIMES, after=TIMES)
 def test_who_has_the_diary_has_the_machine(before: list[int], after: list[int]) -> None:
     """Built anew from its diary it goes on as if nothing had been."""
-    diary = InMemoryLog()
-    first = told(RecoverableNode(Rememberer, diary, HOME), before)
-    again = RecoverableNode(Rememberer, diary, at(len(before)))
+    wal = InMemoryLog()
+    first = told(RecoverableNode(Rememberer, wal, HOME), before)
+    again = RecoverableNode(Rememberer, wal, at(len(before)))
 
-    assert (again.epoch, again.step_count) == (0, len(before))
+    assert (again.incarnation, again.step_count) == (0, len(before))
     assert first + told(again, after, len(before)) == told(Rememberer(HOME), before + after)
 
 
@@ -65,17 +65,17 @@ def test_who_has_the_diary_has_the_machine(before: list[int], after: list[int]) 
 @given(times_ns=TIMES, again=st.integers(0, 3))
 def test_step_is_done_once(times_ns: list[int], again: int) -> None:
     """Asked again for its last step it answers from memory, before its death and after."""
-    diary = InMemoryLog()
-    life = RecoverableNode(Rememberer, diary, HOME)
+    wal = InMemoryLog()
+    life = RecoverableNode(Rememberer, wal, HOME)
     last = turn(len(times_ns) - 1, times_ns[-1])
     first = told(life, times_ns)
     answers = [life.step(last).refused for _ in range(again)]
-    reborn = RecoverableNode(Rememberer, diary, at(len(times_ns) - 1))
+    reborn = RecoverableNode(Rememberer, wal, at(len(times_ns) - 1))
 
     assert answers == [first[-1]] * again
     assert reborn.step(last).refused == first[-1]
     assert reborn.unheard == (last, reborn.step(last))
-    assert len(diary.read() or ()) == 2
+    assert len(wal.read() or ()) == 2
     assert told(life, [7], len(times_ns)) == told(Rememberer(HOME), [*times_ns, 7])[-1:]
 
 
@@ -83,15 +83,15 @@ def test_step_is_done_once(times_ns: list[int], again: int) -> None:
 @given(times_ns=TIMES)
 def test_encoded_turns_are_turns(times_ns: list[int]) -> None:
     """What comes encoded is noted as it came, and answered like any turn; also when it comes again."""
-    diary = InMemoryLog()
-    life = RecoverableNode(Rememberer, diary, HOME)
-    pages = [encode(turn(i, now_ns)) for i, now_ns in enumerate(times_ns)]
-    answers = [life.take(page).refused for page in (*pages, pages[-1])]
-    read = diary.read()
+    wal = InMemoryLog()
+    life = RecoverableNode(Rememberer, wal, HOME)
+    entries = [encode(turn(i, now_ns)) for i, now_ns in enumerate(times_ns)]
+    answers = [life.step_encoded(entry).refused for entry in (*entries, entries[-1])]
+    read = wal.read()
 
     assert answers == [*(first := told(Rememberer(HOME), times_ns)), first[-1]]
     assert read is not None
-    assert list(read.inputs) == pages
+    assert list(read.inputs) == entries
 
 
 class FullDisk(InMemoryLog):
@@ -107,24 +107,24 @@ class FullDisk(InMemoryLog):
 
 def test_what_cannot_be_noted_is_not_done() -> None:
     """On a full disk the machine stands still; when there is room again it goes on where it was."""
-    diary = FullDisk()
-    life = RecoverableNode(Rememberer, diary, HOME)
+    wal = FullDisk()
+    life = RecoverableNode(Rememberer, wal, HOME)
     before = told(life, [1, 2])
-    diary.full = True
+    wal.full = True
     with pytest.raises(OSError, match="full"):
         life.step(turn(2, 3))
-    diary.full = False
+    wal.full = False
 
     assert life.step_count == 2
     assert before + told(life, [4], 2) == told(Rememberer(HOME), [1, 2, 4])
 
 
-def torn(diary: InMemoryLog) -> None:
-    diary.damage("torn", 3)
+def torn(wal: InMemoryLog) -> None:
+    wal.damage("torn", 3)
 
 
-def lost(diary: InMemoryLog) -> None:
-    diary.damage("lost", 3)
+def lost(wal: InMemoryLog) -> None:
+    wal.damage("lost", 3)
 
 
 @pytest.mark.parametrize("damage", [torn, lost])
@@ -132,31 +132,31 @@ def test_who_lacks_a_step_that_others_know_of_is_another(
     damage: Callable[[InMemoryLog], None],
 ) -> None:
     """It knows what the world tells of the body, and nothing else."""
-    diary = InMemoryLog()
-    told(RecoverableNode(Rememberer, diary, HOME), [1, 2, 3])
-    damage(diary)
-    reborn = RecoverableNode(Rememberer, diary, at(3))
+    wal = InMemoryLog()
+    told(RecoverableNode(Rememberer, wal, HOME), [1, 2, 3])
+    damage(wal)
+    reborn = RecoverableNode(Rememberer, wal, at(3))
 
-    assert (reborn.epoch, reborn.step_count, reborn.unheard) == (1, 3, None)
-    assert told(reborn, [4, 5], 3) == told(Rememberer(at(3, epoch=1)), [4, 5], 3)
+    assert (reborn.incarnation, reborn.step_count, reborn.unheard) == (1, 3, None)
+    assert told(reborn, [4, 5], 3) == told(Rememberer(at(3, incarnation=1)), [4, 5], 3)
 
 
 @pytest.mark.parametrize("damage", [torn, lost])
 def test_who_never_acted_stays_the_same(damage: Callable[[InMemoryLog], None]) -> None:
     """Nobody can hold anything of it."""
-    diary = InMemoryLog()
-    RecoverableNode(Rememberer, diary, HOME)
-    damage(diary)
+    wal = InMemoryLog()
+    RecoverableNode(Rememberer, wal, HOME)
+    damage(wal)
 
-    assert RecoverableNode(Rememberer, diary, HOME).epoch == 0
+    assert RecoverableNode(Rememberer, wal, HOME).incarnation == 0
 
 
 def test_diary_of_another_incarnation_is_no_use() -> None:
     """A process that comes back after another took its body over must not write on in its old log."""
-    diary = InMemoryLog()
-    told(RecoverableNode(Rememberer, diary, HOME), [1, 2, 3, 4])
+    wal = InMemoryLog()
+    told(RecoverableNode(Rememberer, wal, HOME), [1, 2, 3, 4])
 
-    assert RecoverableNode(Rememberer, diary, at(3, epoch=2)).epoch == 3
+    assert RecoverableNode(Rememberer, wal, at(3, incarnation=2)).incarnation == 3
 
 
 DISKS: st.SearchStrategy[Disk] = st.sampled_from(["kept", "torn", "lost"])
@@ -174,7 +174,7 @@ def test_nothing_is_lost_and_nothing_is_twice(orders: list[tuple[str, Disk, int]
     An incarnation is the machine that took over the body as the world knew it, and knows what it told.
     """
     mortal = KillableNode(Rememberer, HOME)
-    birth, body = HOME, HOME
+    initial_state, body = HOME, HOME
     times_ns: list[int] = []
     for order, disk, now_ns in orders:
         asked = turn(body.step, now_ns)
@@ -183,15 +183,15 @@ def test_nothing_is_lost_and_nothing_is_twice(orders: list[tuple[str, Disk, int]
         if order != "step":
             mortal.kill()
             known = body
-            forgets = disk == "lost" or (disk == "torn" and body.step > birth.step)
+            forgets = disk == "lost" or (disk == "torn" and body.step > initial_state.step)
             if forgets and body.step:
-                body = replace(body, epoch=body.epoch + 1)
-                birth, times_ns = body, []
+                body = replace(body, incarnation=body.incarnation + 1)
+                initial_state, times_ns = body, []
             unheard = order == "die in a step" and disk == "kept"
-            assert mortal.start(known, disk) == (body.epoch, body.step + unheard)
+            assert mortal.start(known, disk) == (body.incarnation, body.step + unheard)
         if order != "kill":
             times_ns.append(now_ns)
             outputs = mortal.step(asked)
             assert outputs.step == body.step + 1
-            assert outputs.refused == told(Rememberer(birth), times_ns)[-1]
-            body = at(outputs.step, body.epoch)
+            assert outputs.refused == told(Rememberer(initial_state), times_ns)[-1]
+            body = at(outputs.step, body.incarnation)

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 import numpy as np
 from numba import njit
-from kantor_protocol.memory import let_go
+from kantor_protocol.node.memory_trim import release_file_pages
 
 def resident_kb():
     return int(re.search(r"RssFile:\\s+(\\d+)", Path("/proc/self/status").read_text())[1])
@@ -22,16 +22,16 @@ def compiled(n):
 first = compiled(1)
 assert first(np.arange(4.0)) == 6.0
 before = resident_kb()
-let_go()
+release_file_pages()
 print(before - resident_kb())
 assert first(np.arange(4.0)) == 6.0
 assert compiled(2)(np.arange(4.0)) == 12.0
-let_go()
+release_file_pages()
 assert compiled(3)(np.arange(4.0)) == 18.0
 """
 
 
-def test_what_a_file_holds_is_let_go_and_comes_back() -> None:
+def test_what_a_file_holds_is_release_file_pages_and_comes_back() -> None:
     """Tens of megabytes are not resident any more; what is compiled runs, and the next compiles."""
     done = subprocess.run(
         [sys.executable, "-c", _SCRIPT], capture_output=True, text=True, check=False

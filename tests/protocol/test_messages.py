@@ -77,7 +77,7 @@ TO_PARTICIPANT = st.one_of(
         exchange=st.sampled_from(["lockstep", "wall"]),
         frame=st.none() | st.just(Frame(0.5, (-1.0, 2.0), 8, 6)),
         run=NAMES,
-        body=st.builds(Body, pose=POSES, step=COUNTS, energy_spent=COUNTS, epoch=COUNTS),
+        body=st.builds(Body, pose=POSES, step=COUNTS, energy_spent=COUNTS, incarnation=COUNTS),
     ),
     st.builds(Refusal, version=V, nonce=NAMES, reason=NAMES),
     st.builds(StartClock, version=V, nonce=NAMES, now_ns=COUNTS, speed=FINITE),
@@ -107,7 +107,7 @@ GOLDEN_NEWS = GossipMessage(
     step=7,
     x_m=1.5,
     y_m=-2.0,
-    have=b"\x03\x00",
+    version_vector=b"\x03\x00",
     logs=b"\x00\x02\x01\x01\x06\x02",
     claims=b"",
 )
@@ -183,13 +183,13 @@ def test_inputs_come_back_as_they_were(inputs: Inputs) -> None:
 @given(news=NEWS)
 def test_independent_decoder_reads_news(news: GossipMessage) -> None:
     """A record is a msgpack array: tag, version, fields in order. `msgpack` knows nothing more."""
-    fields = [news.step, news.x_m, news.y_m, news.have, news.logs, news.claims]
-    further = [news.registers, news.epoch]
+    fields = [news.step, news.x_m, news.y_m, news.version_vector, news.logs, news.claims]
+    further = [news.registers, news.incarnation]
     while further and not further[-1]:
         further.pop()
 
     assert msgpack.unpackb(encode_gossip(news)) == [1, VERSION, *fields, *further]
-    assert msgpack.unpackb(encode(news)) == [1, VERSION, *fields, news.registers, news.epoch]
+    assert msgpack.unpackb(encode(news)) == [1, VERSION, *fields, news.registers, news.incarnation]
 
 
 @examples(100)

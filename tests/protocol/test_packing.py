@@ -10,9 +10,9 @@ from kantor_protocol.base.varint import (
     Pairs,
     put_int,
     put_uint,
+    read_int,
+    read_uint,
     sum_pairs,
-    take_int,
-    take_uint,
 )
 from support.strategies import COUNTS, examples
 
@@ -53,7 +53,7 @@ def test_unsigned_number_is_leb128(value: int) -> None:
     end = put_uint(out, 0, value)
 
     assert out[:end].tobytes() == leb128(value)
-    assert take_uint(np.frombuffer(leb128(value), dtype=np.uint8), 0) == (value, end)
+    assert read_uint(np.frombuffer(leb128(value), dtype=np.uint8), 0) == (value, end)
 
 
 @examples(150)
@@ -65,7 +65,7 @@ def test_signed_number_is_folded(value: int) -> None:
     folded = leb128(2 * value if value >= 0 else -2 * value - 1)
 
     assert out[:end].tobytes() == folded
-    assert take_int(np.frombuffer(folded, dtype=np.uint8), 0) == (value, end)
+    assert read_int(np.frombuffer(folded, dtype=np.uint8), 0) == (value, end)
 
 
 @examples(200)
@@ -73,14 +73,14 @@ def test_signed_number_is_folded(value: int) -> None:
 def test_reading_a_number_is_total(content: bytes, at: int) -> None:
     """Any bytes, any position: a number with a later position in the buffer, or MALFORMED."""
     buffer = np.frombuffer(content, dtype=np.uint8)
-    for value, end in (take_uint(buffer, at), take_int(buffer, at)):
+    for value, end in (read_uint(buffer, at), read_int(buffer, at)):
         assert (value, end) == (0, MALFORMED) or 0 <= at < end <= min(len(content), at + 9)
 
 
 @pytest.mark.parametrize("content", [b"\x80", b"\xff" * 8, b"\x80" * 9 + b"\x01", b"\xff" * 20])
 def test_number_that_is_cut_or_too_long_is_malformed(content: bytes) -> None:
     """A number ends within nine bytes, or it is none."""
-    assert take_uint(np.frombuffer(content, dtype=np.uint8), 0) == (0, MALFORMED)
+    assert read_uint(np.frombuffer(content, dtype=np.uint8), 0) == (0, MALFORMED)
 
 
 @examples(100)

@@ -47,7 +47,7 @@ def test_whatever_is_said_no_more_is_taken_than_was_asked_for_and_earned(
         if is_asked:
             bucket.ask()
             asked += 1
-        if bucket.take(size, now_s):
+        if bucket.admit(size, now_s):
             taken, taken_bytes = taken + 1, taken_bytes + size
         else:
             excess = Excess(excess.messages + 1, excess.bytes + size)
@@ -64,10 +64,10 @@ def test_an_answer_is_always_taken(sizes: list[int], flood: int) -> None:
     """Turn by turn, however fast turns follow each other, and whatever was said before."""
     bucket = TokenBucket(RateLimit.of(0.0))
     for _ in range(flood):
-        bucket.take(MESSAGE_BYTES_MAX, 0.0)
+        bucket.admit(MESSAGE_BYTES_MAX, 0.0)
     for size in sizes:
         bucket.ask()
-        assert bucket.take(size, 0.0)
+        assert bucket.admit(size, 0.0)
 
 
 @examples(50)
@@ -80,9 +80,9 @@ def test_a_sound_robot_is_within_its_quota(speed: float, frozen_s: list[float]) 
     for freeze_s in [*frozen_s, 0.0]:
         for _ in range(500):
             now_s += period_s
-            assert bucket.take(500, now_s)
+            assert bucket.admit(500, now_s)
         now_s += freeze_s
-        assert all(bucket.take(500, now_s) for _ in range(int(freeze_s / 0.2)))
+        assert all(bucket.admit(500, now_s) for _ in range(int(freeze_s / 0.2)))
 
 
 def test_a_quota_follows_from_the_mission() -> None:

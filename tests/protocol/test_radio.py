@@ -9,7 +9,9 @@ from kantor_protocol.wire.weights import Units
 from support.strategies import mission
 
 TEAM = mission()
-SOUND = encode(GossipMessage(version=1, step=1, x_m=0.0, y_m=0.0, have=b"", logs=b"", claims=b""))
+SOUND = encode(
+    GossipMessage(version=1, step=1, x_m=0.0, y_m=0.0, version_vector=b"", logs=b"", claims=b"")
+)
 
 
 def heard(*envelopes: Envelope, taken: bool = True) -> tuple[list[int], int]:
@@ -62,10 +64,12 @@ def test_word_carries_what_the_replica_composes(coordination: str) -> None:
     envelope = Gossip("r2", scenario).say(
         build_replica("r2", scenario, units, 12), 7, Pose(1.0, 2.0)
     )
-    have, logs, claims = build_replica("r2", scenario, units, 12).compose()
+    version_vector, logs, claims = build_replica("r2", scenario, units, 12).compose()
 
     assert envelope == Envelope("r2", 7, target, envelope.body)
-    assert decode_gossip(envelope.body) == GossipMessage(1, 7, 1.0, 2.0, have, logs, claims)
+    assert decode_gossip(envelope.body) == GossipMessage(
+        1, 7, 1.0, 2.0, version_vector, logs, claims
+    )
 
 
 def test_word_carries_registers_where_the_planner_has_them() -> None:
@@ -107,11 +111,11 @@ def test_replica_follows_the_mission(
     *, name: str, overrides: tuple[str, ...], merges: str, relays: bool, beacons: bool
 ) -> None:
     """Merge rule and beacon are the mission's; only the supervisor forwards at once."""
-    manner = build_replica(name, mission(*overrides), Units.of(30, 12), 12).manner
+    config = build_replica(name, mission(*overrides), Units.of(30, 12), 12).config
 
-    assert manner.ledger == (merges == "ledger")
-    assert (manner.relay, manner.beacon) == (relays, beacons)
-    assert manner.value_max == (2 if merges == "ledger" else 5)
+    assert config.ledger == (merges == "ledger")
+    assert (config.relay, config.beacon) == (relays, beacons)
+    assert config.value_max == (2 if merges == "ledger" else 5)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import replicas
+from support import replicas
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -66,7 +66,7 @@ def buy(held: Replica, purchases: Purchases) -> None:
         units = min(wanted, int(held.weights[sample]))
         if units > 0:
             held.reserve(1)
-            spend(held.store, held.manner, sample, units)
+            spend(held.store, held.config, sample, units)
 
 
 def team(bought: Iterable[Purchases], *, ledger: bool) -> list[Replica]:
@@ -103,23 +103,23 @@ def claim(origin: int, stamp: int, sample: int, since_ns: int) -> bytes:
     return b"".join(leb128(number) for number in (origin, stamp, sample + 1, since_ns))
 
 
-def have(origins: int, *, claims: bool = True) -> bytes:
+def version_vector(origins: int, *, claims: bool = True) -> bytes:
     """A version vector that claims to hold nothing."""
     return bytes(2 * origins if claims else origins)
 
 
 def whole(held: Replica) -> Message:
     """Everything that a replica holds of logs, as one message; it acknowledges nothing."""
-    manner, origins = held.manner, held.store.length.shape[0]
-    told = range(origins) if manner.ledger else [manner.me]
+    config, origins = held.config, held.store.length.shape[0]
+    told = range(origins) if config.ledger else [config.me]
     logs = b"".join(suffix(origin, 0, replicas.entries(held, origin)) for origin in told)
-    return have(origins, claims=manner.claims), logs, b""
+    return version_vector(origins, claims=config.claims), logs, b""
 
 
 def join(held: Replica, *others: Replica) -> Replica:
     """Let a replica learn all that others hold, one after the other."""
     for other in others:
-        assert held.learn(other.manner.me, *whole(other))
+        assert held.learn(other.config.me, *whole(other))
     return held
 
 
@@ -131,11 +131,11 @@ def vector(held: Replica) -> list[int]:
 def truth(made: Iterable[Replica]) -> list[int]:
     """What everybody's weights must come to, by a plain dictionary."""
     made = list(made)
-    if not made[0].manner.ledger:
+    if not made[0].config.ledger:
         return [min(column) for column in zip(*map(vector, made), strict=True)]
     bought: Counter[int] = Counter()
     for held in made:
-        for sample, units in replicas.entries(held, held.manner.me):
+        for sample, units in replicas.entries(held, held.config.me):
             bought[sample] += units
     return [max(0, UNITS.sample - bought[sample]) for sample in range(N)]
 
@@ -148,7 +148,7 @@ def snapshot(held: Replica) -> list[Any]:
 def knowledge(held: Replica) -> list[Any]:
     """What a replica holds, apart from what it knows about others."""
     origins = held.store.length.shape[0]
-    logs = [replicas.entries(held, i) for i in range(origins)] if held.manner.ledger else []
+    logs = [replicas.entries(held, i) for i in range(origins)] if held.config.ledger else []
     return [vector(held), logs]
 
 
@@ -280,7 +280,7 @@ def test_largest_units_are_exact(*, ledger: bool) -> None:
     entries = [(0, value), (0, value)]
 
     assert vector(writer) == [units.sample] * N
-    assert held.learn(0, have(2), suffix(0, 0, entries), b"")
+    assert held.learn(0, version_vector(2), suffix(0, 0, entries), b"")
     assert vector(held)[0] == units.sample - (2 * units.point if ledger else 1)
 
 
@@ -302,7 +302,7 @@ def test_acknowledgement_beyond_any_log_is_taken_for_all_of_it() -> None:
 def test_suffix_that_leaves_a_gap_waits(*, ledger: bool) -> None:
     """A log is held as a prefix: what lies beyond a gap is not acknowledged."""
     held = replica(0, 2, ledger=ledger)
-    message = (have(2), suffix(1, 2, [(0, 1)]), b"")
+    message = (version_vector(2), suffix(1, 2, [(0, 1)]), b"")
 
     assert held.learn(1, *message)
     assert int(held.store.length[1]) == 0
@@ -312,8 +312,8 @@ def test_suffix_that_leaves_a_gap_waits(*, ledger: bool) -> None:
 def test_suffix_that_overlaps_adds_what_is_new() -> None:
     """Entries that are held already are skipped."""
     held = replica(0, 2, ledger=True)
-    held.learn(1, have(2), suffix(1, 0, [(0, 1), (1, 2)]), b"")
-    held.learn(1, have(2), suffix(1, 1, [(1, 2), (2, 3)]), b"")
+    held.learn(1, version_vector(2), suffix(1, 0, [(0, 1), (1, 2)]), b"")
+    held.learn(1, version_vector(2), suffix(1, 1, [(1, 2), (2, 3)]), b"")
 
     assert replicas.entries(held, 1) == [(0, 1), (1, 2), (2, 3)]
     assert vector(held) == [3, 2, 1, 4, 4, 4]
@@ -325,7 +325,7 @@ def test_nobody_else_writes_a_log() -> None:
     buy(held, [(0, 1)])
     before = knowledge(held)
 
-    assert held.learn(1, have(2), suffix(0, 0, [(0, 1), (1, 3)]), b"")
+    assert held.learn(1, version_vector(2), suffix(0, 0, [(0, 1), (1, 3)]), b"")
     assert knowledge(held) == before
 
 
@@ -333,7 +333,7 @@ def test_minimum_is_not_forwarded_for_others() -> None:
     """min: a suffix comes from its origin alone, whose log holds what it learned as well."""
     held = replica(0, 3, ledger=False)
 
-    assert not held.learn(1, have(3), suffix(2, 0, [(0, 1)]), b"")
+    assert not held.learn(1, version_vector(3), suffix(2, 0, [(0, 1)]), b"")
     assert vector(held) == [4] * N
 
 
@@ -379,7 +379,7 @@ def test_relay_forwards_at_once_and_a_robot_after_its_patience(*, relay: bool, w
         middle.end_step()
         middle.learn(2, *reader.compose())
     buy(author, [(0, 3)])
-    middle.learn(0, have(3), suffix(0, 0, replicas.entries(author, 0)), b"")
+    middle.learn(0, version_vector(3), suffix(0, 0, replicas.entries(author, 0)), b"")
     steps = 0
     while vector(reader) == [4] * N:
         reader.learn(1, *middle.compose())
@@ -453,7 +453,7 @@ def test_long_log_is_sent_in_parts_and_converges(*, ledger: bool) -> None:
     writer = made[0]
     writer.reserve(2 * samples)
     for sample in (*range(samples), *range(0, samples, 2)):
-        spend(writer.store, writer.manner, sample, 1)
+        spend(writer.store, writer.config, sample, 1)
     agreed = [0, 1] * (samples // 2)
 
     assert units == Units(whole=2 * samples, sample=2, point=1)
@@ -576,7 +576,7 @@ def test_malformed_suffix_is_refused(*, ledger: bool, name: str) -> None:
     held = replica(0, 3, ledger=ledger)
     before = snapshot(held)
 
-    assert not held.learn(1, have(3), MALFORMED_LOGS[name], b"")
+    assert not held.learn(1, version_vector(3), MALFORMED_LOGS[name], b"")
     assert snapshot(held) == before
 
 
@@ -584,8 +584,8 @@ def test_ledger_entry_is_at_most_a_point() -> None:
     """Nobody ships more than a point to one sample at once."""
     held = replica(0, 2, ledger=True)
 
-    assert not held.learn(1, have(2), suffix(1, 0, [(0, UNITS.point + 1)]), b"")
-    assert held.learn(1, have(2), suffix(1, 0, [(0, UNITS.point)]), b"")
+    assert not held.learn(1, version_vector(2), suffix(1, 0, [(0, UNITS.point + 1)]), b"")
+    assert held.learn(1, version_vector(2), suffix(1, 0, [(0, UNITS.point)]), b"")
 
 
 @pytest.mark.parametrize(
@@ -596,7 +596,7 @@ def test_malformed_claim_is_refused(content: bytes) -> None:
     held = replica(0, 3, ledger=True)
     before = snapshot(held)
 
-    assert not held.learn(1, have(3), suffix(1, 0, [(0, 1)]), content)
+    assert not held.learn(1, version_vector(3), suffix(1, 0, [(0, 1)]), content)
     assert snapshot(held) == before
 
 
@@ -606,7 +606,7 @@ def test_version_vector_of_another_length_is_refused(content: bytes) -> None:
     held = replica(0, 3, ledger=True)
 
     assert not held.learn(1, content, b"", b"")
-    assert held.learn(1, have(3), b"", b"")
+    assert held.learn(1, version_vector(3), b"", b"")
 
 
 @MODES
@@ -615,7 +615,7 @@ def test_malformed_message_takes_no_room(*, ledger: bool) -> None:
     held = replica(0, 3, ledger=ledger)
     before = snapshot(held)
 
-    assert not held.learn(1, have(3), b"\xff" * 20_000, b"")
+    assert not held.learn(1, version_vector(3), b"\xff" * 20_000, b"")
     assert snapshot(held) == before
 
 

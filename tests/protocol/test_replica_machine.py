@@ -9,7 +9,7 @@ but for what nobody alive has heard of.
 from collections import Counter
 from typing import Any
 
-import replicas
+from support import replicas
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -90,15 +90,15 @@ class Replicas(RuleBasedStateMachine):
         units = min(wanted, int(held.weights[sample]))
         if units > 0:
             held.reserve(1)
-            spend(held.store, held.manner, sample, units)
-            self.bought[held.manner.me].append((sample, units))
+            spend(held.store, held.config, sample, units)
+            self.bought[held.config.me].append((sample, units))
 
     @precondition(lambda self: len(self.authors) < len(self.made) + BIRTHS_MAX)
     @rule(who=st.integers(0, 3))
     def lose_all(self, who: int) -> None:
         """A robot has lost its disk, and goes on as its next incarnation."""
         who %= len(self.made)
-        self.made[who] = self.born(self.made[who].manner.me + len(self.made))
+        self.made[who] = self.born(self.made[who].config.me + len(self.made))
         self.seen[who] = [UNITS.sample] * N
 
     @rule(who=st.integers(0, 3), sample=st.integers(NOBODY, N - 1))
@@ -115,16 +115,16 @@ class Replicas(RuleBasedStateMachine):
         message = held.compose()
         held.end_step()
         others = [other for other in range(len(self.made)) if other != who]
-        self.air += [(held.manner.me, other, message) for other in others]
+        self.air += [(held.config.me, other, message) for other in others]
 
     @rule(who=st.integers(0, 3), whom=st.integers(0, 3))
     def speak_to(self, who: int, whom: int) -> None:
         """A robot ends its step with a message to one participant, as to a supervisor."""
         who, whom = who % len(self.made), whom % len(self.made)
         if who != whom:
-            held, theirs = self.made[who], self.made[whom].manner.me
+            held, theirs = self.made[who], self.made[whom].config.me
             slot = theirs if theirs < held.slots else whom  # it may not have heard of it yet
-            self.air.append((held.manner.me, whom, held.compose(slot)))
+            self.air.append((held.config.me, whom, held.compose(slot)))
             held.end_step()
 
     @precondition(lambda self: self.air)
@@ -160,12 +160,12 @@ class Replicas(RuleBasedStateMachine):
         """The radio is good for a while: everybody comes to the same weights, the true ones."""
         self.air = []
         made, expected = self.made, self._truth()
-        for _ in range(2 * made[0].manner.patience + 6):
+        for _ in range(2 * made[0].config.patience + 6):
             words = [held.compose() for held in made]
             for i, held in enumerate(made):
                 held.end_step()
                 for j, word in enumerate(words):
-                    assert i == j or held.learn(made[j].manner.me, *word)
+                    assert i == j or held.learn(made[j].config.me, *word)
 
         assert [held.weights.tolist() for held in made] == [expected] * len(made)
 
@@ -196,12 +196,12 @@ class Replicas(RuleBasedStateMachine):
     @invariant()
     def logs_are_prefixes_of_what_was_spent(self) -> None:
         """ledger: whoever holds anything of a log holds its beginning, and weighs exactly that."""
-        for held in self.made if self.made and self.made[0].manner.ledger else []:
+        for held in self.made if self.made and self.made[0].config.ledger else []:
             spent: Counter[int] = Counter()
             for origin in range(held.slots):
                 entries, bought = replicas.entries(held, origin), self.bought.get(origin, [])
                 assert entries == bought[: len(entries)]
-                assert origin != held.manner.me or len(entries) == len(bought)
+                assert origin != held.config.me or len(entries) == len(bought)
                 for sample, units in entries:
                     spent[sample] += units
 
@@ -210,7 +210,7 @@ class Replicas(RuleBasedStateMachine):
     @invariant()
     def acknowledged_minima_were_merged(self) -> None:
         """min: who says that it holds a log up to some length weighs no more than it says there."""
-        for held in self.made if self.made and not self.made[0].manner.ledger else []:
+        for held in self.made if self.made and not self.made[0].config.ledger else []:
             for slot, author in self.authors.items():
                 length = int(held.store.length[slot]) if slot < held.slots else 0
                 assert length <= len(replicas.entries(author, slot))
@@ -234,7 +234,7 @@ class Replicas(RuleBasedStateMachine):
         """Slots come in blocks, one for each incarnation of somebody that was heard of."""
         for held in self.made:
             assert held.slots % len(self.made) == 0
-            assert held.manner.me < held.slots <= max(self.authors) + len(self.made)
+            assert held.config.me < held.slots <= max(self.authors) + len(self.made)
 
     @invariant()
     def fallen_samples_are_named_once(self) -> None:
@@ -246,7 +246,7 @@ class Replicas(RuleBasedStateMachine):
 
     def _truth(self) -> list[int]:
         """What the living know between them."""
-        if not self.made[0].manner.ledger:
+        if not self.made[0].config.ledger:
             return [min(int(held.weights[sample]) for held in self.made) for sample in range(N)]
         spent = Counter[int]()
         for slot, bought in self.bought.items():

@@ -97,7 +97,7 @@ def test_subscriber_rebuilds_the_vector_at_every_message(
     rebuilt = []
     messages = publish(steps, every, keyframe_every, first)
     for content, _ in messages:
-        assert subscriber.take(content)
+        assert subscriber.apply(content)
         rebuilt.append(vector_of(subscriber))
 
     assert rebuilt == [vector for _, vector in messages]
@@ -109,11 +109,11 @@ def test_last_step_is_published_at_once() -> None:
     weights = np.full(3, 9, dtype=np.int64)
     publisher, subscriber = WeightsPublisher(weights, 10, 20), WeightsSubscriber()
     nothing = np.zeros(0, dtype=np.int64)
-    subscriber.take(publisher.step(nothing, last=False))
+    subscriber.apply(publisher.step(nothing, last=False))
     weights[1] = 4
 
     assert publisher.step(np.array([1]), last=False) == b""
-    assert subscriber.take(publisher.step(nothing, last=True))
+    assert subscriber.apply(publisher.step(nothing, last=True))
     assert vector_of(subscriber) == [9, 4, 9]
     assert publisher.step(nothing, last=True) == b""
 
@@ -133,7 +133,7 @@ def test_gap_is_noticed_and_ends_with_the_next_keyframe(
             continue
         gap = gap and i % keyframe_every != 0
         expected.append((not gap, None if gap else vector))
-        rebuilt.append((subscriber.take(content), vector_of(subscriber)))
+        rebuilt.append((subscriber.apply(content), vector_of(subscriber)))
 
     assert rebuilt == expected
 
@@ -142,7 +142,7 @@ def test_repeated_change_is_refused() -> None:
     """A change applies to one version only; applied to another it is not taken."""
     subscriber = WeightsSubscriber()
     taken = [
-        subscriber.take(payload)
+        subscriber.apply(payload)
         for payload in (
             message(1, 0, 2, keyframe(9, 9)),
             message(2, 1, 2, changes((0, 5))),
@@ -178,19 +178,19 @@ UNSOUND = {
 def test_unsound_message_is_refused(name: str) -> None:
     """What is malformed or does not follow is refused, and the vector is right or unknown."""
     subscriber = WeightsSubscriber()
-    subscriber.take(message(1, 0, 3, keyframe(200, 200, 200)))
+    subscriber.apply(message(1, 0, 3, keyframe(200, 200, 200)))
 
-    assert not subscriber.take(UNSOUND[name])
+    assert not subscriber.apply(UNSOUND[name])
     assert vector_of(subscriber) in (None, [200, 200, 200])
 
 
 def test_bytes_that_are_no_message_leave_the_vector() -> None:
     """Noise on the key is not a gap."""
     subscriber = WeightsSubscriber()
-    subscriber.take(message(1, 0, 3, keyframe(200, 200, 200)))
+    subscriber.apply(message(1, 0, 3, keyframe(200, 200, 200)))
 
-    assert not subscriber.take(b"\xff\xff")
-    assert subscriber.take(message(2, 1, 3, changes((1, 199))))
+    assert not subscriber.apply(b"\xff\xff")
+    assert subscriber.apply(message(2, 1, 3, changes((1, 199))))
     assert vector_of(subscriber) == [200, 199, 200]
 
 
@@ -199,7 +199,7 @@ def test_keyframe_of_every_width_is_read(kind: str) -> None:
     """A keyframe uses the narrowest integers that hold its largest weight."""
     subscriber = WeightsSubscriber()
 
-    assert subscriber.take(message(1, 0, 3, keyframe(1, 2, 3, kind=kind)))
+    assert subscriber.apply(message(1, 0, 3, keyframe(1, 2, 3, kind=kind)))
     assert vector_of(subscriber) == [1, 2, 3]
 
 
@@ -209,7 +209,7 @@ def test_any_bytes_are_survived(payloads: list[bytes]) -> None:
     """No payload raises."""
     subscriber = WeightsSubscriber()
     for payload in payloads:
-        subscriber.take(payload)
+        subscriber.apply(payload)
 
 
 @examples(200)
@@ -223,8 +223,8 @@ def test_any_content_is_survived_and_weights_stay_in_bounds(
 ) -> None:
     """Whatever a message holds: refused, or a vector of its size without a negative weight."""
     subscriber = WeightsSubscriber()
-    subscriber.take(message(1, 0, 3, keyframe(200, 200, 200)))
-    if subscriber.take(message(2, base, size, content)):
+    subscriber.apply(message(1, 0, 3, keyframe(200, 200, 200)))
+    if subscriber.apply(message(2, base, size, content)):
         vector = vector_of(subscriber)
 
         assert vector is not None
@@ -236,4 +236,4 @@ def test_bomb_is_not_inflated() -> None:
     """A keyframe is not inflated beyond what its size allows."""
     subscriber = WeightsSubscriber()
 
-    assert not subscriber.take(message(1, 0, 3, zlib.compress(bytes(50_000_000))))
+    assert not subscriber.apply(message(1, 0, 3, zlib.compress(bytes(50_000_000))))

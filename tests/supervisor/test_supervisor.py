@@ -153,7 +153,7 @@ def test_published_weights_are_the_merged_vector() -> None:
     subscriber = WeightsSubscriber()
     for i, outputs in enumerate(put_out):
         if outputs.weights:
-            assert subscriber.take(outputs.weights)
+            assert subscriber.apply(outputs.weights)
             assert subscriber.weights is not None
             assert subscriber.weights.tolist() == vector_after(put_out[: i + 1])
 
@@ -197,6 +197,6 @@ def test_first_word_of_a_supervisor_that_has_heard_nobody() -> None:
     outputs = supervisor(scenario).step(Inputs(150_000_000, look))
     news = decode_gossip(outputs.outbox[0].body)
 
-    assert (news.have, news.logs, news.claims) == (bytes(8), b"", b"")
+    assert (news.version_vector, news.logs, news.claims) == (bytes(8), b"", b"")
     assert outputs.state is State.EXPLORING
     assert (outputs.lowered, outputs.weights[:1]) == (b"", b"\x96")

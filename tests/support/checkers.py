@@ -12,9 +12,9 @@ def rules(records: Iterable[Record]) -> set[str]:
     return {complaint.partition(":")[0] for complaint in check(records).complaints}
 
 
-def listed(referee: type) -> set[str]:
+def listed(checker: type) -> set[str]:
     """The rules that a referee's docstring lists. Python 3.13 takes its indentation off, earlier ones do not."""
-    text = inspect.getdoc(referee)
+    text = inspect.getdoc(checker)
     assert text is not None
     lines = text.partition("-----\n")[2].splitlines()
     return {line.split()[0] for line in lines if line[:1].isalpha()}

@@ -49,7 +49,12 @@ def incidents_of(folder: Path) -> list[ProcessEvent]:
 def acts_of(records: Iterable[Record], name: str) -> list[StepRecord]:
     """What a participant did, in order."""
     batches = (record for record in records if isinstance(record, Batch))
-    return [act for batch in batches for act in batch.acts if act.name == name and act.outputs]
+    return [
+        step_record
+        for batch in batches
+        for step_record in batch.step_records
+        if step_record.name == name and step_record.outputs
+    ]
 
 
 def await_incident(folder: Path, who: str, what: str, count: int = 1) -> ProcessEvent:
@@ -67,8 +72,8 @@ def await_act(folder: Path, name: str, after: int = 0) -> StepRecord:
     """The first step of a participant after a number of steps, once it is on record."""
     give_up = time.monotonic() + PATIENCE_S
     while time.monotonic() < give_up:
-        acts = acts_of(records_of(folder), name)
-        if len(acts) > after:
-            return acts[after]
+        step_records = acts_of(records_of(folder), name)
+        if len(step_records) > after:
+            return step_records[after]
         time.sleep(0.02)
     raise AssertionError(f"{name} makes no step {after + 1}")

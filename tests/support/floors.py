@@ -31,10 +31,10 @@ class Floor:
     def __init__(self, cells: npt.NDArray[np.uint8], *overrides: str) -> None:
         """cells: (rows, columns)."""
         self.scenario: Scenario = parse(_MISSION, "floor", overrides)
-        self.chart = FusedMap(Frame(1.0, (0.0, 0.0), *cells.shape), 8)
-        self.chart.cells[:] = cells.ravel()
-        self.chart.revision = 1
-        self.terrain = CostMap(self.scenario, self.chart)
+        self.fused_map = FusedMap(Frame(1.0, (0.0, 0.0), *cells.shape), 8)
+        self.fused_map.cells[:] = cells.ravel()
+        self.fused_map.revision = 1
+        self.cost_map = CostMap(self.scenario, self.fused_map)
 
     def situation(
         self,
@@ -44,9 +44,9 @@ class Floor:
         but: Sequence[int] = (),
     ) -> Situation:
         """With all frontiers but some to choose from."""
-        frontiers = self.chart.frontiers
+        frontiers = self.fused_map.frontiers
         frontiers = frontiers[~np.isin(frontiers, but)]
-        return Situation(self.terrain, frontiers, tuple(members), tuple(others), tuple(absent), 0)
+        return Situation(self.cost_map, frontiers, tuple(members), tuple(others), tuple(absent), 0)
 
 
 def drawn(plan: Sequence[str], *overrides: str) -> Floor:

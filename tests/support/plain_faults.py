@@ -368,7 +368,7 @@ class PlainFaults:
                 told.append((to, which, self._judge(hop._replace(copy=copy), due_ns, queued[row])))
         return on_air, told, lost
 
-    def take_tolls(self) -> dict[int, dict[str, int]]:
+    def pop_stats(self) -> dict[int, dict[str, int]]:
         """What each fault has done since the last call; those that did nothing are left out."""
         taken, self._tolls = self._tolls, {}
         return {fault: dict(taken[fault]) for fault in sorted(taken)}

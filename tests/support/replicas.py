@@ -12,14 +12,14 @@ from kantor_protocol.replication.replica_kernels import LENGTH_MAX
 
 def entries(held: Replica, origin: int) -> list[tuple[int, int]]:
     """The held log of an origin, as (sample, value); with min only the own log is held."""
-    row, length = (origin if held.manner.ledger else 0), int(held.store.length[origin])
+    row, length = (origin if held.config.ledger else 0), int(held.store.length[origin])
     return [(index, value) for index, value in held.store.logs[row, :length].tolist()]
 
 
 def taken(held: Replica) -> list[int]:
     """Samples that others have claimed and this participant must leave, as its planner asks."""
     room = np.zeros(held.slots, dtype=np.int64)
-    claims, counters, me = held.store.claims, held.store.counters, held.manner.me
+    claims, counters, me = held.store.claims, held.store.counters, held.config.me
     return room[: replica_kernels.taken(claims, counters, me, room)].tolist()
 
 

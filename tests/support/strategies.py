@@ -176,11 +176,11 @@ NEWS = st.builds(
     step=COUNTS,
     x_m=FINITE,
     y_m=FINITE,
-    have=st.binary(max_size=40),
+    version_vector=st.binary(max_size=40),
     logs=st.binary(max_size=40),
     claims=st.binary(max_size=40),
     registers=st.binary(max_size=40),
-    epoch=st.integers(0, 15),
+    incarnation=st.integers(0, 15),
 )
 POSES = st.builds(Pose, x_m=FINITE, y_m=FINITE, heading_rad=FINITE, speed_m_s=FINITE)
 ENVELOPES = st.builds(

@@ -58,8 +58,8 @@ def channel(
     return made
 
 
-def receivers(verdicts: Iterable[DeliveryDecision]) -> list[ParticipantId]:
-    return [verdict.target for verdict in verdicts]
+def receivers(decisions: Iterable[DeliveryDecision]) -> list[ParticipantId]:
+    return [decision.target for decision in decisions]
 
 
 def chatter(scenario: Scenario, count: int) -> list[Sent]:
@@ -86,9 +86,9 @@ def chatter(scenario: Scenario, count: int) -> list[Sent]:
 def test_range_is_inclusive(place_m: tuple[float, float], heard_by: list[ParticipantId]) -> None:
     """At exactly the range a receiver hears; any further it does not, and that is counted."""
     radio = channel("radio.range_m=5", at={"r2": place_m, "r3": (99.0, 0.0)})
-    verdicts, out_of_range = radio.transmit([said("r1", 1)])
+    decisions, out_of_range = radio.transmit([said("r1", 1)])
 
-    assert (receivers(verdicts), out_of_range) == (heard_by, 2 - len(heard_by))
+    assert (receivers(decisions), out_of_range) == (heard_by, 2 - len(heard_by))
 
 
 @examples(100)
@@ -100,8 +100,8 @@ def test_hearing_is_mutual(places: list[tuple[float, float]], range_m: float) ->
     """Of two robots either both are in range of each other or none."""
     at = dict(zip(("r1", "r2", "r3"), places, strict=True))
     radio = channel(f"radio.range_m={range_m}", at=at)
-    verdicts, out_of_range = radio.transmit([said(name, 1) for name in at])
-    pairs = {(verdict.source, verdict.target) for verdict in verdicts}
+    decisions, out_of_range = radio.transmit([said(name, 1) for name in at])
+    pairs = {(decision.source, decision.target) for decision in decisions}
 
     assert {(target, source) for source, target in pairs} == pairs
     assert len(pairs) + out_of_range == 6
@@ -115,15 +115,15 @@ def test_places_count_at_the_time_of_sending() -> None:
     radio.place("r2", Pose(99.0, 0.0))
     radio.place("r3", Pose(0.0, 0.0))
 
-    assert [envelope.sequence for envelope in radio.take("r2", 1000 * MS)] == [1]
-    assert radio.take("r3", 1000 * MS) == ()
+    assert [envelope.sequence for envelope in radio.collect("r2", 1000 * MS)] == [1]
+    assert radio.collect("r3", 1000 * MS) == ()
 
 
 def test_nobody_hears_before_anybody_is_placed() -> None:
     """A participant without a place is out of range of all."""
-    verdicts, out_of_range = Channel(mission("radio.range_m=5"), 1).transmit([said("r1", 1)])
+    decisions, out_of_range = Channel(mission("radio.range_m=5"), 1).transmit([said("r1", 1)])
 
-    assert (verdicts, out_of_range) == ([], 2)
+    assert (decisions, out_of_range) == ([], 2)
 
 
 def test_supervisor_has_a_range_of_its_own() -> None:
@@ -135,7 +135,7 @@ def test_supervisor_has_a_range_of_its_own() -> None:
     robots, _ = radio.transmit([said("r3", 2)])
 
     assert (receivers(spoken), too_far) == (["r1", "r2"], 1)
-    assert [verdict.source for verdict in answered] == ["r1", "r2"]
+    assert [decision.source for decision in answered] == ["r1", "r2"]
     assert robots == []
 
 
@@ -185,9 +185,9 @@ IN_A_ROW = [(101.0, ROW_M), (103.0, ROW_M), (107.0, ROW_M), (115.0, ROW_M)]
 def test_walls_shorten_the_range(radio: tuple[str, ...], heard_by: list[ParticipantId]) -> None:
     """Each by its loss, the bound included; with line of sight they end it. Who hears nothing is counted."""
     channel_there = among_walls(*radio, places_m=IN_A_ROW)
-    verdicts, out_of_range = channel_there.transmit([said("r1", 1)])
+    decisions, out_of_range = channel_there.transmit([said("r1", 1)])
 
-    assert (receivers(verdicts), out_of_range) == (heard_by, 3 - len(heard_by))
+    assert (receivers(decisions), out_of_range) == (heard_by, 3 - len(heard_by))
 
 
 def test_way_around_a_wall_is_in_sight() -> None:
@@ -215,7 +215,7 @@ def test_walls_stand_before_a_supervisor_with_a_place(
     heard, _ = radio.transmit([said(f"r{i}", 1, SUPERVISOR) for i in range(1, 5)])
 
     assert receivers(spoken) == hear
-    assert [verdict.source for verdict in heard] == speaks
+    assert [decision.source for decision in heard] == speaks
 
 
 def test_supervisor_has_its_own_range_less_the_walls() -> None:
@@ -269,7 +269,7 @@ def test_hearing_through_walls_is_mutual(
     radio = Channel(scenario, 1, ground)
     for name, (x_m, y_m) in zip(scenario.robot_ids, xy_m.tolist(), strict=True):
         radio.place(name, Pose(x_m, y_m))
-    verdicts, out_of_range = radio.transmit([said(name, 1) for name in scenario.robot_ids])
+    decisions, out_of_range = radio.transmit([said(name, 1) for name in scenario.robot_ids])
     expected = set()
     uv = ((xy_m - (left_m, bottom_m)) / side_m).tolist()
     for i, one in enumerate(scenario.robot_ids):
@@ -282,7 +282,7 @@ def test_hearing_through_walls_is_mutual(
             if i != j and within and not hindered:
                 expected.add((one, other))
 
-    assert {(verdict.source, verdict.target) for verdict in verdicts} == expected
+    assert {(decision.source, decision.target) for decision in decisions} == expected
     assert len(expected) + out_of_range == 6
     assert links(xy_m, range_m, Walls.of(scenario.radio, ground)) == len(expected) / 2
 
@@ -310,9 +310,9 @@ def test_envelope_goes_to_its_target(
     target: ParticipantId, hear: list[ParticipantId], out_of_range: int
 ) -> None:
     """Everybody, or the one who is meant; never the sender; a stranger is nobody."""
-    verdicts = channel(CENTRALIZED).transmit([said("r1", 1, target)])
+    decisions = channel(CENTRALIZED).transmit([said("r1", 1, target)])
 
-    assert (receivers(verdicts[0]), verdicts[1]) == (hear, out_of_range)
+    assert (receivers(decisions[0]), decisions[1]) == (hear, out_of_range)
 
 
 def test_only_the_target_can_be_out_of_range() -> None:
@@ -347,7 +347,7 @@ def test_one_more_robot_changes_no_other_draw(coordination: str) -> None:
     overrides = (f"coordination={coordination}", *LOSSY)
     three = channel(*overrides).transmit(chatter(mission(*overrides), 50))[0]
     four = channel(*overrides, *FOUR).transmit(chatter(mission(*overrides, *FOUR), 50))[0]
-    old = [verdict for verdict in four if "r4" not in (verdict.source, verdict.target)]
+    old = [decision for decision in four if "r4" not in (decision.source, decision.target)]
 
     assert set(old) == set(three)
     assert len(old) < len(four)
@@ -357,11 +357,11 @@ def test_draws_differ_between_links_sequences_and_seeds() -> None:
     """No two links share their luck, nor do two runs."""
 
     def luck(seed: int) -> dict[tuple[str, str], tuple[bool, ...]]:
-        verdicts = channel("radio.drop=0.5", seed=seed).transmit(chatter(mission(), 64))[0]
+        decisions = channel("radio.drop=0.5", seed=seed).transmit(chatter(mission(), 64))[0]
         fates: dict[tuple[str, str], tuple[bool, ...]] = {}
-        for verdict in verdicts:
-            link = verdict.source, verdict.target
-            fates[link] = (*fates.get(link, ()), verdict.due_ns == DROPPED)
+        for decision in decisions:
+            link = decision.source, decision.target
+            fates[link] = (*fates.get(link, ()), decision.due_ns == DROPPED)
         return fates
 
     fates = [*luck(1).values(), *luck(2).values()]
@@ -370,12 +370,12 @@ def test_draws_differ_between_links_sequences_and_seeds() -> None:
     assert all(0 < sum(fate) < 64 for fate in fates)
 
 
-def _copies(verdicts: Sequence[DeliveryDecision]) -> dict[tuple[str, int, str], list[int]]:
+def _copies(decisions: Sequence[DeliveryDecision]) -> dict[tuple[str, int, str], list[int]]:
     """When each copy arrives, by (source, sequence, target)."""
     copies: dict[tuple[str, int, str], list[int]] = {}
-    for verdict in verdicts:
-        key = verdict.source, verdict.sequence, verdict.target
-        copies.setdefault(key, []).append(verdict.due_ns)
+    for decision in decisions:
+        key = decision.source, decision.sequence, decision.target
+        copies.setdefault(key, []).append(decision.due_ns)
     return copies
 
 
@@ -393,14 +393,14 @@ def within_luck(hits: int, trials: int, rate: float) -> bool:
 def test_drops_and_duplicates_come_at_their_rate(drop: float, duplicate: float, seed: int) -> None:
     """Per receiver and copy; a copy's loss does not depend on its twin's."""
     radio = channel(f"radio.drop={drop}", f"radio.duplicate={duplicate}", seed=seed)
-    verdicts = radio.transmit(chatter(mission(), 1500))[0]
-    copies = _copies(verdicts)
+    decisions = radio.transmit(chatter(mission(), 1500))[0]
+    copies = _copies(decisions)
     twins = [due for due in copies.values() if len(due) == 2]
     both = sum(due == [DROPPED, DROPPED] for due in twins)
 
     assert len(copies) == 3 * 2 * 1500
     assert within_luck(len(twins), len(copies), duplicate)
-    assert within_luck(sum(v.due_ns == DROPPED for v in verdicts), len(verdicts), drop)
+    assert within_luck(sum(v.due_ns == DROPPED for v in decisions), len(decisions), drop)
     assert within_luck(both, len(twins), drop * drop)
 
 
@@ -425,8 +425,8 @@ def test_delay_lies_between_its_bounds(
         f"radio.duplicate={duplicate}",
         seed=seed,
     )
-    verdicts = radio.transmit(chatter(mission(), 40))[0]
-    delays_ms = [verdict.due_ns / MS - 100 * verdict.sequence for verdict in verdicts]
+    decisions = radio.transmit(chatter(mission(), 40))[0]
+    delays_ms = [decision.due_ns / MS - 100 * decision.sequence for decision in decisions]
     latest_ms = delay_ms + jitter_ms + (reorder_ms if reorder else 0)
 
     assert radio.lookahead_ns == delay_ms * MS
@@ -438,13 +438,13 @@ def test_delay_lies_between_its_bounds(
 def test_held_back_messages_are_overtaken() -> None:
     """A share `reorder` of the messages waits up to reorder_s, so that later ones pass them."""
     overrides = ("radio.reorder=0.25", "radio.reorder_s=0.5")
-    verdicts = channel(*overrides).transmit(chatter(mission(), 1500))[0]
-    held = sum(verdict.due_ns > 100 * MS * verdict.sequence for verdict in verdicts)
+    decisions = channel(*overrides).transmit(chatter(mission(), 1500))[0]
+    held = sum(decision.due_ns > 100 * MS * decision.sequence for decision in decisions)
     radio = channel(*overrides)
     radio.transmit([sent for sent in chatter(mission(), 20) if sent.envelope.source == "r1"])
-    arrived = [envelope.sequence for envelope in radio.take("r2", 10_000 * MS)]
+    arrived = [envelope.sequence for envelope in radio.collect("r2", 10_000 * MS)]
 
-    assert within_luck(held, len(verdicts), 0.25)
+    assert within_luck(held, len(decisions), 0.25)
     assert sorted(arrived) == list(range(1, 21))
     assert arrived != sorted(arrived)
 
@@ -453,7 +453,7 @@ def test_a_steady_delay_keeps_the_order() -> None:
     """Without jitter and hold-back nothing is overtaken."""
     radio = channel("radio.delay_s=0.25", "radio.drop=0.3", "radio.duplicate=0.3")
     radio.transmit([sent for sent in chatter(mission(), 50) if sent.envelope.source == "r1"])
-    arrived = [envelope.sequence for envelope in radio.take("r2", 10_000 * MS)]
+    arrived = [envelope.sequence for envelope in radio.collect("r2", 10_000 * MS)]
 
     assert len(arrived) > 30
     assert arrived == sorted(arrived)
@@ -474,7 +474,7 @@ def test_inbox_is_in_order_of_arrival_then_source_then_sequence() -> None:
         said("r2", 10, now_ns=-1 * MS),
     ]
     radio.transmit(sent)
-    inbox = radio.take("r1", 15 * MS)
+    inbox = radio.collect("r1", 15 * MS)
 
     assert [(envelope.source, envelope.sequence) for envelope in inbox] == [
         ("r2", 10),
@@ -492,23 +492,23 @@ def test_taken_once_and_not_before_it_is_due() -> None:
     radio.transmit([said("r1", 1, "r2"), said("r1", 2, "r2", now_ns=10 * MS)])
 
     assert radio.next_due_ns() == 50 * MS
-    assert radio.take("r2", 50 * MS - 1) == ()
+    assert radio.collect("r2", 50 * MS - 1) == ()
     assert not radio.waits("r2", 50 * MS - 1)
     assert radio.waits("r2", 50 * MS)
-    assert [envelope.sequence for envelope in radio.take("r2", 50 * MS)] == [1]
+    assert [envelope.sequence for envelope in radio.collect("r2", 50 * MS)] == [1]
     assert not radio.waits("r2", 50 * MS)
     assert radio.next_due_ns() == 60 * MS
-    assert [envelope.sequence for envelope in radio.take("r2", 10**12)] == [2]
+    assert [envelope.sequence for envelope in radio.collect("r2", 10**12)] == [2]
     assert radio.next_due_ns() is None
-    assert radio.take("r2", 10**12) == ()
+    assert radio.collect("r2", 10**12) == ()
 
 
 def test_dropped_is_ruled_on_but_never_under_way() -> None:
     """What is lost is in the record, and in nobody's inbox."""
     radio = channel("radio.drop=0.999999")
-    verdicts, _ = radio.transmit([said("r1", 1)])
+    decisions, _ = radio.transmit([said("r1", 1)])
 
-    assert verdicts == [
+    assert decisions == [
         DeliveryDecision("r1", 1, "r2", DROPPED),
         DeliveryDecision("r1", 1, "r3", DROPPED),
     ]

@@ -16,7 +16,7 @@ from kantor_protocol.base.machine import SUPERVISOR, Envelope, ParticipantId, Po
 from kantor_protocol.base.varint import Pairs, put_uint
 from kantor_protocol.replication.cosine_basis import VISIT
 from kantor_protocol.replication.registers import read_register
-from kantor_protocol.replication.replica import read_have
+from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.faults.links import Partition, Range
 from kantor_protocol.scenario.faults.processes import Kill
 from kantor_protocol.scenario.faults.schedule import AnyFault
@@ -59,9 +59,14 @@ def batches(records: Records) -> list[Batch]:
     return [record for record in records if isinstance(record, Batch)]
 
 
-def acts(records: Records, name: ParticipantId) -> list[StepRecord]:
+def step_records(records: Records, name: ParticipantId) -> list[StepRecord]:
     """What a participant did, in order."""
-    return [act for batch in batches(records) for act in batch.acts if act.name == name]
+    return [
+        step_record
+        for batch in batches(records)
+        for step_record in batch.step_records
+        if step_record.name == name
+    ]
 
 
 def opening(records: Records) -> Opening:
@@ -78,34 +83,37 @@ def put_act(records: Records, old: StepRecord, change: Change) -> list[Record]:
     """The records with one act changed."""
 
     def changed(batch: Batch) -> Batch:
-        told = tuple(change(act) if act is old else act for act in batch.acts)
-        return msgspec.structs.replace(batch, acts=told)
+        told = tuple(
+            change(step_record) if step_record is old else step_record
+            for step_record in batch.step_records
+        )
+        return msgspec.structs.replace(batch, step_records=told)
 
     return [changed(record) if isinstance(record, Batch) else record for record in records]
 
 
 def outputs(**values: Any) -> Change:
     """A change of some of what a participant returned."""
-    return lambda act: msgspec.structs.replace(
-        act, outputs=msgspec.structs.replace(act.outputs, **values)
+    return lambda step_record: msgspec.structs.replace(
+        step_record, outputs=msgspec.structs.replace(step_record.outputs, **values)
     )
 
 
-def ruling(**values: Any) -> Change:
+def verdict(**values: Any) -> Change:
     """A change of what the world made of it."""
-    return lambda act: msgspec.structs.replace(
-        act, ruling=msgspec.structs.replace(act.ruling, **values)
+    return lambda step_record: msgspec.structs.replace(
+        step_record, verdict=msgspec.structs.replace(step_record.verdict, **values)
     )
 
 
 def heard(*references: tuple[ParticipantId, int]) -> Change:
     """A change of the inbox."""
-    return lambda act: msgspec.structs.replace(act, heard=references)
+    return lambda step_record: msgspec.structs.replace(step_record, heard=references)
 
 
-def news(act: StepRecord, change: Callable[[GossipMessage], GossipMessage]) -> Change:
+def news(step_record: StepRecord, change: Callable[[GossipMessage], GossipMessage]) -> Change:
     """A change of the message that a participant sent."""
-    (envelope,) = act.outputs.outbox
+    (envelope,) = step_record.outputs.outbox
     body = encode(change(decode_gossip(envelope.body)))
     return outputs(outbox=(msgspec.structs.replace(envelope, body=body),))
 
@@ -114,9 +122,9 @@ LATE_NS = 1 << 60
 """After every end: who is to hear something then never does."""
 
 
-def add_verdict(records: Records, batch: Batch, verdict: DeliveryDecision) -> list[Record]:
+def add_verdict(records: Records, batch: Batch, decision: DeliveryDecision) -> list[Record]:
     """The records with one more verdict of the radio."""
-    told = msgspec.structs.replace(batch, verdicts=(*batch.verdicts, verdict))
+    told = msgspec.structs.replace(batch, decisions=(*batch.decisions, decision))
     return put(records, batch, told)
 
 
@@ -153,9 +161,9 @@ def uints(*values: int) -> bytes:
     return buffer[:at].tobytes()
 
 
-def own_register(act: StepRecord, origins: int = 3, slot: int = 0) -> int:
+def own_register(step_record: StepRecord, origins: int = 3, slot: int = 0) -> int:
     """How many writes the register of a slot has that is sent along; 0 if there is none."""
-    content = decode_gossip(act.outputs.outbox[0].body).registers
+    content = decode_gossip(step_record.outputs.outbox[0].body).registers
     found = read_register(content, origins, 9, slot)
     assert found is not None
     return found[0]
@@ -165,8 +173,8 @@ def consumed(records: Records, until_ns: int) -> npt.NDArray[np.int64]:
     """Units that all participants together have shipped to each sample by then."""
     total = np.zeros(60, dtype=np.int64)
     for batch in batches(records):
-        for act in batch.acts if batch.now_ns <= until_ns else ():
-            for sample, units in entries(act.outputs.spent):
+        for step_record in batch.step_records if batch.now_ns <= until_ns else ():
+            for sample, units in entries(step_record.outputs.spent):
                 total[sample] += units
     return total
 
@@ -200,7 +208,7 @@ def test_no_complaint_about_a_sound_run_by_registers(
 
     assert check(records).complaints == []
     origins = len(opening(records).scenario.roster)
-    told = [own_register(act, origins) for act in acts(records, "r1")]
+    told = [own_register(step_record, origins) for step_record in step_records(records, "r1")]
     assert max(told) > 5
 
 
@@ -307,11 +315,11 @@ def under(records: Records, *faults: AnyFault) -> list[Record]:
 
 def revived(records: Records) -> list[Record]:
     """The records with one drop, the first, as a delivery."""
-    batch = next(b for b in batches(records) if any(v.due_ns == DROPPED for v in b.verdicts))
-    lost = next(v for v in batch.verdicts if v.due_ns == DROPPED)
+    batch = next(b for b in batches(records) if any(v.due_ns == DROPPED for v in b.decisions))
+    lost = next(v for v in batch.decisions if v.due_ns == DROPPED)
     found = msgspec.structs.replace(lost, due_ns=LATE_NS)
-    told = tuple(found if verdict is lost else verdict for verdict in batch.verdicts)
-    return put(records, batch, msgspec.structs.replace(batch, verdicts=told))
+    told = tuple(found if decision is lost else decision for decision in batch.decisions)
+    return put(records, batch, msgspec.structs.replace(batch, decisions=told))
 
 
 @breaks("range", run=SHRUNK)
@@ -355,41 +363,43 @@ def _replayed_across_a_partition(records: Records) -> list[Record]:
     fifth = batches(records)[4]
     cut = Partition(shape="isolate", robots=("r3",), from_s=0.45, until_s=0.55)
     apart = msgspec.structs.replace(
-        fifth, verdicts=tuple(v for v in fifth.verdicts if "r3" not in (v.source, v.target))
+        fifth, decisions=tuple(v for v in fifth.decisions if "r3" not in (v.source, v.target))
     )
     deaf = put(records, fifth, apart)
     sixth = batches(deaf)[5]
-    told = tuple(put_heard(act, apart) for act in sixth.acts)
-    deaf = put(deaf, sixth, msgspec.structs.replace(sixth, acts=told))
+    told = tuple(put_heard(step_record, apart) for step_record in sixth.step_records)
+    deaf = put(deaf, sixth, msgspec.structs.replace(sixth, step_records=told))
     return add_verdict(under(deaf, cut), apart, DeliveryDecision("r1", 2, "r3", LATE_NS))
 
 
-def put_heard(act: StepRecord, batch: Batch) -> StepRecord:
+def put_heard(step_record: StepRecord, batch: Batch) -> StepRecord:
     """The act without what a batch did not deliver to it."""
-    told = {(v.source, v.sequence) for v in batch.verdicts if v.target == act.name}
-    return msgspec.structs.replace(act, heard=tuple(ref for ref in act.heard if ref in told))
+    told = {(v.source, v.sequence) for v in batch.decisions if v.target == step_record.name}
+    return msgspec.structs.replace(
+        step_record, heard=tuple(ref for ref in step_record.heard if ref in told)
+    )
 
 
 @breaks("delivery", run=DEAF)
 def _heard_what_the_radio_did_not_deliver(records: Records) -> list[Record]:
-    return put_act(records, acts(records, "r1")[5], heard(("r2", 5)))
+    return put_act(records, step_records(records, "r1")[5], heard(("r2", 5)))
 
 
 @breaks("delivery")
 def _heard_twice(records: Records) -> list[Record]:
-    act = acts(records, "r1")[5]
-    return put_act(records, act, heard(*act.heard, act.heard[0]))
+    step_record = step_records(records, "r1")[5]
+    return put_act(records, step_record, heard(*step_record.heard, step_record.heard[0]))
 
 
 @breaks("delivery")
 def _heard_again_later(records: Records) -> list[Record]:
-    early, late = acts(records, "r1")[5:7]
+    early, late = step_records(records, "r1")[5:7]
     return put_act(records, late, heard(*late.heard, *early.heard))
 
 
 @breaks("delivery", run=("radio.delay_s=0.25",))
 def _heard_before_it_was_due(records: Records) -> list[Record]:
-    early, late = acts(records, "r1")[3:5]
+    early, late = step_records(records, "r1")[3:5]
     swapped = put_act(records, early, heard(*early.heard, late.heard[0]))
     return put_act(swapped, late, heard(*late.heard[1:]))
 
@@ -397,14 +407,14 @@ def _heard_before_it_was_due(records: Records) -> list[Record]:
 @breaks("delivery")
 def _heard_what_was_dropped(records: Records) -> list[Record]:
     batch = batches(records)[3]
-    lost = (msgspec.structs.replace(batch.verdicts[0], due_ns=DROPPED), *batch.verdicts[1:])
-    return put(records, batch, msgspec.structs.replace(batch, verdicts=lost))
+    lost = (msgspec.structs.replace(batch.decisions[0], due_ns=DROPPED), *batch.decisions[1:])
+    return put(records, batch, msgspec.structs.replace(batch, decisions=lost))
 
 
 @breaks("delivery", run=("radio.duplicate=0.999",))
 def _heard_more_copies_than_were_ruled(records: Records) -> list[Record]:
     batch = batches(records)[3]
-    return put(records, batch, msgspec.structs.replace(batch, verdicts=batch.verdicts[1:]))
+    return put(records, batch, msgspec.structs.replace(batch, decisions=batch.decisions[1:]))
 
 
 @breaks("delivery")
@@ -427,45 +437,45 @@ def _delivered_to_somebody_else(records: Records) -> list[Record]:
 
 @breaks("weights", run=MERGES["min"])
 def _weight_rises(records: Records) -> list[Record]:
-    last = acts(records, "r1")[-1]
-    spent_first = entries(acts(records, "r1")[0].outputs.lowered)[0][0]
+    last = step_records(records, "r1")[-1]
+    spent_first = entries(step_records(records, "r1")[0].outputs.lowered)[0][0]
     return put_act(records, last, outputs(lowered=pairs((spent_first, 3))))
 
 
 @breaks("weights", run=MERGES["min"])
 def _weight_falls_to_what_it_was(records: Records) -> list[Record]:
-    act = acts(records, "r1")[3]
-    fallen = entries(act.outputs.lowered)
-    return put_act(records, act, outputs(lowered=pairs(*fallen, fallen[0])))
+    step_record = step_records(records, "r1")[3]
+    fallen = entries(step_record.outputs.lowered)
+    return put_act(records, step_record, outputs(lowered=pairs(*fallen, fallen[0])))
 
 
 @breaks("weights", run=(*MERGES["min"], *DEAF))
 def _lowered_does_not_decode(records: Records) -> list[Record]:
-    return put_act(records, acts(records, "r1")[-1], outputs(lowered=b"\x80"))
+    return put_act(records, step_records(records, "r1")[-1], outputs(lowered=b"\x80"))
 
 
 @breaks("weights", run=MERGES["min"])
 def _published_vector_is_not_the_robots(records: Records) -> list[Record]:
-    act = acts(records, "r1")[10]
-    message = msgspec.msgpack.decode(act.outputs.weights, type=WeightsMessage)
+    step_record = step_records(records, "r1")[10]
+    message = msgspec.msgpack.decode(step_record.outputs.weights, type=WeightsMessage)
     assert message.base > 0
     risen = msgspec.structs.replace(message, content=b"")
-    return put_act(records, act, outputs(weights=msgspec.msgpack.encode(risen)))
+    return put_act(records, step_record, outputs(weights=msgspec.msgpack.encode(risen)))
 
 
 @breaks("weights", run=MERGES["min"])
 def _published_vector_cannot_be_rebuilt(records: Records) -> list[Record]:
-    act = acts(records, "r1")[10]
-    return put_act(records, act, outputs(weights=act.outputs.weights[:-1]))
+    step_record = step_records(records, "r1")[10]
+    return put_act(records, step_record, outputs(weights=step_record.outputs.weights[:-1]))
 
 
 def republished(records: Records, which: int, **values: Any) -> list[Record]:
     """Something else in place of what the first robot published in one of its steps."""
-    act = acts(records, "r1")[which]
-    message = msgspec.msgpack.decode(act.outputs.weights, type=WeightsMessage)
+    step_record = step_records(records, "r1")[which]
+    message = msgspec.msgpack.decode(step_record.outputs.weights, type=WeightsMessage)
     assert (message.base == 0) == (which == 0)
     told = msgspec.structs.replace(message, **values)
-    return put_act(records, act, outputs(weights=msgspec.msgpack.encode(told)))
+    return put_act(records, step_record, outputs(weights=msgspec.msgpack.encode(told)))
 
 
 @breaks("weights", run=MERGES["min"])
@@ -507,82 +517,86 @@ def _budget_was_smaller(records: Records) -> list[Record]:
 
 @breaks("energy", run=MERGES["min"])
 def _point_holds_more_than_it_can(records: Records) -> list[Record]:
-    act = acts(records, "r1")[3]
-    (sample, units), *rest = entries(act.outputs.spent)
-    return put_act(records, act, outputs(spent=pairs((sample, units + 1), *rest)))
+    step_record = step_records(records, "r1")[3]
+    (sample, units), *rest = entries(step_record.outputs.spent)
+    return put_act(records, step_record, outputs(spent=pairs((sample, units + 1), *rest)))
 
 
 @breaks("energy")
 def _counts_less_than_it_shipped(records: Records) -> list[Record]:
-    return put_act(records, acts(records, "r1")[3], outputs(energy_spent=3))
+    return put_act(records, step_records(records, "r1")[3], outputs(energy_spent=3))
 
 
 @breaks("energy", "credit", run=MERGES["min"])
 def _spending_does_not_decode(records: Records) -> list[Record]:
-    return put_act(records, acts(records, "r1")[3], outputs(spent=b"\x80"))
+    return put_act(records, step_records(records, "r1")[3], outputs(spent=b"\x80"))
 
 
 @breaks("ledger")
 def _sends_another_log_than_it_consumed(records: Records) -> list[Record]:
-    act = acts(records, "r1")[0]
-    (sample, units), *_ = entries(act.outputs.spent)
+    step_record = step_records(records, "r1")[0]
+    (sample, units), *_ = entries(step_record.outputs.spent)
     log = uints(0, 0, 1, 1) + pairs((sample, units % 2 + 1))
-    change = news(act, lambda said: msgspec.structs.replace(said, logs=log))
-    return put_act(records, act, change)
+    change = news(step_record, lambda said: msgspec.structs.replace(said, logs=log))
+    return put_act(records, step_record, change)
 
 
 @breaks("ledger")
 def _sends_entries_that_it_never_made(records: Records) -> list[Record]:
-    act = acts(records, "r1")[0]
+    step_record = step_records(records, "r1")[0]
     log = uints(0, 500, 1, 1) + pairs((0, 1))
-    change = news(act, lambda said: msgspec.structs.replace(said, logs=log))
-    return put_act(records, act, change)
+    change = news(step_record, lambda said: msgspec.structs.replace(said, logs=log))
+    return put_act(records, step_record, change)
 
 
 @breaks("ledger")
 def _sends_what_is_no_message(records: Records) -> list[Record]:
-    act = acts(records, "r1")[3]
-    (envelope,) = act.outputs.outbox
+    step_record = step_records(records, "r1")[3]
+    (envelope,) = step_record.outputs.outbox
     garbled = msgspec.structs.replace(envelope, body=b"\xc1")
-    return put_act(records, act, outputs(outbox=(garbled,)))
+    return put_act(records, step_record, outputs(outbox=(garbled,)))
 
 
 @breaks("ledger")
 def _sends_logs_that_do_not_decode(records: Records) -> list[Record]:
-    act = acts(records, "r1")[3]
-    change = news(act, lambda said: msgspec.structs.replace(said, logs=b"\x80"))
-    return put_act(records, act, change)
+    step_record = step_records(records, "r1")[3]
+    change = news(step_record, lambda said: msgspec.structs.replace(said, logs=b"\x80"))
+    return put_act(records, step_record, change)
 
 
 @breaks("ledger")
 def _holds_more_of_a_log_than_there_is(records: Records) -> list[Record]:
-    last = acts(records, "r1")[-1]
+    last = step_records(records, "r1")[-1]
 
     def boast(said: GossipMessage) -> GossipMessage:
-        own, *others = read_have(said.have, 3) or []
-        stamps = said.have[len(uints(own, *others)) :]
-        return msgspec.structs.replace(said, have=uints(own, others[0] + 1, others[1]) + stamps)
+        own, *others = read_version_vector(said.version_vector, 3) or []
+        stamps = said.version_vector[len(uints(own, *others)) :]
+        return msgspec.structs.replace(
+            said, version_vector=uints(own, others[0] + 1, others[1]) + stamps
+        )
 
     return put_act(records, last, news(last, boast))
 
 
 @breaks("ledger", "weights")
 def _ends_with_more_than_its_logs_leave(records: Records) -> list[Record]:
-    act = [act for act in acts(records, "r1") if act.outputs.lowered][-1]
-    return put_act(records, act, outputs(lowered=b""))
+    step_record = [
+        step_record for step_record in step_records(records, "r1") if step_record.outputs.lowered
+    ][-1]
+    return put_act(records, step_record, outputs(lowered=b""))
 
 
 @breaks("ledger", "credit")
 def _consumes_another_sample_than_it_says(records: Records) -> list[Record]:
-    act = acts(records, "r1")[0]
-    other = int(np.argmin(consumed(records, act.now_ns)))
-    (_, units), *rest = entries(act.outputs.spent)
-    return put_act(records, act, outputs(spent=pairs((other, units), *rest)))
+    step_record = step_records(records, "r1")[0]
+    other = int(np.argmin(consumed(records, step_record.now_ns)))
+    (_, units), *rest = entries(step_record.outputs.spent)
+    return put_act(records, step_record, outputs(spent=pairs((other, units), *rest)))
 
 
 @breaks("credit", "weights", run=(*MERGES["min"], *DEAF, "energy.steps=10"))
 def _view_falls_below_the_truth(records: Records) -> list[Record]:
-    last = acts(records, "r1")[-1]
+    last = step_records(records, "r1")[-1]
     untouched = int(np.argmin(consumed(records, last.now_ns)))
     return put_act(records, last, outputs(lowered=pairs((untouched, 0))))
 
@@ -590,7 +604,7 @@ def _view_falls_below_the_truth(records: Records) -> list[Record]:
 @breaks("credit", run=MERGES["min"])
 def _view_falls_before_the_truth_does(records: Records) -> list[Record]:
     """r1 lowers a sample one step before another robot consumes it, which ends in the same views."""
-    for early, late in pairwise(acts(records, "r1")):
+    for early, late in pairwise(step_records(records, "r1")):
         before, fallen = entries(early.outputs.lowered), entries(late.outputs.lowered)
         truth = opening(records).units.sample - consumed(records, early.now_ns - 1)
         ahead = [(sample, left) for sample, left in fallen if left < truth[sample]]
@@ -604,53 +618,57 @@ def _view_falls_before_the_truth_does(records: Records) -> list[Record]:
 
 @breaks("register", run=SPECTRAL)
 def _counts_a_place_where_it_was_not(records: Records) -> list[Record]:
-    act = acts(records, "r1")[3]
-    moved = msgspec.structs.replace(act.observation, pose=Pose(1.0, 2.0))
-    return put_act(records, act, lambda a: msgspec.structs.replace(a, observation=moved))
+    step_record = step_records(records, "r1")[3]
+    moved = msgspec.structs.replace(step_record.observation, pose=Pose(1.0, 2.0))
+    return put_act(records, step_record, lambda a: msgspec.structs.replace(a, observation=moved))
 
 
 @breaks("register", run=SPECTRAL)
 def _sends_sums_that_are_not_its_own(records: Records) -> list[Record]:
-    act = [act for act in acts(records, "r1") if own_register(act)][-1]
-    sums = bytes([0]) + bytes([own_register(act)]) + uints(2 * VISIT, *[0] * 8)
-    lie = news(act, lambda said: msgspec.structs.replace(said, registers=bytes(3) + sums))
-    return put_act(records, act, lie)
+    step_record = [
+        step_record for step_record in step_records(records, "r1") if own_register(step_record)
+    ][-1]
+    sums = bytes([0]) + bytes([own_register(step_record)]) + uints(2 * VISIT, *[0] * 8)
+    lie = news(step_record, lambda said: msgspec.structs.replace(said, registers=bytes(3) + sums))
+    return put_act(records, step_record, lie)
 
 
 @breaks("register", run=SPECTRAL)
 def _says_that_it_wrote_more_often(records: Records) -> list[Record]:
-    act = [act for act in acts(records, "r1") if own_register(act)][-1]
+    step_record = [
+        step_record for step_record in step_records(records, "r1") if own_register(step_record)
+    ][-1]
 
     def boast(said: GossipMessage) -> GossipMessage:
         before, stamp, rest = said.registers[:4], said.registers[4], said.registers[5:]
         return msgspec.structs.replace(said, registers=before + bytes([stamp + 1]) + rest)
 
-    return put_act(records, act, news(act, boast))
+    return put_act(records, step_record, news(step_record, boast))
 
 
 @breaks("register", run=SPECTRAL)
 def _sends_registers_that_do_not_decode(records: Records) -> list[Record]:
-    act = acts(records, "r1")[3]
-    change = news(act, lambda said: msgspec.structs.replace(said, registers=b"\x80"))
-    return put_act(records, act, change)
+    step_record = step_records(records, "r1")[3]
+    change = news(step_record, lambda said: msgspec.structs.replace(said, registers=b"\x80"))
+    return put_act(records, step_record, change)
 
 
 @breaks("speed")
 def _jumps(records: Records) -> list[Record]:
-    act = acts(records, "r1")[3]
-    pose = act.ruling.pose
-    return put_act(records, act, ruling(pose=Pose(pose.x_m + 30.0, pose.y_m)))
+    step_record = step_records(records, "r1")[3]
+    pose = step_record.verdict.pose
+    return put_act(records, step_record, verdict(pose=Pose(pose.x_m + 30.0, pose.y_m)))
 
 
 @breaks("speed", run=("coordination=centralized",))
 def _supervisor_moves(records: Records) -> list[Record]:
-    act = acts(records, SUPERVISOR)[-1]
-    return put_act(records, act, ruling(pose=Pose(50.0, 50.1)))
+    step_record = step_records(records, SUPERVISOR)[-1]
+    return put_act(records, step_record, verdict(pose=Pose(50.0, 50.1)))
 
 
 @breaks("speed")
 def _nowhere(records: Records) -> list[Record]:
-    return put_act(records, acts(records, "r1")[-1], ruling(pose=Pose(float("nan"), 0.0)))
+    return put_act(records, step_records(records, "r1")[-1], verdict(pose=Pose(float("nan"), 0.0)))
 
 
 @breaks("speed")
@@ -660,14 +678,17 @@ def _vehicle_was_slower(records: Records) -> list[Record]:
 
 @breaks("goal")
 def _goal_is_no_sample(records: Records) -> list[Record]:
-    return put_act(records, acts(records, "r1")[3], outputs(goal=(1.0, 2.0)))
+    return put_act(records, step_records(records, "r1")[3], outputs(goal=(1.0, 2.0)))
 
 
 @breaks("goal")
 def _goal_is_used_up(records: Records) -> list[Record]:
-    mine = acts(records, "r1")
+    mine = step_records(records, "r1")
     empty = next(
-        sample for act in mine for sample, left in entries(act.outputs.lowered) if left == 0
+        sample
+        for step_record in mine
+        for sample, left in entries(step_record.outputs.lowered)
+        if left == 0
     )
     place = opening(records).site.samples_m[empty].tolist()
     return put_act(records, mine[-2], outputs(goal=tuple(place)))
@@ -676,24 +697,24 @@ def _goal_is_used_up(records: Records) -> list[Record]:
 @breaks("goal", run=MERGES["min"])
 def _goal_was_emptied_by_news(records: Records) -> list[Record]:
     places_m = opening(records).site.samples_m.tolist()
-    for act in acts(records, "r1"):
-        shipped = {sample for sample, _ in entries(act.outputs.spent)}
-        for sample, left in entries(act.outputs.lowered):
-            if left == 0 and sample not in shipped and act.outputs.goal is not None:
-                return put_act(records, act, outputs(goal=tuple(places_m[sample])))
+    for step_record in step_records(records, "r1"):
+        shipped = {sample for sample, _ in entries(step_record.outputs.spent)}
+        for sample, left in entries(step_record.outputs.lowered):
+            if left == 0 and sample not in shipped and step_record.outputs.goal is not None:
+                return put_act(records, step_record, outputs(goal=tuple(places_m[sample])))
     raise AssertionError("no news empties a sample")
 
 
 @breaks("order")
 def _step_is_left_out(records: Records) -> list[Record]:
-    act = acts(records, "r1")[-1]
-    return put_act(records, act, outputs(step=act.outputs.step + 1))
+    step_record = step_records(records, "r1")[-1]
+    return put_act(records, step_record, outputs(step=step_record.outputs.step + 1))
 
 
 @breaks("order")
 def _step_is_repeated(records: Records) -> list[Record]:
-    act = acts(records, "r1")[-1]
-    return put_act(records, act, outputs(step=act.outputs.step - 1))
+    step_record = step_records(records, "r1")[-1]
+    return put_act(records, step_record, outputs(step=step_record.outputs.step - 1))
 
 
 @breaks("order", run=DEAF)
@@ -725,13 +746,15 @@ def _second_ending(records: Records) -> list[Record]:
 @breaks("order")
 def _stranger_acts(records: Records) -> list[Record]:
     first = batches(records)[0]
-    stranger = msgspec.structs.replace(first.acts[0], name="r9")
-    return put(records, first, msgspec.structs.replace(first, acts=(*first.acts, stranger)))
+    stranger = msgspec.structs.replace(first.step_records[0], name="r9")
+    return put(
+        records, first, msgspec.structs.replace(first, step_records=(*first.step_records, stranger))
+    )
 
 
 @breaks("ruling")
 def _world_refused_something(records: Records) -> list[Record]:
-    return put_act(records, acts(records, "r1")[3], ruling(violations=("speed",)))
+    return put_act(records, step_records(records, "r1")[3], verdict(violations=("speed",)))
 
 
 # What befalls processes.
@@ -784,119 +807,144 @@ def delayed(records: Records, what: str) -> list[Record]:
     """The records with an incident that comes only after the next batch in which something is done."""
     incident = befell(records, what)[0]
     at = list(records).index(incident)
-    after = next(i for i, r in enumerate(records) if i > at and isinstance(r, Batch) and r.acts)
+    after = next(
+        i for i, r in enumerate(records) if i > at and isinstance(r, Batch) and r.step_records
+    )
     later = msgspec.structs.replace(incident, now_ns=records[after].now_ns)  # type: ignore[union-attr]
     return [*records[:at], *records[at + 1 : after + 1], later, *records[after + 1 :]]
 
 
 @breaks("delivery")
 def _did_not_hear_what_had_arrived(records: Records) -> list[Record]:
-    act = acts(records, "r1")[5]
-    return put_act(records, act, heard(*act.heard[1:]))
+    step_record = step_records(records, "r1")[5]
+    return put_act(records, step_record, heard(*step_record.heard[1:]))
 
 
 @breaks("delivery")
 def _heard_out_of_turn(records: Records) -> list[Record]:
-    act = acts(records, "r1")[5]
-    return put_act(records, act, heard(*reversed(act.heard)))
+    step_record = step_records(records, "r1")[5]
+    return put_act(records, step_record, heard(*reversed(step_record.heard)))
 
 
 @breaks("delivery", run=DEAF)
 def _used_a_number_twice(records: Records) -> list[Record]:
-    act = acts(records, "r1")[5]
-    (envelope,) = act.outputs.outbox
+    step_record = step_records(records, "r1")[5]
+    (envelope,) = step_record.outputs.outbox
     again = msgspec.structs.replace(envelope, sequence=2)
-    return put_act(records, act, outputs(outbox=(again,)))
+    return put_act(records, step_record, outputs(outbox=(again,)))
 
 
 @breaks("delivery", run=KILLED)
 def _heard_what_came_while_it_was_dead(records: Records) -> list[Record]:
-    act = next(act for act in acts(records, "r2") if act.now_ns > 1_100_000_000)
-    lost = next(
-        (verdict.source, verdict.sequence)
-        for batch in batches(records)
-        for verdict in batch.verdicts
-        if verdict.target == "r2" and verdict.due_ns == 600_000_000
+    step_record = next(
+        step_record
+        for step_record in step_records(records, "r2")
+        if step_record.now_ns > 1_100_000_000
     )
-    return put_act(records, act, heard(lost, *act.heard))
+    lost = next(
+        (decision.source, decision.sequence)
+        for batch in batches(records)
+        for decision in batch.decisions
+        if decision.target == "r2" and decision.due_ns == 600_000_000
+    )
+    return put_act(records, step_record, heard(lost, *step_record.heard))
 
 
 @breaks("delivery", run=MID_STEP)
 def _answered_without_what_it_was_given(records: Records) -> list[Record]:
-    act = next(act for act in acts(records, "r2") if act.now_ns == 500_000_000 and act.outputs)
-    return put_act(records, act, heard(*act.heard[1:]))
+    step_record = next(
+        step_record
+        for step_record in step_records(records, "r2")
+        if step_record.now_ns == 500_000_000 and step_record.outputs
+    )
+    return put_act(records, step_record, heard(*step_record.heard[1:]))
 
 
 @breaks("order", "epoch", "hold", run=FORGETFUL)
 def _steps_begin_anew(records: Records) -> list[Record]:
     steps, again = 0, changed(records, "start", step=0)
-    for act in acts(records, "r2"):
-        if act.now_ns > 1_100_000_000:
+    for step_record in step_records(records, "r2"):
+        if step_record.now_ns > 1_100_000_000:
             steps += 1
-            again = put_act(again, act, outputs(step=steps))
+            again = put_act(again, step_record, outputs(step=steps))
     return again
 
 
 @breaks("epoch", "weights", "ledger", run=KILLED)
 def _reborn_with_what_it_knew(records: Records) -> list[Record]:
-    return changed(_same_as_before_after_a_lost_disk(records), "start", epoch=1)
+    return changed(_same_as_before_after_a_lost_disk(records), "start", incarnation=1)
 
 
 @breaks("weights", run=FORGETFUL)
 def _reborn_and_does_not_begin_with_all_weights(records: Records) -> list[Record]:
-    told = [act for act in acts(records, "r2") if act.outputs and act.outputs.weights]
-    act = next(act for act in told if act.now_ns >= 1_100_000_000)
-    changes = msgspec.msgpack.decode(act.outputs.weights)
+    told = [
+        step_record
+        for step_record in step_records(records, "r2")
+        if step_record.outputs and step_record.outputs.weights
+    ]
+    step_record = next(step_record for step_record in told if step_record.now_ns >= 1_100_000_000)
+    changes = msgspec.msgpack.decode(step_record.outputs.weights)
     changes[3] = 1  # as if they were changes of something
-    return put_act(records, act, outputs(weights=msgspec.msgpack.encode(changes)))
+    return put_act(records, step_record, outputs(weights=msgspec.msgpack.encode(changes)))
 
 
 @breaks("energy", run=FORGETFUL)
 def _budget_was_for_all_its_lives(records: Records) -> list[Record]:
-    spent = max(sum(bool(act.outputs.spent) for act in acts(records, n)) for n in ("r1", "r3"))
-    both = sum(bool(act.outputs.spent) for act in acts(records, "r2"))
+    spent = max(
+        sum(bool(step_record.outputs.spent) for step_record in step_records(records, n))
+        for n in ("r1", "r3")
+    )
+    both = sum(bool(step_record.outputs.spent) for step_record in step_records(records, "r2"))
     assert spent >= both or both > spent
     return with_scenario(records, energy={"steps": max(spent, both) - 1})
 
 
 @breaks("ledger", run=FORGETFUL)
 def _forgets_its_predecessors_log(records: Records) -> list[Record]:
-    act = acts(records, "r2")[-1]
+    step_record = step_records(records, "r2")[-1]
 
     def forget(said: GossipMessage) -> GossipMessage:
-        told = read_have(said.have, 6) or []
-        rest = said.have[len(uints(*told)) :]
-        return msgspec.structs.replace(said, have=uints(told[0], 0, *told[2:]) + rest)
+        told = read_version_vector(said.version_vector, 6) or []
+        rest = said.version_vector[len(uints(*told)) :]
+        return msgspec.structs.replace(said, version_vector=uints(told[0], 0, *told[2:]) + rest)
 
-    return put_act(records, act, news(act, forget))
+    return put_act(records, step_record, news(step_record, forget))
 
 
 @breaks("ledger")
 def _holds_entries_of_nobody(records: Records) -> list[Record]:
-    act = acts(records, "r1")[-1]
+    step_record = step_records(records, "r1")[-1]
 
     def invent(said: GossipMessage) -> GossipMessage:
-        told = read_have(said.have, 3) or []
-        return msgspec.structs.replace(said, have=uints(*told, 1, 0, 0, *([0] * 6)))
+        told = read_version_vector(said.version_vector, 3) or []
+        return msgspec.structs.replace(said, version_vector=uints(*told, 1, 0, 0, *([0] * 6)))
 
-    return put_act(records, act, news(act, invent))
+    return put_act(records, step_record, news(step_record, invent))
 
 
 @breaks("ledger")
 def _forwards_what_its_origin_never_made(records: Records) -> list[Record]:
-    act = acts(records, "r1")[5]
+    step_record = step_records(records, "r1")[5]
     log = uints(1, 0, 1, 1) + pairs((59, 1))
-    return put_act(records, act, news(act, lambda said: msgspec.structs.replace(said, logs=log)))
+    return put_act(
+        records,
+        step_record,
+        news(step_record, lambda said: msgspec.structs.replace(said, logs=log)),
+    )
 
 
 @breaks("register", run=(*FORGETFUL, *SPECTRAL))
 def _goes_on_with_its_predecessors_sums(records: Records) -> list[Record]:
-    act = next(act for act in reversed(acts(records, "r2")) if own_register(act, 6, 4))
-    content = decode_gossip(act.outputs.outbox[0].body).registers
+    step_record = next(
+        step_record
+        for step_record in reversed(step_records(records, "r2"))
+        if own_register(step_record, 6, 4)
+    )
+    content = decode_gossip(step_record.outputs.outbox[0].body).registers
     _, sums = read_register(content, 6, 9, 4) or (0, [])
-    register = uints(0, 0, 0, 0, 0, 0, 4, own_register(act, 6, 4), 1, 2 * (sums[0] + VISIT))
-    change = news(act, lambda said: msgspec.structs.replace(said, registers=register))
-    return put_act(records, act, change)
+    register = uints(0, 0, 0, 0, 0, 0, 4, own_register(step_record, 6, 4), 1, 2 * (sums[0] + VISIT))
+    change = news(step_record, lambda said: msgspec.structs.replace(said, registers=register))
+    return put_act(records, step_record, change)
 
 
 @breaks("incident")
@@ -956,7 +1004,7 @@ def _acts_while_it_is_dead(records: Records) -> list[Record]:
 def acting_early(records: Records) -> list[Record]:
     """The records with a start that comes after a step."""
     start = befell(records, "start")[0]
-    first = next(a for a in acts(records, "r2") if a.now_ns > start.now_ns)
+    first = next(a for a in step_records(records, "r2") if a.now_ns > start.now_ns)
     return changed(delayed(records, "start"), "start", step=first.outputs.step)
 
 
@@ -982,8 +1030,12 @@ def _goes_on_from_a_step_to_come(records: Records) -> list[Record]:
 
 @breaks("epoch")
 def _speaks_as_another_incarnation(records: Records) -> list[Record]:
-    act = acts(records, "r1")[5]
-    return put_act(records, act, news(act, lambda said: msgspec.structs.replace(said, epoch=1)))
+    step_record = step_records(records, "r1")[5]
+    return put_act(
+        records,
+        step_record,
+        news(step_record, lambda said: msgspec.structs.replace(said, incarnation=1)),
+    )
 
 
 @breaks("epoch", run=MERGES["min"])
@@ -998,13 +1050,17 @@ def _impostor_is_let_in(records: Records) -> list[Record]:
 
 @breaks("refusal")
 def _refuses_what_is_sound(records: Records) -> list[Record]:
-    return put_act(records, acts(records, "r1")[-1], outputs(refused=1))
+    return put_act(records, step_records(records, "r1")[-1], outputs(refused=1))
 
 
 @breaks("refusal", run=HOSTILE)
 def _takes_in_what_is_forged(records: Records) -> list[Record]:
-    refused = max(act.outputs.refused for act in acts(records, "r1"))
-    taken = next(act for act in acts(records, "r1") if act.outputs.refused == refused)
+    refused = max(step_record.outputs.refused for step_record in step_records(records, "r1"))
+    taken = next(
+        step_record
+        for step_record in step_records(records, "r1")
+        if step_record.outputs.refused == refused
+    )
     return put_act(records, taken, outputs(refused=refused - 1))
 
 
@@ -1022,40 +1078,52 @@ def _forged_under_a_number_that_is_sent(records: Records) -> list[Record]:
 
 @breaks("clock")
 def _clock_is_wrong_of_itself(records: Records) -> list[Record]:
-    return put_act(records, acts(records, "r1")[5], skewed(1))
+    return put_act(records, step_records(records, "r1")[5], skewed(1))
 
 
 @breaks("clock", run=SKEWED)
 def _clock_is_not_as_wrong_as_a_fault_says(records: Records) -> list[Record]:
-    act = next(act for act in acts(records, "r2") if act.skew_ns)
-    return put_act(records, act, skewed(act.skew_ns - 1))
+    step_record = next(
+        step_record for step_record in step_records(records, "r2") if step_record.skew_ns
+    )
+    return put_act(records, step_record, skewed(step_record.skew_ns - 1))
 
 
 def skewed(skew_ns: int) -> Change:
-    return lambda act: msgspec.structs.replace(act, skew_ns=skew_ns)
+    return lambda step_record: msgspec.structs.replace(step_record, skew_ns=skew_ns)
 
 
 @breaks("ruling", run=SKEWED)
 def _too_fast_by_a_clock_that_did_not_gain(records: Records) -> list[Record]:
-    act = next(act for act in reversed(acts(records, "r2")) if act.skew_ns)
-    return put_act(records, act, ruling(violations=("speed",)))
+    step_record = next(
+        step_record for step_record in reversed(step_records(records, "r2")) if step_record.skew_ns
+    )
+    return put_act(records, step_record, verdict(violations=("speed",)))
 
 
 def test_too_fast_by_a_clock_that_gains_is_excused(played: Play) -> None:
     """It cannot know that its clock has jumped; the world refuses the move, and nobody is to blame."""
     records = played(*SKEWED)
-    act = next(act for act in acts(records, "r2") if act.skew_ns)
+    step_record = next(
+        step_record for step_record in step_records(records, "r2") if step_record.skew_ns
+    )
 
-    assert rules(put_act(records, act, ruling(violations=("speed",)))) == set()
-    assert rules(put_act(records, act, ruling(violations=("speed", "units")))) == {"ruling"}
-    assert rules(put_act(records, act, ruling(violations=("units",)))) == {"ruling"}
+    assert rules(put_act(records, step_record, verdict(violations=("speed",)))) == set()
+    assert rules(put_act(records, step_record, verdict(violations=("speed", "units")))) == {
+        "ruling"
+    }
+    assert rules(put_act(records, step_record, verdict(violations=("units",)))) == {"ruling"}
 
 
 @breaks("hold")
 def _steps_without_having_seen_the_last_one(records: Records) -> list[Record]:
-    act = acts(records, "r1")[5]
-    stale = msgspec.structs.replace(act.observation, step=act.observation.step - 1)
-    return put_act(records, act, lambda act: msgspec.structs.replace(act, observation=stale))
+    step_record = step_records(records, "r1")[5]
+    stale = msgspec.structs.replace(step_record.observation, step=step_record.observation.step - 1)
+    return put_act(
+        records,
+        step_record,
+        lambda step_record: msgspec.structs.replace(step_record, observation=stale),
+    )
 
 
 @pytest.mark.parametrize("name", list(BROKEN))
@@ -1096,11 +1164,11 @@ def test_subscriber_sees_what_the_checker_follows(played: Play) -> None:
         for name in ("r1", "r2", "r3"):
             subscriber = WeightsSubscriber()
             view = np.full(60, opening(records).units.sample)
-            for act in acts(records, name):
-                for sample, left in entries(act.outputs.lowered):
+            for step_record in step_records(records, name):
+                for sample, left in entries(step_record.outputs.lowered):
                     view[sample] = left
-                if act.outputs.weights:
-                    assert subscriber.take(act.outputs.weights)
+                if step_record.outputs.weights:
+                    assert subscriber.apply(step_record.outputs.weights)
 
             assert subscriber.weights is not None
             assert view.tolist() == subscriber.weights.tolist()

@@ -74,15 +74,19 @@ def incidents(records: list[Record]) -> list[ProcessEvent]:
     return [record for record in records if isinstance(record, ProcessEvent)]
 
 
-def acts(records: list[Record], name: ParticipantId) -> list[StepRecord]:
+def step_records(records: list[Record], name: ParticipantId) -> list[StepRecord]:
     """A participant's answered steps."""
-    told = (act for batch in batches(records) for act in batch.acts)
-    return [act for act in told if act.name == name and act.outputs is not None]
+    told = (step_record for batch in batches(records) for step_record in batch.step_records)
+    return [
+        step_record
+        for step_record in told
+        if step_record.name == name and step_record.outputs is not None
+    ]
 
 
-def outputs(act: StepRecord) -> Outputs:
-    assert act.outputs is not None
-    return act.outputs
+def outputs(step_record: StepRecord) -> Outputs:
+    assert step_record.outputs is not None
+    return step_record.outputs
 
 
 def kill(who: str, from_s: float, until_s: float | None, *more: str) -> str:
@@ -93,17 +97,26 @@ def kill(who: str, from_s: float, until_s: float | None, *more: str) -> str:
 
 def is_sound(records: list[Record]) -> bool:
     """Steps without a gap, no message twice, nobody beyond its energy, no rule broken."""
-    all_acts = [act for batch in batches(records) for act in batch.acts if act.outputs]
-    sent = Counter((e.source, e.sequence) for act in all_acts for e in outputs(act).outbox)
-    spent = Counter(act.name for act in all_acts if outputs(act).spent)
+    all_acts = [
+        step_record
+        for batch in batches(records)
+        for step_record in batch.step_records
+        if step_record.outputs
+    ]
+    sent = Counter(
+        (e.source, e.sequence) for step_record in all_acts for e in outputs(step_record).outbox
+    )
+    spent = Counter(step_record.name for step_record in all_acts if outputs(step_record).spent)
     steps: dict[ParticipantId, list[int]] = {}
-    for act in all_acts:
-        steps.setdefault(act.name, []).append(outputs(act).step)
+    for step_record in all_acts:
+        steps.setdefault(step_record.name, []).append(outputs(step_record).step)
     return (
         all(told == list(range(1, len(told) + 1)) for told in steps.values())
         and set(sent.values()) == {1}
         and all(count <= 60 for count in spent.values())
-        and not any(act.ruling.violations for act in all_acts if act.ruling)
+        and not any(
+            step_record.verdict.violations for step_record in all_acts if step_record.verdict
+        )
     )
 
 
@@ -129,7 +142,7 @@ def test_restart_with_the_snapshot_is_as_if_nothing_had_been(
     starts = [incident for incident in incidents(records) if incident.what == "start"]
 
     assert batches(records) == batches(undisturbed(overrides))
-    assert all(incident.epoch == 0 for incident in starts)
+    assert all(incident.incarnation == 0 for incident in starts)
     assert [(incident.who, incident.what) for incident in incidents(records)] == [
         (who, what) for _ in starts for what in ("kill", "start")
     ]
@@ -138,12 +151,14 @@ def test_restart_with_the_snapshot_is_as_if_nothing_had_been(
 def test_what_reaches_a_dead_robot_is_lost() -> None:
     """What arrives while it is away, and only that; the rest it hears when it goes on."""
     records = run(kill("r2", 1.05, 2.05), overrides=("radio.delay_s=0.08",))
-    heard = {reference for act in acts(records, "r2") for reference in act.heard}
+    heard = {
+        reference for step_record in step_records(records, "r2") for reference in step_record.heard
+    }
     arrived = {
-        (verdict.source, verdict.sequence): verdict.due_ns
+        (decision.source, decision.sequence): decision.due_ns
         for batch in batches(records)
-        for verdict in batch.verdicts
-        if verdict.target == "r2" and batch.now_ns <= 3000 * MS
+        for decision in batch.decisions
+        if decision.target == "r2" and batch.now_ns <= 3000 * MS
     }
     missed = {reference for reference in arrived if reference not in heard}
 
@@ -151,7 +166,11 @@ def test_what_reaches_a_dead_robot_is_lost() -> None:
         reference for reference, due_ns in arrived.items() if 1050 * MS <= due_ns < 2050 * MS
     }
     assert len(missed) > 10
-    assert [act.now_ns // MS for act in acts(records, "r2")][9:12] == [1000, 2100, 2200]
+    assert [step_record.now_ns // MS for step_record in step_records(records, "r2")][9:12] == [
+        1000,
+        2100,
+        2200,
+    ]
     assert is_sound(records)
 
 
@@ -164,15 +183,19 @@ def test_step_between_its_note_and_its_answer_is_neither_lost_nor_made_twice(
     overrides = (*LOSSY, *PACES[pace])
     records = run(kill("r2", 1.22, until_s, "mid_step = true"), overrides=overrides)
     start = next(incident for incident in incidents(records) if incident.what == "start")
-    plain = acts(undisturbed(overrides), "r2")
+    plain = step_records(undisturbed(overrides), "r2")
     silent = [batch for batch in batches(records) if batch.absent]
-    answer = next(act for act in acts(records, "r2") if outputs(act).step == start.step)
-    back = next(batch for batch in batches(records) if answer in batch.acts)
+    answer = next(
+        step_record
+        for step_record in step_records(records, "r2")
+        if outputs(step_record).step == start.step
+    )
+    back = next(batch for batch in batches(records) if answer in batch.step_records)
 
     assert [batch.absent for batch in silent] == [("r2",)]
-    assert (start.epoch, start.now_ns) == (0, round(until_s * 1e9))
+    assert (start.incarnation, start.now_ns) == (0, round(until_s * 1e9))
     assert answer == plain[start.step - 1]
-    assert (back.now_ns, back.acts) == (start.now_ns, (answer,))
+    assert (back.now_ns, back.step_records) == (start.now_ns, (answer,))
     assert answer.now_ns == silent[0].now_ns < back.now_ns
     assert is_sound(records)
 
@@ -193,18 +216,20 @@ def test_who_forgot_comes_back_as_another(pace: str, disk: str, mid_step: bool) 
     kills = [kill("r1", 1.02, 1.42, *more), kill("r1", 2.02, 2.42, *more)]
     records = run(*kills, overrides=(*LOSSY, *PACES[pace]))
     starts = [incident for incident in incidents(records) if incident.what == "start"]
-    told = acts(records, "r1")
-    epochs = {
-        outputs(act).step: decode_gossip(envelope.body).epoch
-        for act in told
-        for envelope in outputs(act).outbox
+    told = step_records(records, "r1")
+    incarnations = {
+        outputs(step_record).step: decode_gossip(envelope.body).incarnation
+        for step_record in told
+        for envelope in outputs(step_record).outbox
     }
 
-    assert [incident.epoch for incident in starts] == [1, 2]
-    assert all(epochs[start.step] == start.epoch - 1 for start in starts)
-    assert all(epochs[start.step + 1] == start.epoch for start in starts)
+    assert [incident.incarnation for incident in starts] == [1, 2]
+    assert all(incarnations[start.step] == start.incarnation - 1 for start in starts)
+    assert all(incarnations[start.step + 1] == start.incarnation for start in starts)
     assert is_sound(records)
-    assert outputs(told[-1]).energy_spent == sum(bool(outputs(act).spent) for act in told)
+    assert outputs(told[-1]).energy_spent == sum(
+        bool(outputs(step_record).spent) for step_record in told
+    )
 
 
 @pytest.mark.parametrize("disk", ["kept", "torn", "lost"])
@@ -214,7 +239,7 @@ def test_who_never_acted_is_nobody_else(disk: str) -> None:
         kill("r1", 0.01, 0.52, f'disk = "{disk}"', "mid_step = true"),
         kill("r2", 0.01, 0.52, f'disk = "{disk}"'),
     )
-    starts = {i.who: (i.epoch, i.step) for i in incidents(records) if i.what == "start"}
+    starts = {i.who: (i.incarnation, i.step) for i in incidents(records) if i.what == "start"}
 
     assert starts == {"r1": (0, int(disk == "kept")), "r2": (0, 0)}
     assert is_sound(records)
@@ -226,16 +251,18 @@ def test_who_never_acted_is_nobody_else(disk: str) -> None:
 def test_late_joiner_takes_part() -> None:
     """It does nothing and hears nothing before it is there; then its first step is its first."""
     records = run('kind = "late"; who = ["r3"]; until_s = 1.55')
-    first = acts(records, "r3")[0]
+    first = step_records(records, "r3")[0]
     sent_ns = {
-        (verdict.source, verdict.sequence): verdict.due_ns
+        (decision.source, decision.sequence): decision.due_ns
         for batch in batches(records)
-        for verdict in batch.verdicts
+        for decision in batch.decisions
     }
 
     assert incidents(records) == [ProcessEvent(1550 * MS, "r3", "start", 0)]
     assert (first.now_ns, outputs(first).step) == (1600 * MS, 1)
-    heard = [reference for act in acts(records, "r3") for reference in act.heard]
+    heard = [
+        reference for step_record in step_records(records, "r3") for reference in step_record.heard
+    ]
     assert min(sent_ns[reference] for reference in heard) >= 1550 * MS
     assert is_sound(records)
 
@@ -250,17 +277,17 @@ def test_late_joiner_takes_part() -> None:
 def test_what_is_sent_to_an_idle_robot_waits(fault: str, told: tuple[str, str]) -> None:
     """It takes no step and sends nothing; then it hears all that came, in order of arrival."""
     records = run(fault)
-    r2 = acts(records, "r2")
-    back = next(act for act in r2 if act.now_ns == 1500 * MS)
+    r2 = step_records(records, "r2")
+    back = next(step_record for step_record in r2 if step_record.now_ns == 1500 * MS)
     waiting = sorted(
-        (verdict.due_ns, verdict.source, verdict.sequence)
+        (decision.due_ns, decision.source, decision.sequence)
         for batch in batches(records)
-        for verdict in batch.verdicts
-        if verdict.target == "r2" and 900 * MS <= batch.now_ns < 1500 * MS
+        for decision in batch.decisions
+        if decision.target == "r2" and 900 * MS <= batch.now_ns < 1500 * MS
     )
 
     assert tuple(incident.what for incident in incidents(records)) == told
-    assert [act.now_ns // MS for act in r2][8:11] == [900, 1500, 1600]
+    assert [step_record.now_ns // MS for step_record in r2][8:11] == [900, 1500, 1600]
     assert back.heard == tuple((source, sequence) for _, source, sequence in waiting)
     assert not any(batch.absent for batch in batches(records))
     assert is_sound(records)
@@ -269,7 +296,7 @@ def test_what_is_sent_to_an_idle_robot_waits(fault: str, told: tuple[str, str]) 
 def test_slow_robot_gets_to_some_of_its_steps() -> None:
     """One in four while it is slow, and no step number is left out."""
     records = run('kind = "slow"; who = ["r2"]; from_s = 1.0; until_s = 2.5; every = 4')
-    times_ms = [act.now_ns // MS for act in acts(records, "r2")]
+    times_ms = [step_record.now_ns // MS for step_record in step_records(records, "r2")]
 
     assert times_ms[8:15] == [900, 1200, 1600, 2000, 2400, 2500, 2600]
     assert [incident.what for incident in incidents(records)] == ["slow", "quicken"]
@@ -282,16 +309,25 @@ def test_wrong_clock_is_on_record_and_breaks_no_rule(pace: str, offset_s: float)
     """The machine reads the wrong time, the world goes by the right one."""
     clock = f'kind = "clock"; who = ["r2"]; from_s = 1.0; until_s = 2.0; offset_s = {offset_s}'
     records = run(clock, overrides=(*LOSSY, *PACES[pace]))
-    wrong = [act for act in acts(records, "r2") if 1000 * MS <= act.now_ns < 2000 * MS]
-    act = next(act for act in acts(records, "r2") if act.skew_ns)
+    wrong = [
+        step_record
+        for step_record in step_records(records, "r2")
+        if 1000 * MS <= step_record.now_ns < 2000 * MS
+    ]
+    step_record = next(
+        step_record for step_record in step_records(records, "r2") if step_record.skew_ns
+    )
     mailbag = EnvelopeIndex()
     for batch in batches(records):
         mailbag.post(batch)
 
     assert wrong
-    assert all(act.skew_ns == max(round(offset_s * 1e9), -act.now_ns) for act in wrong)
-    assert {act.skew_ns for act in acts(records, "r1")} == {0}
-    assert mailbag.inputs(act).now_ns == act.now_ns + act.skew_ns >= 0
+    assert all(
+        step_record.skew_ns == max(round(offset_s * 1e9), -step_record.now_ns)
+        for step_record in wrong
+    )
+    assert {step_record.skew_ns for step_record in step_records(records, "r1")} == {0}
+    assert mailbag.inputs(step_record).now_ns == step_record.now_ns + step_record.skew_ns >= 0
     assert is_sound(records)
 
 
@@ -402,7 +438,7 @@ def test_world_with_a_map_goes_on_from_its_record(coordination: str) -> None:
         play(replace(scenario, faults=(lost, outage)), 1, site, [records.append])
         assert isinstance(records[-1], Ending)
         assert records[-1].reason == "done"
-        assert [incident.epoch for incident in incidents(records) if incident.step] == [1]
+        assert [incident.incarnation for incident in incidents(records) if incident.step] == [1]
         return batches(records)
 
     window = {"who": (WORLD_SIM,), "from_s": 1.2, "until_s": 1.5}
@@ -440,8 +476,8 @@ def test_mission_goes_on_from_any_record(pace: str) -> None:
         crew = in_process(everybody_mortal(scenario, site))
         left = iter(range(asks))
         records: list[Record] = []
-        stage = Simulation(scenario, 1, site, [records.append])
-        simulate(stage, crew, 1, lambda left=left: next(left, None) is None)  # type: ignore[misc]
+        simulation = Simulation(scenario, 1, site, [records.append])
+        simulate(simulation, crew, 1, lambda left=left: next(left, None) is None)  # type: ignore[misc]
         if records[-1] == whole[-1]:
             break
         records.pop()
@@ -459,17 +495,21 @@ def test_records_that_do_not_follow_are_refused() -> None:
     number, batch = next(
         (i, record)
         for i, record in enumerate(records)
-        if isinstance(record, Batch) and any(act.heard for act in record.acts)
+        if isinstance(record, Batch)
+        and any(step_record.heard for step_record in record.step_records)
     )
-    unheard = [replace(act, heard=(("r1", 4711),)) for act in batch.acts]
+    unheard = [replace(step_record, heard=(("r1", 4711),)) for step_record in batch.step_records]
     elsewhere = [
-        replace(act, ruling=act.ruling and replace(act.ruling, pose=Pose(1.0, 2.0)))
-        for act in batch.acts
+        replace(
+            step_record,
+            verdict=step_record.verdict and replace(step_record.verdict, pose=Pose(1.0, 2.0)),
+        )
+        for step_record in batch.step_records
     ]
 
     for changed in (
-        replace(batch, acts=tuple(unheard)),
-        replace(batch, acts=tuple(elsewhere)),
+        replace(batch, step_records=tuple(unheard)),
+        replace(batch, step_records=tuple(elsewhere)),
         replace(batch, out_of_range=99),
     ):
         with pytest.raises(ForeignRecordError, match=f"^record {number}: "):
@@ -482,20 +522,20 @@ def test_only_what_was_heard_is_taken_from_what_is_under_way() -> None:
     """A stage that is resumed holds exactly what nobody has heard yet."""
     scenario = troubled(overrides=LOSSY)
     records = run(overrides=LOSSY)[:30]
-    stage = Simulation.resumed(scenario, 1, WorldSetup.of(scenario, 1), records, [])
+    simulation = Simulation.resumed(scenario, 1, WorldSetup.of(scenario, 1), records, [])
     under_way = Counter(
         (v.target, v.source, v.sequence)
         for batch in batches(records)
-        for v in batch.verdicts
+        for v in batch.decisions
         if v.due_ns != DROPPED
     )
     for batch in batches(records):
-        for act in batch.acts:
-            under_way.subtract((act.name, *reference) for reference in act.heard)
+        for step_record in batch.step_records:
+            under_way.subtract((step_record.name, *reference) for reference in step_record.heard)
     held = Counter(
         (name, envelope.source, envelope.sequence)
         for name in scenario.roster
-        for envelope in stage.channel.take(name, 2**62)
+        for envelope in simulation.channel.collect(name, 2**62)
     )
 
     assert held == +under_way

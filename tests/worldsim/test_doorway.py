@@ -46,7 +46,7 @@ def test_who_is_there_and_silent_is_told_its_mission_again(monkeypatch: pytest.M
     monkeypatch.setattr("kantor_worldsim.exchange.lobby.time", bus)
     site = WorldSetup.of(scenario, 0)
     plan = MissionConfig(scenario, 0, site, "wall")
-    doorway = Lobby(
+    lobby = Lobby(
         cast("HubRouter", bus),
         plan,
         Recording(scenario, 0, "wall"),
@@ -55,10 +55,10 @@ def test_who_is_there_and_silent_is_told_its_mission_again(monkeypatch: pytest.M
         None,
         lambda _line: None,
     )
-    doorway.stage = Simulation(scenario, 0, site, [])
+    lobby.simulation = Simulation(scenario, 0, site, [])
     bus.events.append(Joined("r1", "nonce"))
     while bus.now_s < 3.5 * AGAIN_S:
-        doorway.next(0.1 * AGAIN_S)
+        lobby.next(0.1 * AGAIN_S)
 
     told = [decode_to_participant(payload) for _, payload in bus.sent]
     assert {name for name, _ in bus.sent} == {"r1"}

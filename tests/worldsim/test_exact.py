@@ -61,9 +61,9 @@ def judged(records: tuple[Record, ...], every: int) -> tuple[list[DensityRow], C
     """The rows of a record with exact distances, and a checker that has seen them."""
     metrics, checker = DensityMetrics(every), Checker()
     for record in records:
-        metrics.take(record)
+        metrics.observe(record)
     for row in metrics.rows:
-        checker.take_row(row)
+        checker.observe_row(row)
     return metrics.rows, checker
 
 
@@ -104,7 +104,7 @@ def test_it_is_computed_when_asked_for(played: Play) -> None:
     def ticks(every: int | None) -> list[int]:
         metrics = DensityMetrics(every)
         for record in records:
-            metrics.take(record)
+            metrics.observe(record)
         return [row.tick for row in metrics.rows if row.w1_exact is not None]
 
     last = judged(records, every=0)[0][-1].tick
@@ -127,8 +127,8 @@ def test_checker_tells_of_a_bound_below_it(played: Play, form: str) -> None:
     row = rows[0]._replace(w1_exact=1.0, w_ub_tight=1.0, w_ub_paper=1.0)
     checker = Checker()
 
-    checker.take_row(row._replace(**{form: 0.999}))
+    checker.observe_row(row._replace(**{form: 0.999}))
 
     assert [line.partition(":")[0] for line in checker.complaints] == ["bound"]
-    checker.take_row(row._replace(w_ub_tight=None, w_ub_paper=0.1))  # it does not claim to hold
+    checker.observe_row(row._replace(w_ub_tight=None, w_ub_paper=0.1))  # it does not claim to hold
     assert checker.count == 1

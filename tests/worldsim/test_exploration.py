@@ -30,7 +30,7 @@ Records = Sequence[Record]
 def measured(records: Records) -> MapMetrics:
     metrics = MapMetrics()
     for record in records:
-        metrics.take(record)
+        metrics.observe(record)
     return metrics
 
 
@@ -96,9 +96,12 @@ def poses_by_tick(records: Records) -> list[list[tuple[float, float]]]:
     by_tick = [list(poses.values())]
     for record in records:
         if isinstance(record, Batch):
-            for act in record.acts:
-                if act.name in poses and act.ruling is not None:
-                    poses[act.name] = act.ruling.pose.x_m, act.ruling.pose.y_m
+            for step_record in record.step_records:
+                if step_record.name in poses and step_record.verdict is not None:
+                    poses[step_record.name] = (
+                        step_record.verdict.pose.x_m,
+                        step_record.verdict.pose.y_m,
+                    )
             tick = record.now_ns // PERIOD_NS
             by_tick[tick:] = [list(poses.values())]
     return by_tick
@@ -109,8 +112,8 @@ def test_variances_are_their_definitions(every: int) -> None:
     """WTV and EPV of every row and over time, for every number of regions."""
     records = explored(f"metrics.every={every}")
     metrics, poses = measured(records), poses_by_tick(records)
-    first = metrics.survey.books.first_tick
-    counts = metrics.survey.observable.ravel()
+    first = metrics.map_tracker.state.first_tick
+    counts = metrics.map_tracker.observable.ravel()
     means = map_of(metrics)
 
     for i, shape in enumerate(SHAPES):
@@ -135,7 +138,7 @@ def test_final_variance_is_of_true_stamps_alone() -> None:
     """A mission that was cut: what was never seen does not count, nor a region of nothing else."""
     records = [*explored()[:6], Ending(5 * PERIOD_NS, "interrupted")]
     metrics = measured(records)
-    first, counts = metrics.survey.books.first_tick, metrics.survey.observable.ravel()
+    first, counts = metrics.map_tracker.state.first_tick, metrics.map_tracker.observable.ravel()
 
     assert 0.0 < metrics.rows[-1].explored < 1.0
     for i, shape in enumerate(SHAPES):
@@ -159,12 +162,12 @@ def test_row_every_ten_ticks_tells_how_its_tick_ended() -> None:
     """Tick 0, every tenth, and the end; what is seen later is not in it."""
     records = explored()
     metrics, end = measured(records), records[-1].now_ns // PERIOD_NS
-    first, counts = metrics.survey.books.first_tick, metrics.survey.observable.ravel()
+    first, counts = metrics.map_tracker.state.first_tick, metrics.map_tracker.observable.ravel()
 
     assert [row.tick for row in metrics.rows] == [*range(0, end, 10), end]
     for row in metrics.rows:
         seen = ((first >= 0) & (first <= row.tick) & counts).sum()
-        assert row.explored == seen / metrics.survey.total
+        assert row.explored == seen / metrics.map_tracker.total
         assert row.explored_least <= row.explored
         assert row.time_s == pytest.approx(0.1 * row.tick)
     assert metrics.rows[0].explored == 0.0
@@ -175,23 +178,30 @@ def test_generic_counts_are_those_of_the_record() -> None:
     """Deliveries, drops, bytes, contact and the end, whatever is explored."""
     records = explored("radio.drop=0.3")
     batches = [record for record in records if isinstance(record, Batch)]
-    verdicts = [verdict for batch in batches for verdict in batch.verdicts]
-    acts = [act for batch in batches for act in batch.acts]
-    bodies = [len(e.body) for act in acts if act.outputs for e in act.outputs.outbox]
+    decisions = [decision for batch in batches for decision in batch.decisions]
+    step_records = [step_record for batch in batches for step_record in batch.step_records]
+    bodies = [
+        len(e.body)
+        for step_record in step_records
+        if step_record.outputs
+        for e in step_record.outputs.outbox
+    ]
     result = result_of(measured(records))
 
-    assert result.drops == sum(verdict.due_ns == DROPPED for verdict in verdicts) > 0
-    assert result.deliveries == len(verdicts) - result.drops
-    assert result.bytes_per_robot_tick.total == pytest.approx(sum(bodies) / len(acts))
+    assert result.drops == sum(decision.due_ns == DROPPED for decision in decisions) > 0
+    assert result.deliveries == len(decisions) - result.drops
+    assert result.bytes_per_robot_tick.total == pytest.approx(sum(bodies) / len(step_records))
     assert result.bytes_per_robot_tick.weights == 0.0
-    assert result.first_contact_tick == next(act.outputs.step for act in acts if act.heard)
+    assert result.first_contact_tick == next(
+        step_record.outputs.step for step_record in step_records if step_record.heard
+    )
     assert result.out_of_range_refused == sum(batch.out_of_range for batch in batches)
     assert (result.ended, result.ticks) == ("done", batches[-1].now_ns // PERIOD_NS)
     assert result.finished_tick == max(
         next(
-            act.outputs.step
-            for act in acts
-            if act.name == name and act.outputs.state is State.FINISHED
+            step_record.outputs.step
+            for step_record in step_records
+            if step_record.name == name and step_record.outputs.state is State.FINISHED
         )
         for name in ("r1", "r2")
     )
@@ -204,28 +214,31 @@ def test_own_bytes_of_maps_are_counted() -> None:
     from kantor_protocol.wire.messages import decode_gossip
 
     records = explored("coordination=centralized")
-    acts = [
-        act
+    step_records = [
+        step_record
         for batch in records
         if isinstance(batch, Batch)
-        for act in batch.acts
-        if act.name != "supervisor"
+        for step_record in batch.step_records
+        if step_record.name != "supervisor"
     ]
     sent = [
-        len(decode_gossip(e.body).logs) for act in acts if act.outputs for e in act.outputs.outbox
+        len(decode_gossip(e.body).logs)
+        for step_record in step_records
+        if step_record.outputs
+        for e in step_record.outputs.outbox
     ]
     found = map_of(measured(records)).log_bytes_per_robot_tick
 
-    assert found == pytest.approx(sum(sent) / len(acts))
+    assert found == pytest.approx(sum(sent) / len(step_records))
 
 
 def test_overlap_is_what_was_seen_twice() -> None:
     """The sum of what robots saw themselves over what somebody saw; a robot alone has none."""
     metrics = measured(explored("radio.range_m=0.01"))
-    own = metrics.survey.own_cells.sum()
+    own = metrics.map_tracker.own_cells.sum()
     alone = measured(explored("robots.count=1", "starts.poses_m=[[1.5, 1.5]]"))
 
-    assert map_of(metrics).overlap == pytest.approx(own / metrics.survey.seen - 1.0)
+    assert map_of(metrics).overlap == pytest.approx(own / metrics.map_tracker.seen - 1.0)
     assert map_of(metrics).overlap > 0.9
     assert map_of(alone).overlap == 0.0
 
@@ -239,7 +252,7 @@ class Errand:
     def __init__(self) -> None:
         self.scenario = on_map("robots.count=1", "starts.poses_m=[[1.5, 8.5]]", "metrics.every=1")
         self.metrics = MapMetrics()
-        self.metrics.take(opening_of(self.scenario, 1, site_of(self.scenario), {"r1": ()}))
+        self.metrics.observe(opening_of(self.scenario, 1, site_of(self.scenario), {"r1": ()}))
         self.tick = 0
         self.pose = Pose(1.5, 8.5)
 
@@ -255,12 +268,12 @@ class Errand:
         look = Observation(self.tick, self.pose)
         self.tick, self.pose = self.tick + 1, Pose(x_m, 8.5)
         outputs = Outputs(self.tick, self.pose, goal=goal_m, state=state)
-        ruling = StepVerdict(self.pose, bumped=bumped)
-        act = StepRecord("r1", self.tick * PERIOD_NS, look, (), outputs, ruling)
-        self.metrics.take(Batch(self.tick * PERIOD_NS, (act,), (), 0))
+        verdict = StepVerdict(self.pose, bumped=bumped)
+        step_record = StepRecord("r1", self.tick * PERIOD_NS, look, (), outputs, verdict)
+        self.metrics.observe(Batch(self.tick * PERIOD_NS, (step_record,), (), 0))
 
     def end(self) -> MapResult:
-        self.metrics.take(Ending(self.tick * PERIOD_NS, "limit"))
+        self.metrics.observe(Ending(self.tick * PERIOD_NS, "limit"))
         return map_of(self.metrics)
 
 
@@ -333,21 +346,21 @@ def test_class_is_chosen_by_what_is_explored() -> None:
 
 def test_glance_has_distance_and_share() -> None:
     """Cheap at any time, also before anything."""
-    assert MapMetrics().glance().mass_left == 1.0
+    assert MapMetrics().snapshot().mass_left == 1.0
     metrics = measured(explored())
-    glance = metrics.glance()
+    snapshot = metrics.snapshot()
 
-    assert glance.mass_left == 0.0
-    assert glance.distance_m == metrics.rows[-1].distance_m
-    assert glance.robots_done == 2
-    assert glance.messages_per_s > 0.0
+    assert snapshot.mass_left == 0.0
+    assert snapshot.distance_m == metrics.rows[-1].distance_m
+    assert snapshot.robots_done == 2
+    assert snapshot.messages_per_s > 0.0
 
 
 def test_run_folder_has_rows_and_result(tmp_path: Path) -> None:
     """metrics.csv has a map's columns, result.json its part, and both referees share one survey."""
     scenario = on_map()
     recording = Recording(scenario, 1, "in-process", tmp_path)
-    play(scenario, 1, site_of(scenario), [recording.take])
+    play(scenario, 1, site_of(scenario), [recording.observe])
     result = recording.finish()
     head, *lines = (tmp_path / "metrics.csv").read_text(encoding="utf-8").splitlines()
     stored = msgspec.json.decode((tmp_path / "result.json").read_bytes(), type=Result)
@@ -361,12 +374,12 @@ def test_run_folder_has_rows_and_result(tmp_path: Path) -> None:
 
 def test_survey_may_be_shared_only_with_who_comes_later() -> None:
     """The measures are the same with a survey of their own."""
-    survey = MapTracker()
-    shared, own = MapMetrics(survey=survey), MapMetrics()
+    map_tracker = MapTracker()
+    shared, own = MapMetrics(map_tracker=map_tracker), MapMetrics()
     for record in explored():
-        shared.take(record)
-        survey.take(record)
-        own.take(record)
+        shared.observe(record)
+        map_tracker.observe(record)
+        own.observe(record)
 
     assert shared.rows == own.rows
 

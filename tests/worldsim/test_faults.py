@@ -77,13 +77,13 @@ class Air:
         return self.channel.transmit(sent)[0]
 
     @property
-    def tolls(self) -> dict[int, dict[str, int]]:
+    def fault_stats(self) -> dict[int, dict[str, int]]:
         """What each fault did, without what it did not."""
         return {
-            toll.fault: {
-                k: n for k, n in msgspec.structs.asdict(toll).items() if n and k != "fault"
+            stats.fault: {
+                k: n for k, n in msgspec.structs.asdict(stats).items() if n and k != "fault"
             }
-            for toll in self.faults.take_tolls()
+            for stats in self.faults.pop_stats()
         }
 
 
@@ -107,13 +107,13 @@ def chatter(count: int, roster: Sequence[str] = ("r1", "r2", "r3"), size: int = 
     ]
 
 
-def dues(verdicts: Sequence[DeliveryDecision]) -> list[int]:
-    return [verdict.due_ns for verdict in verdicts]
+def dues(decisions: Sequence[DeliveryDecision]) -> list[int]:
+    return [decision.due_ns for decision in decisions]
 
 
-def reached(verdicts: Sequence[DeliveryDecision]) -> set[str]:
+def reached(decisions: Sequence[DeliveryDecision]) -> set[str]:
     """Links over which something passed, as source>target."""
-    return {f"{v.source}>{v.target}" for v in verdicts if v.due_ns != DROPPED}
+    return {f"{v.source}>{v.target}" for v in decisions if v.due_ns != DROPPED}
 
 
 ALL = {f"{one}>{other}" for one, other in itertools.permutations(("r1", "r2", "r3"), 2)}
@@ -140,8 +140,8 @@ def test_named_robots_have_their_links_struck_both_ways() -> None:
     air = Air(Drop(probability=1.0, robots=("r2",)))
 
     assert reached(air.say(*chatter(1))) == {"r1>r3", "r3>r1"}
-    assert air.tolls == {0: {"dropped": 4}}
-    assert air.tolls == {}
+    assert air.fault_stats == {0: {"dropped": 4}}
+    assert air.fault_stats == {}
 
 
 # Loss.
@@ -149,18 +149,18 @@ def test_named_robots_have_their_links_struck_both_ways() -> None:
 
 @pytest.mark.parametrize("probability", [0.05, 0.5, 0.95])
 def test_copies_drop_at_their_rate(probability: float) -> None:
-    verdicts = Air(Drop(probability=probability)).say(*chatter(500))
+    decisions = Air(Drop(probability=probability)).say(*chatter(500))
 
-    assert within_luck(dues(verdicts).count(DROPPED), 3000, probability)
+    assert within_luck(dues(decisions).count(DROPPED), 3000, probability)
 
 
 def test_faults_have_luck_of_their_own() -> None:
     """Two of the same kind, and the radio beside them, lose more than one."""
-    verdicts = Air(*2 * [Drop(probability=0.5)], scenario=mission("radio.drop=0.5")).say(
+    decisions = Air(*2 * [Drop(probability=0.5)], scenario=mission("radio.drop=0.5")).say(
         *chatter(500)
     )
 
-    assert within_luck(dues(verdicts).count(DROPPED), 3000, 7 / 8)
+    assert within_luck(dues(decisions).count(DROPPED), 3000, 7 / 8)
 
 
 @examples(40)
@@ -212,32 +212,32 @@ def test_delays_add_up() -> None:
     air = Air(Delay(delay_s=0.5), Delay(delay_s=0.25), scenario=mission("radio.delay_s=0.125"))
 
     assert dues(air.say(said("r1", 1, S))) == 2 * [S + 875 * MS]
-    assert air.tolls == {0: {"delayed": 2}, 1: {"delayed": 2}}
+    assert air.fault_stats == {0: {"delayed": 2}, 1: {"delayed": 2}}
 
 
 def test_jitter_is_within_its_bounds_and_spreads() -> None:
-    verdicts = Air(Delay(delay_s=0.5, jitter_s=0.2)).say(*[said("r1", i) for i in range(1, 400)])
+    decisions = Air(Delay(delay_s=0.5, jitter_s=0.2)).say(*[said("r1", i) for i in range(1, 400)])
 
-    assert all(500 * MS <= due < 700 * MS for due in dues(verdicts))
-    assert max(dues(verdicts)) - min(dues(verdicts)) > 190 * MS
-    assert len(set(dues(verdicts))) > 700
+    assert all(500 * MS <= due < 700 * MS for due in dues(decisions))
+    assert max(dues(decisions)) - min(dues(decisions)) > 190 * MS
+    assert len(set(dues(decisions))) > 700
 
 
 def test_some_are_held_back_so_that_others_overtake() -> None:
     air = Air(Reorder(probability=0.25, hold_s=1.0))
-    verdicts = air.say(*[said("r1", i, i * MS, "r2") for i in range(1, 1001)])
-    held = [v.due_ns - v.sequence * MS for v in verdicts if v.due_ns > v.sequence * MS]
+    decisions = air.say(*[said("r1", i, i * MS, "r2") for i in range(1, 1001)])
+    held = [v.due_ns - v.sequence * MS for v in decisions if v.due_ns > v.sequence * MS]
 
     assert within_luck(len(held), 1000, 0.25)
     assert 0 < min(held) < 100 * MS < 900 * MS < max(held) < S
-    assert dues(verdicts) != sorted(dues(verdicts))
+    assert dues(decisions) != sorted(dues(decisions))
 
 
 def test_a_clog_bursts_in_order_when_it_ends() -> None:
     air = Air(Clog(from_s=1.0, until_s=2.0), Delay(delay_s=0.3, jitter_s=0.2))
     air.say(*[said(name, i, i * 100 * MS) for i in range(1, 25) for name in ("r1", "r2")])
-    before = air.channel.take("r3", 2 * S - 1)
-    burst = air.channel.take("r3", 2 * S)
+    before = air.channel.collect("r3", 2 * S - 1)
+    burst = air.channel.collect("r3", 2 * S)
 
     assert {envelope.sequence for envelope in before} == set(range(1, 10))
     held = [(e.source, e.sequence) for e in burst if 10 <= e.sequence < 15]
@@ -263,9 +263,9 @@ def test_bandwidth_lets_the_excess_wait() -> None:
 )
 def test_a_full_queue_drops(queue_bytes: int | None, arriving: int) -> None:
     air = Air(Bandwidth(bytes_per_s=1000.0, queue_bytes=queue_bytes))
-    verdicts = air.say(*[said("r1", i, 0, "r2", size=500) for i in (1, 2, 3, 4)])
+    decisions = air.say(*[said("r1", i, 0, "r2", size=500) for i in (1, 2, 3, 4)])
 
-    assert dues(verdicts) == [500 * i * MS if i <= arriving else DROPPED for i in range(1, 5)]
+    assert dues(decisions) == [500 * i * MS if i <= arriving else DROPPED for i in range(1, 5)]
 
 
 def test_bandwidth_is_the_named_senders() -> None:
@@ -277,9 +277,9 @@ def test_bandwidth_is_the_named_senders() -> None:
 def test_what_never_arrives_can_be_recorded() -> None:
     """A queue of centuries: the time of arrival stays a number that records hold."""
     air = Air(Bandwidth(bytes_per_s=1e-3), *20 * [Delay(delay_s=1e6)])
-    verdicts = [air.say(said("r1", i, size=10**6))[0] for i in range(1, 30)]
+    decisions = [air.say(said("r1", i, size=10**6))[0] for i in range(1, 30)]
 
-    assert all(0 < due < 2**63 for due in dues(verdicts))
+    assert all(0 < due < 2**63 for due in dues(decisions))
 
 
 # Copies.
@@ -287,12 +287,12 @@ def test_what_never_arrives_can_be_recorded() -> None:
 
 def test_copies_are_doubled_and_lost_each_by_itself() -> None:
     air = Air(Duplicate(probability=1.0, copies=3, delay_s=0.5), Drop(probability=0.5))
-    verdicts = air.say(*chatter(100))
+    decisions = air.say(*chatter(100))
 
-    assert len(verdicts) == 4 * 600
-    assert within_luck(dues(verdicts).count(DROPPED), 2400, 0.5)
-    assert air.tolls[0] == {"doubled": 1800}
-    late = [v.due_ns - v.sequence * 100 * MS for v in verdicts if v.due_ns != DROPPED]
+    assert len(decisions) == 4 * 600
+    assert within_luck(dues(decisions).count(DROPPED), 2400, 0.5)
+    assert air.fault_stats[0] == {"doubled": 1800}
+    late = [v.due_ns - v.sequence * 100 * MS for v in decisions if v.due_ns != DROPPED]
     assert min(late) == 0
     assert 0 < max(late) < 500 * MS
     assert len(set(late)) > 700
@@ -300,25 +300,25 @@ def test_copies_are_doubled_and_lost_each_by_itself() -> None:
 
 @pytest.mark.parametrize("probability", [0.1, 0.9])
 def test_doubling_comes_at_its_rate(probability: float) -> None:
-    verdicts = Air(Duplicate(probability=probability)).say(*chatter(200))
+    decisions = Air(Duplicate(probability=probability)).say(*chatter(200))
 
-    assert within_luck(len(verdicts) - 1200, 1200, probability)
+    assert within_luck(len(decisions) - 1200, 1200, probability)
 
 
 def test_what_the_radio_has_lost_is_not_doubled() -> None:
     faults = (Duplicate(probability=1.0), Replay(probability=1.0, age_s=9.0))
-    verdicts = Air(*faults, scenario=mission("radio.drop=0.5")).say(*chatter(100))
+    decisions = Air(*faults, scenario=mission("radio.drop=0.5")).say(*chatter(100))
     fates: dict[tuple[str, int, str], list[int]] = {}
-    for verdict in Air(faults[0], scenario=mission("radio.drop=0.5")).say(*chatter(100)):
-        fates.setdefault((verdict.source, verdict.sequence, verdict.target), []).append(
-            verdict.due_ns
+    for decision in Air(faults[0], scenario=mission("radio.drop=0.5")).say(*chatter(100)):
+        fates.setdefault((decision.source, decision.sequence, decision.target), []).append(
+            decision.due_ns
         )
 
     assert {tuple(due == DROPPED for due in each) for each in fates.values()} == {
         (True,),
         (False, False),
     }
-    assert len(verdicts) > sum(map(len, fates.values()))
+    assert len(decisions) > sum(map(len, fates.values()))
 
 
 def test_an_older_message_of_the_same_sender_comes_again() -> None:
@@ -327,9 +327,9 @@ def test_an_older_message_of_the_same_sender_comes_again() -> None:
     replays = []
     for i in range(1, 101):
         now_ns = i * 100 * MS
-        verdicts = air.say(said("r1", i, now_ns), said("r2", 1000 + i, now_ns, "r3"))
-        replays += [(i, v) for v in verdicts if v.sequence % 1000 != i]
-        assert {v.due_ns for v in verdicts} == {now_ns}
+        decisions = air.say(said("r1", i, now_ns), said("r2", 1000 + i, now_ns, "r3"))
+        replays += [(i, v) for v in decisions if v.sequence % 1000 != i]
+        assert {v.due_ns for v in decisions} == {now_ns}
 
     ages = Counter(i - v.sequence % 1000 for i, v in replays)
     assert len(replays) > 280
@@ -386,9 +386,9 @@ def test_a_cut_holds_at_the_time_of_sending() -> None:
     air = Air(
         Partition(shape="halves", from_s=1.0, until_s=2.0), scenario=mission("radio.delay_s=0.5")
     )
-    verdicts = air.say(*[said("r1", i, i * 100 * MS, "r3") for i in range(1, 31)])
+    decisions = air.say(*[said("r1", i, i * 100 * MS, "r3") for i in range(1, 31)])
 
-    assert [v.sequence for v in verdicts if v.due_ns == DROPPED] == list(range(10, 20))
+    assert [v.sequence for v in decisions if v.due_ns == DROPPED] == list(range(10, 20))
 
 
 def test_a_cut_comes_and_goes() -> None:
@@ -424,10 +424,10 @@ PLACES = {"r2": (30.0, 0.0), "r3": (60.0, 0.0)}
 def test_range_shrinks_for_those_concerned(faults: tuple[Range, ...], links: set[str]) -> None:
     """The least range counts, its bound included; who is beyond is counted as out of range."""
     air = Air(*faults, scenario=mission("radio.range_m=60"), at=PLACES)
-    verdicts, out_of_range = air.channel.transmit(chatter(1)[:3])
+    decisions, out_of_range = air.channel.transmit(chatter(1)[:3])
 
     now_ns = 100 * MS
-    assert reached(verdicts) == links
+    assert reached(decisions) == links
     assert len(links) + out_of_range == 6
     for link in ALL:
         one, other = link.split(">")
@@ -601,10 +601,10 @@ def test_one_fault_more_saves_nobody(
         assert isinstance(fault, Replay | Duplicate) or after[key] >= before[key]
 
 
-def _arrivals(verdicts: Sequence[DeliveryDecision]) -> dict[tuple[str, int, str], int]:
+def _arrivals(decisions: Sequence[DeliveryDecision]) -> dict[tuple[str, int, str], int]:
     """When the first copy of each message that was sent arrives at each receiver."""
     arrivals: dict[tuple[str, int, str], int] = {}
-    for source, sequence, target, due_ns in map(msgspec.structs.astuple, verdicts):
+    for source, sequence, target, due_ns in map(msgspec.structs.astuple, decisions):
         if due_ns != DROPPED and sequence < FIRST_SEQUENCE:
             key = source, sequence, target
             arrivals[key] = min(due_ns, arrivals.get(key, due_ns))
@@ -639,9 +639,9 @@ def test_compiled_rules_are_the_plain_ones(
         sent = [said(name, i, now_ns, size=20) for name in scenario.roster]
         sent += [said("r1", 100 + i, now_ns, "r2", size=5)]
         assert air.channel.transmit(sent) == reference.transmit(sent)
-        assert air.tolls == plain.take_tolls()
+        assert air.fault_stats == plain.pop_stats()
         for name in scenario.roster:
-            assert air.channel.take(name, now_ns) == reference.take(name, now_ns)
+            assert air.channel.collect(name, now_ns) == reference.collect(name, now_ns)
         for one, other in itertools.permutations(scenario.roster, 2):
             assert air.faults.cuts(now_ns, one, other) == plain.cuts(now_ns, one, other)
             assert air.faults.reach_m(now_ns, one, other) == plain.reach_m(now_ns, one, other)
@@ -671,13 +671,13 @@ def test_tolls_are_the_verdicts() -> None:
     """Every copy that faults drop is counted, for each fault that drops it."""
     faults = (Partition(shape="halves"), Drop(probability=0.5), Delay(delay_s=1.0))
     air = Air(*faults)
-    verdicts = air.say(*chatter(50))
-    passed = [v.due_ns for v in verdicts if v.due_ns != DROPPED]
-    tolls = air.tolls
+    decisions = air.say(*chatter(50))
+    passed = [v.due_ns for v in decisions if v.due_ns != DROPPED]
+    fault_stats = air.fault_stats
 
-    assert tolls[0] == {"dropped": 200}
-    assert tolls[1]["dropped"] > 100 - len(passed)
-    assert tolls[2] == {"delayed": len(passed)}
+    assert fault_stats[0] == {"dropped": 200}
+    assert fault_stats[1]["dropped"] > 100 - len(passed)
+    assert fault_stats[2] == {"delayed": len(passed)}
 
 
 # Missions.
@@ -722,8 +722,8 @@ def result_of(records: Sequence[Record]) -> Result:
     metrics = metrics_of(first.scenario)
     journal = Journal()
     for record in records:
-        metrics.take(record)
-        journal.take(record)
+        metrics.observe(record)
+        journal.append(record)
     return metrics.result(
         exchange="in-process",
         digest=journal.digest.hex,
@@ -853,7 +853,7 @@ def test_a_fault_that_comes_after_the_end_changes_nothing(played: Play, name: st
 def test_batches_tell_what_struck(played: Play) -> None:
     """In the window, and not outside."""
     records = played(under(SCHEDULE["halves"]))
-    told = [r.now_ns for r in records if isinstance(r, Batch) and r.tolls]
+    told = [r.now_ns for r in records if isinstance(r, Batch) and r.fault_stats]
 
     assert (min(told), max(told)) == (500 * MS, 1900 * MS)
 

@@ -61,9 +61,9 @@ class Air:
 
     def say(self, *sent: Sent) -> tuple[list[DeliveryDecision], list[DeliveryDecision]]:
         """What becomes of envelopes, and of what comes beside them."""
-        verdicts = self.channel.transmit(sent)[0]
-        beside = [v for v in verdicts if v.sequence >= FIRST_SEQUENCE]
-        return [v for v in verdicts if v.sequence < FIRST_SEQUENCE], beside
+        decisions = self.channel.transmit(sent)[0]
+        beside = [v for v in decisions if v.sequence >= FIRST_SEQUENCE]
+        return [v for v in decisions if v.sequence < FIRST_SEQUENCE], beside
 
 
 def chatter(count: int) -> list[Sent]:
@@ -88,26 +88,26 @@ def test_what_is_sent_is_ruled_as_if_there_were_none() -> None:
 def test_forgeries_come_at_their_rate(probability: float) -> None:
     air = Air(Hostile(probability=probability))
     beside = air.say(*chatter(300))[1]
-    (toll,) = air.faults.take_tolls()
+    (stats,) = air.faults.pop_stats()
 
     assert abs(len(beside) - 1800 * probability) < 5 * (1800 * 0.09) ** 0.5
-    assert toll.forged == len(beside)
+    assert stats.forged == len(beside)
 
 
 def test_a_forgery_arrives_with_what_it_comes_beside_and_has_a_number_of_its_own() -> None:
     """It is for that receiver, in the sender's name or a stranger's, and it is on record."""
     air = Air(Hostile(probability=1.0))
-    verdicts, beside = air.say(*chatter(100))
-    forgeries = air.faults.take_forged()
+    decisions, beside = air.say(*chatter(100))
+    forgeries = air.faults.pop_forged()
 
     assert [v.sequence for v in beside] == list(range(FIRST_SEQUENCE, FIRST_SEQUENCE + 600))
     assert [(v.source, v.sequence, v.target) for v in beside] == [
         (e.source, e.sequence, e.target) for e in forgeries
     ]
-    for own, other in zip(verdicts, beside, strict=True):
+    for own, other in zip(decisions, beside, strict=True):
         assert (own.target, own.due_ns) == (other.target, other.due_ns)
         assert other.source == own.source or other.source in strangers(NAMES)
-    assert air.faults.take_forged() == ()
+    assert air.faults.pop_forged() == ()
     assert air.say(*chatter(1))[1][0].sequence == FIRST_SEQUENCE + 600
 
 
@@ -136,7 +136,7 @@ def test_forgeries_depend_on_the_message_alone(data: st.DataObject) -> None:
         made.append([])
         for portion in portions:
             air.say(*portion)
-        for envelope in air.faults.take_forged():
+        for envelope in air.faults.pop_forged():
             made[-1].append((envelope.source, envelope.target, envelope.body))
 
     assert made[1] == made[2]
@@ -234,16 +234,22 @@ def _clean(record: Record) -> Record:
         return replace(record, scenario=replace(record.scenario, faults=()))
     if not isinstance(record, Batch):
         return record
-    acts = [
+    step_records = [
         replace(
-            act,
-            heard=tuple(each for each in act.heard if each[1] < FIRST_SEQUENCE),
-            outputs=act.outputs and replace(act.outputs, refused=0),
+            step_record,
+            heard=tuple(each for each in step_record.heard if each[1] < FIRST_SEQUENCE),
+            outputs=step_record.outputs and replace(step_record.outputs, refused=0),
         )
-        for act in record.acts
+        for step_record in record.step_records
     ]
-    verdicts = [v for v in record.verdicts if v.sequence < FIRST_SEQUENCE]
-    return replace(record, acts=tuple(acts), verdicts=tuple(verdicts), tolls=(), injected=())
+    decisions = [v for v in record.decisions if v.sequence < FIRST_SEQUENCE]
+    return replace(
+        record,
+        step_records=tuple(step_records),
+        decisions=tuple(decisions),
+        fault_stats=(),
+        injected=(),
+    )
 
 
 @pytest.mark.parametrize("name", WORLDS)
@@ -271,10 +277,12 @@ def test_nobody_takes_in_anything_of_the_catalogue(
     records = recorded(msgspec.structs.replace(scenario, faults=faults))
     refused: Counter[str] = Counter()
     for record in records:
-        for act in record.acts if isinstance(record, Batch) else ():
-            refused[act.name] += sum(sequence >= FIRST_SEQUENCE for _, sequence in act.heard)
-            assert act.outputs is not None
-            assert act.outputs.refused == refused[act.name]
+        for step_record in record.step_records if isinstance(record, Batch) else ():
+            refused[step_record.name] += sum(
+                sequence >= FIRST_SEQUENCE for _, sequence in step_record.heard
+            )
+            assert step_record.outputs is not None
+            assert step_record.outputs.refused == refused[step_record.name]
 
     assert min(made.values()) >= 3
     assert len(made) == len(FORGERS) + len(strangers(scenario.roster))
@@ -290,8 +298,8 @@ def test_inboxes_with_forgeries_can_be_opened_again() -> None:
         again = decode_record(encode_record(record))
         assert again == record
         if isinstance(again, Batch):
-            for act in again.acts:
-                inputs = mailbag.inputs(act)
+            for step_record in again.step_records:
+                inputs = mailbag.inputs(step_record)
                 heard += sum(envelope.sequence >= FIRST_SEQUENCE for envelope in inputs.inbox)
             mailbag.post(again)
 

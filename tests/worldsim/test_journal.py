@@ -52,10 +52,10 @@ def write(records: tuple[Record, ...], path: Path) -> Journal:
     journal, metrics = Journal(path), DensityMetrics()
     written = 0
     for record in records:
-        journal.take(record)
-        metrics.take(record)
+        journal.append(record)
+        metrics.observe(record)
         for row in metrics.rows[written:]:
-            journal.take_row(row)
+            journal.append_row(row)
         written = len(metrics.rows)
     journal.close()
     return journal
@@ -93,7 +93,7 @@ def run_in(folder: Path, *overrides: str) -> Result:
     scenario = mission(*overrides)
     site = WorldSetup.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process", folder)
-    play(scenario, 1, site, [recording.take])
+    play(scenario, 1, site, [recording.observe])
     return recording.finish()
 
 
@@ -116,7 +116,7 @@ def test_digest_is_the_same_with_and_without_a_file(
     """The digest is of the records: no file, no metrics and no clock enter it."""
     without = Journal()
     for record in records:
-        without.take(record)
+        without.observe(record)
     without.close()
     from_file = Digest()
     written = write(records, folder / "digest.mcap")
@@ -268,15 +268,15 @@ def test_full_disk_cuts_the_record_not_the_mission(
 LIMITED = """
 import resource, sys
 from pathlib import Path
-from kantor_worldsim.journal import read
-from kantor_worldsim.recording import Recording
+from kantor_worldsim.record.journal import read
+from kantor_worldsim.observers.recording import Recording
 
 source, folder, limit = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
 records = [record for _, record in read(source)]
 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 recording = Recording(records[0].scenario, records[0].seed, "in-process", folder)
 for record in records:
-    recording.take(record)
+    recording.observe(record)
 recording.finish()
 """
 
@@ -303,12 +303,12 @@ def test_file_size_limit_cuts_the_record(whole_run: tuple[Path, Result], tmp_pat
 TOLD = """
 import sys
 from pathlib import Path
-from kantor_worldsim.journal import Journal, read
+from kantor_worldsim.record.journal import Journal, read
 
 records = [record for _, record in read(Path(sys.argv[1]))]
 journal = Journal(Path(sys.argv[2]))
 for record in records[:100]:
-    journal.take(record)
+    journal.append(record)
 print("taken", flush=True)
 sys.stdin.read()
 """

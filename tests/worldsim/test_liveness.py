@@ -9,7 +9,7 @@ import pytest
 from kantor_fleet.execution.in_process_team import team
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR
 from kantor_protocol.base.varint import put_uint
-from kantor_protocol.replication.replica import read_have
+from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import decode_gossip, encode_gossip
 from kantor_worldsim.engine.event_loop import simulate
@@ -46,16 +46,16 @@ def rested(*overrides: str, seed: int = 1) -> list[Record]:
     scenario: Scenario = mission(*SIZE, *overrides)
     site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    stage = _Patient(scenario, seed, site, [records.append])
-    simulate(stage, in_process(team(scenario, seed, site)), seed, lambda: False)
+    simulation = _Patient(scenario, seed, site, [records.append])
+    simulate(simulation, in_process(team(scenario, seed, site)), seed, lambda: False)
     return records
 
 
 def judged(records: Sequence[Record]) -> LivenessChecker:
-    referee = LivenessChecker()
+    checker = LivenessChecker()
     for record in records:
-        referee.take(record)
-    return referee
+        checker.observe(record)
+    return checker
 
 
 def rules(records: Sequence[Record]) -> set[str]:
@@ -70,21 +70,26 @@ def test_all_is_known_to_all_in_the_end(
     merge: tuple[str, ...], fault: str, guided: tuple[str, ...], radio: tuple[str, ...]
 ) -> None:
     """Whatever happened before: who can hear one another hold the same when all is quiet."""
-    referee = judged(rested(*merge, fault, *guided, *radio))
+    checker = judged(rested(*merge, fault, *guided, *radio))
 
-    assert referee.complaints == []
-    assert {"L1", "L2"} <= referee.judged
-    assert ("I8" in referee.judged) == ("merge=ledger" in merge)
+    assert checker.complaints == []
+    assert {"L1", "L2"} <= checker.judged
+    assert ("I8" in checker.judged) == ("merge=ledger" in merge)
 
 
 def test_supervisor_that_dies_is_given_up_and_taken_back() -> None:
     """Robots talk to everybody meanwhile, and nobody complains."""
     records = rested(AWAY, GUIDED)
-    referee = judged(records)
-    targets = [e.target for act in acts(records, "r1") if act.outputs for e in act.outputs.outbox]
+    checker = judged(records)
+    targets = [
+        e.target
+        for step_record in step_records(records, "r1")
+        if step_record.outputs
+        for e in step_record.outputs.outbox
+    ]
 
-    assert referee.complaints == []
-    assert "L3" in referee.judged
+    assert checker.complaints == []
+    assert "L3" in checker.judged
     assert {SUPERVISOR, EVERYBODY} == set(targets)
     assert targets[-1] == SUPERVISOR
 
@@ -97,14 +102,22 @@ def test_nothing_is_judged_before_it_can_be_known() -> None:
     assert lasting.judged == {"L2"}
 
 
-def acts(records: Sequence[Record], name: str) -> list[StepRecord]:
-    return [act for r in records if isinstance(r, Batch) for act in r.acts if act.name == name]
+def step_records(records: Sequence[Record], name: str) -> list[StepRecord]:
+    return [
+        step_record
+        for r in records
+        if isinstance(r, Batch)
+        for step_record in r.step_records
+        if step_record.name == name
+    ]
 
 
 def altered(records: Sequence[Record], change: Callable[[StepRecord], StepRecord]) -> list[Record]:
     """The records with every act changed."""
     return [
-        msgspec.structs.replace(r, acts=tuple(map(change, r.acts))) if isinstance(r, Batch) else r
+        msgspec.structs.replace(r, step_records=tuple(map(change, r.step_records)))
+        if isinstance(r, Batch)
+        else r
         for r in records
     ]
 
@@ -112,22 +125,24 @@ def altered(records: Sequence[Record], change: Callable[[StepRecord], StepRecord
 def returning(records: Sequence[Record], name: str, **values: object) -> list[Record]:
     """The records with everything that a participant returned changed."""
 
-    def change(act: StepRecord) -> StepRecord:
-        if act.name != name or act.outputs is None:
-            return act
-        told = msgspec.structs.replace(act.outputs, **values)
-        return msgspec.structs.replace(act, outputs=told)
+    def change(step_record: StepRecord) -> StepRecord:
+        if step_record.name != name or step_record.outputs is None:
+            return step_record
+        told = msgspec.structs.replace(step_record.outputs, **values)
+        return msgspec.structs.replace(step_record, outputs=told)
 
     return altered(records, change)
 
 
-def said(have: Sequence[int], act: StepRecord) -> object:
+def said(version_vector: Sequence[int], step_record: StepRecord) -> object:
     """The last message of an act with other log lengths."""
-    assert act.outputs is not None
-    (envelope,) = act.outputs.outbox
+    assert step_record.outputs is not None
+    (envelope,) = step_record.outputs.outbox
     news = decode_gossip(envelope.body)
-    rest = news.have[len(_uints(read_have(news.have, 3) or [])) :]
-    body = encode_gossip(msgspec.structs.replace(news, have=_uints(have) + rest))
+    rest = news.version_vector[len(_uints(read_version_vector(news.version_vector, 3) or [])) :]
+    body = encode_gossip(
+        msgspec.structs.replace(news, version_vector=_uints(version_vector) + rest)
+    )
     return (msgspec.structs.replace(envelope, body=body),)
 
 
@@ -138,15 +153,18 @@ def _uints(values: Sequence[int]) -> bytes:
     return buffer[:at].tobytes()
 
 
-def have_of(act: StepRecord) -> list[int]:
-    assert act.outputs is not None
-    return read_have(decode_gossip(act.outputs.outbox[0].body).have, 3) or []
+def have_of(step_record: StepRecord) -> list[int]:
+    assert step_record.outputs is not None
+    return (
+        read_version_vector(decode_gossip(step_record.outputs.outbox[0].body).version_vector, 3)
+        or []
+    )
 
 
 def test_who_never_learns_is_named() -> None:
     """L1: a participant that lacks entries, and one whose view is another."""
     records = rested()
-    last = acts(records, "r2")[-1]
+    last = step_records(records, "r2")[-1]
     less = [have_of(last)[0] - 1, *have_of(last)[1:]]
 
     assert rules(returning(records, "r2", outbox=said(less, last))) == {"L1"}
@@ -168,12 +186,12 @@ def test_who_does_not_turn_to_others_is_named(target: str) -> None:
     """L3: one that waits for a dead supervisor, and one that ignores it when it is back."""
     records = rested(AWAY, GUIDED)
 
-    def change(act: StepRecord) -> StepRecord:
-        if act.name != "r1" or act.outputs is None:
-            return act
-        box = tuple(msgspec.structs.replace(e, target=target) for e in act.outputs.outbox)
-        told = msgspec.structs.replace(act.outputs, outbox=box)
-        return msgspec.structs.replace(act, outputs=told)
+    def change(step_record: StepRecord) -> StepRecord:
+        if step_record.name != "r1" or step_record.outputs is None:
+            return step_record
+        box = tuple(msgspec.structs.replace(e, target=target) for e in step_record.outputs.outbox)
+        told = msgspec.structs.replace(step_record.outputs, outbox=box)
+        return msgspec.structs.replace(step_record, outputs=told)
 
     assert rules(altered(records, change)) == {"L3"}
 
@@ -183,9 +201,13 @@ def test_lost_entries_are_named() -> None:
     records = rested()
     told = [*records]
     for name in ("r1", "r2", "r3"):
-        last = acts(records, name)[-1]
-        have = have_of(last)
-        told = returning(told, name, outbox=said([have[0], have[1] - 1, have[2]], last))
+        last = step_records(records, name)[-1]
+        version_vector = have_of(last)
+        told = returning(
+            told,
+            name,
+            outbox=said([version_vector[0], version_vector[1] - 1, version_vector[2]], last),
+        )
 
     assert rules(told) == {"I8"}
 
@@ -193,14 +215,14 @@ def test_lost_entries_are_named() -> None:
 def test_what_a_fault_has_held_up_is_news_when_it_arrives() -> None:
     """Nobody is judged by what was still under way; once it has arrived long ago, everybody is."""
     records = rested(CUT)
-    sent = next(i for i, r in enumerate(records) if isinstance(r, Batch) and r.verdicts)
+    sent = next(i for i, r in enumerate(records) if isinstance(r, Batch) and r.decisions)
     batch = records[sent]
     assert isinstance(batch, Batch)
     assert "L1" in judged(records).judged
     for before_the_end_ns, rules_judged in ((1, False), (-1, True)):
         due_ns = records[-1].now_ns - before_the_end_ns  # type: ignore[union-attr]
-        late = msgspec.structs.replace(batch.verdicts[0], due_ns=due_ns)
-        held_up = msgspec.structs.replace(batch, verdicts=(late, *batch.verdicts[1:]))
-        referee = judged([*records[:sent], held_up, *records[sent + 1 :]])
+        late = msgspec.structs.replace(batch.decisions[0], due_ns=due_ns)
+        held_up = msgspec.structs.replace(batch, decisions=(late, *batch.decisions[1:]))
+        checker = judged([*records[:sent], held_up, *records[sent + 1 :]])
 
-        assert ("L1" in referee.judged) == rules_judged
+        assert ("L1" in checker.judged) == rules_judged

@@ -45,7 +45,7 @@ PACES = {
 def digest(records: tuple[Record, ...]) -> str:
     journal = Journal()
     for record in records:
-        journal.take(record)
+        journal.append(record)
     return journal.digest.hex
 
 
@@ -58,14 +58,14 @@ def run(
     *,
     exchange: Callable[[Exchange], Exchange] = lambda plain: plain,
     stopped: Callable[[], bool] = lambda: False,
-    prepare: Callable[[Simulation], None] = lambda stage: None,
+    prepare: Callable[[Simulation], None] = lambda simulation: None,
 ) -> list[Record]:
     """The records of a mission whose exchange, stop or stage is meddled with."""
     site = WorldSetup.of(scenario, 1)
     records: list[Record] = []
-    stage = Simulation(scenario, 1, site, [records.append])
-    prepare(stage)
-    simulate(stage, exchange(in_process(team(scenario, 1, site))), 1, stopped)
+    simulation = Simulation(scenario, 1, site, [records.append])
+    prepare(simulation)
+    simulate(simulation, exchange(in_process(team(scenario, 1, site))), 1, stopped)
     return records
 
 
@@ -86,19 +86,20 @@ def test_same_seed_gives_the_same_record() -> None:
 
 DIGESTS = """
 import sys
-from kantor_fleet.team import play, team
-from kantor_protocol.scenario import parse
-from kantor_worldsim.loop import in_process, simulate
-from kantor_worldsim.recording import Recording
-from kantor_worldsim.stage import Stage
-from kantor_worldsim.world import Site
+from kantor_fleet.execution.in_process_team import play, team
+from kantor_protocol.scenario.load import parse
+from kantor_worldsim.engine.event_loop import simulate
+from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.world.world import WorldSetup
 
 text, *overrides = sys.argv[1:]
 for coordination in ("centralized", "decentralized"):
     scenario = parse(text, "-", [f"coordination={coordination}", *overrides])
-    site = Site.of(scenario, 1)
+    site = WorldSetup.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process")
-    play(scenario, 1, site, [recording.take])
+    play(scenario, 1, site, [recording.observe])
     print(recording.finish().digest)
 """
 
@@ -127,19 +128,21 @@ def by_definition(scenario: Scenario, seed: int) -> list[Record]:
     """What simulate stands for: one moment after the other, without looking ahead."""
     site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    stage = Simulation(scenario, seed, site, [records.append])
+    simulation = Simulation(scenario, seed, site, [records.append])
     machines = team(scenario, seed, site)
     owned = step_clocks(scenario, seed)
     steps = dict.fromkeys(owned, 1)
     while True:
         due = {name: clock.due_ns(steps[name]) for name, clock in owned.items()}
         now_ns = min(due.values())
-        if stage.over or now_ns > scenario.limit_ns:
-            stage.end(stage.over or "limit")
+        if simulation.over or now_ns > scenario.limit_ns:
+            simulation.end(simulation.over or "limit")
             return records
-        given = {name: stage.inputs(name, now_ns) for name in due if due[name] == now_ns}
-        acts = [Step(name, inputs, machines[name].step(inputs)) for name, inputs in given.items()]
-        stage.settle(now_ns, acts)
+        given = {name: simulation.inputs(name, now_ns) for name in due if due[name] == now_ns}
+        step_records = [
+            Step(name, inputs, machines[name].step(inputs)) for name, inputs in given.items()
+        ]
+        simulation.settle(now_ns, step_records)
         for name in given:
             steps[name] += 1
 
@@ -225,17 +228,19 @@ def test_everything_is_heard_once_at_the_first_step_after_it_is_due(
     waiting: dict[str, list[tuple[int, str, int]]] = {}
     for earlier, batch in pairwise([None, *batches(records)]):
         assert batch is not None
-        for act in batch.acts:
-            box = waiting.setdefault(act.name, [])
-            due = [item for item in box if item[0] <= act.now_ns]
-            waiting[act.name] = [item for item in box if item[0] > act.now_ns]
-            assert sorted(act.heard) == sorted((source, number) for _, source, number in due)
+        for step_record in batch.step_records:
+            box = waiting.setdefault(step_record.name, [])
+            due = [item for item in box if item[0] <= step_record.now_ns]
+            waiting[step_record.name] = [item for item in box if item[0] > step_record.now_ns]
+            assert sorted(step_record.heard) == sorted(
+                (source, number) for _, source, number in due
+            )
         assert earlier is None or earlier.now_ns <= batch.now_ns
-        for verdict in batch.verdicts:
-            if verdict.due_ns != DROPPED:
-                assert verdict.due_ns >= batch.now_ns + delay_ms * MS
-                item = (verdict.due_ns, verdict.source, verdict.sequence)
-                waiting.setdefault(verdict.target, []).append(item)
+        for decision in batch.decisions:
+            if decision.due_ns != DROPPED:
+                assert decision.due_ns >= batch.now_ns + delay_ms * MS
+                item = (decision.due_ns, decision.source, decision.sequence)
+                waiting.setdefault(decision.target, []).append(item)
 
 
 # The exchange.
@@ -284,10 +289,18 @@ def test_others_go_on_without_a_missing_robot(merge: tuple[str, ...]) -> None:
     """A missing output is recorded as an absence; the others finish, and no rule is broken."""
     scenario = mission("energy.steps=60", *merge)
     records = run(scenario, exchange=without("r2", 350 * MS))
-    acts = [act for batch in batches(records) for act in batch.acts]
+    step_records = [step_record for batch in batches(records) for step_record in batch.step_records]
     absences = [batch.now_ns for batch in batches(records) if batch.absent]
-    there = [act.now_ns for act in acts if act.name == "r2" and act.outputs is not None]
-    finished = {act.name for act in acts if act.outputs is not None and act.outputs.state}
+    there = [
+        step_record.now_ns
+        for step_record in step_records
+        if step_record.name == "r2" and step_record.outputs is not None
+    ]
+    finished = {
+        step_record.name
+        for step_record in step_records
+        if step_record.outputs is not None and step_record.outputs.state
+    }
 
     assert there == [100 * MS, 200 * MS, 300 * MS]
     assert absences == [batch.now_ns for batch in batches(records)][3:]
@@ -300,8 +313,8 @@ def test_others_go_on_without_a_missing_robot(merge: tuple[str, ...]) -> None:
 def test_robot_that_has_left_is_not_waited_for() -> None:
     """When whoever runs the robots knows that one is gone, the mission ends with the others."""
 
-    def leave(stage: Simulation) -> None:
-        stage.gone = {"r2"}
+    def leave(simulation: Simulation) -> None:
+        simulation.gone = {"r2"}
 
     records = run(mission("energy.steps=60"), exchange=without("r2", 0), prepare=leave)
 
@@ -321,8 +334,17 @@ def test_robot_that_was_late_goes_on() -> None:
         return exchange
 
     records = run(scenario, exchange=napping)
-    acts = [act for batch in batches(records) for act in batch.acts if act.name == "r2"]
-    steps = [(act.now_ns // (100 * MS), act.outputs.step) for act in acts if act.outputs]
+    step_records = [
+        step_record
+        for batch in batches(records)
+        for step_record in batch.step_records
+        if step_record.name == "r2"
+    ]
+    steps = [
+        (step_record.now_ns // (100 * MS), step_record.outputs.step)
+        for step_record in step_records
+        if step_record.outputs
+    ]
 
     assert steps[:4] == [(1, 1), (2, 2), (3, 3), (7, 4)]
     assert check(records).complaints == []

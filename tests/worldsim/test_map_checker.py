@@ -13,7 +13,7 @@ from kantor_protocol.base.grid import FREE, OCCUPIED
 from kantor_protocol.base.machine import Envelope, Pose, State
 from kantor_protocol.base.varint import put_int, put_uint
 from kantor_protocol.replication.occupancy_log import dead_frontier
-from kantor_protocol.replication.replica import read_have
+from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.wire.messages import (
     Array,
     GossipMessage,
@@ -55,15 +55,23 @@ def batches(records: Records) -> list[Batch]:
 
 def acts_of(records: Records, name: str) -> list[StepRecord]:
     """What a robot did, in order."""
-    return [act for batch in batches(records) for act in batch.acts if act.name == name]
+    return [
+        step_record
+        for batch in batches(records)
+        for step_record in batch.step_records
+        if step_record.name == name
+    ]
 
 
 def put(records: Records, old: StepRecord, change: Change) -> list[Record]:
     """The records with one act changed."""
 
     def changed(batch: Batch) -> Batch:
-        acts = tuple(change(act) if act is old else act for act in batch.acts)
-        return msgspec.structs.replace(batch, acts=acts)
+        step_records = tuple(
+            change(step_record) if step_record is old else step_record
+            for step_record in batch.step_records
+        )
+        return msgspec.structs.replace(batch, step_records=step_records)
 
     return [changed(record) if isinstance(record, Batch) else record for record in records]
 
@@ -75,31 +83,31 @@ def opened(records: Records, **values: Any) -> list[Record]:
 
 def goes(x_m: float, y_m: float) -> Change:
     """A change of where the world says a robot is."""
-    return lambda act: msgspec.structs.replace(
-        act, ruling=msgspec.structs.replace(act.ruling, pose=Pose(x_m, y_m))
+    return lambda step_record: msgspec.structs.replace(
+        step_record, verdict=msgspec.structs.replace(step_record.verdict, pose=Pose(x_m, y_m))
     )
 
 
-def hurried(records: Records, act: StepRecord, change: Change) -> list[Record]:
+def hurried(records: Records, step_record: StepRecord, change: Change) -> list[Record]:
     """The records with one act changed, in a world without a speed limit."""
-    return put(opened(records, scenario=on_map("vehicle.speed_m_s=1000")), act, change)
+    return put(opened(records, scenario=on_map("vehicle.speed_m_s=1000")), step_record, change)
 
 
-def news_of(act: StepRecord) -> GossipMessage:
-    assert act.outputs is not None
-    return decode_gossip(act.outputs.outbox[0].body)
+def news_of(step_record: StepRecord) -> GossipMessage:
+    assert step_record.outputs is not None
+    return decode_gossip(step_record.outputs.outbox[0].body)
 
 
 def says(change: Callable[[GossipMessage], GossipMessage]) -> Change:
     """A change of the message that a robot sends."""
 
-    def changed(act: StepRecord) -> StepRecord:
-        assert act.outputs is not None
-        (envelope,) = act.outputs.outbox
+    def changed(step_record: StepRecord) -> StepRecord:
+        assert step_record.outputs is not None
+        (envelope,) = step_record.outputs.outbox
         body = encode_gossip(change(decode_gossip(envelope.body)))
         sent: tuple[Envelope, ...] = (msgspec.structs.replace(envelope, body=body),)
         return msgspec.structs.replace(
-            act, outputs=msgspec.structs.replace(act.outputs, outbox=sent)
+            step_record, outputs=msgspec.structs.replace(step_record.outputs, outbox=sent)
         )
 
     return changed
@@ -123,15 +131,15 @@ def suffix(origin: int, start: int, entries: Sequence[int]) -> bytes:
 
 def having(news: GossipMessage, **lengths: int) -> GossipMessage:
     """The news with other lengths in its version vector; r1, r2: by how much they differ."""
-    have = read_have(news.have, 2)
-    assert have is not None
-    told = [length + lengths.get(f"r{i}", 0) for i, length in enumerate(have, 1)]
-    return msgspec.structs.replace(news, have=uints(*told))
+    version_vector = read_version_vector(news.version_vector, 2)
+    assert version_vector is not None
+    told = [length + lengths.get(f"r{i}", 0) for i, length in enumerate(version_vector, 1)]
+    return msgspec.structs.replace(news, version_vector=uints(*told))
 
 
-def own_log(act: StepRecord, origin: int = 0) -> list[int]:
+def own_log(step_record: StepRecord, origin: int = 0) -> list[int]:
     """What a robot sends of its own log."""
-    rows = read_logs(news_of(act).logs, valued=False)
+    rows = read_logs(news_of(step_record).logs, valued=False)
     assert rows is not None
     return [int(entry) for who, _, entry, _ in rows if who == origin]
 
@@ -160,70 +168,82 @@ def _is_nowhere(records: Records) -> list[Record]:
 
 def _goes_through_wall(records: Records) -> list[Record]:
     """From the lower left room straight into the lower right one, where no door is."""
-    act = next(act for act in acts_of(records, "r1") if act.ruling and act.ruling.pose.x_m < 6.0)
-    last = acts_of(records, "r1").index(act)
-    assert act.ruling is not None
+    step_record = next(
+        step_record
+        for step_record in acts_of(records, "r1")
+        if step_record.verdict and step_record.verdict.pose.x_m < 6.0
+    )
+    last = acts_of(records, "r1").index(step_record)
+    assert step_record.verdict is not None
     short = [record for record in records[: 2 + last] if not isinstance(record, Opening)]
-    return hurried([records[0], *short], act, goes(13.5, act.ruling.pose.y_m - 0.2))
+    return hurried(
+        [records[0], *short], step_record, goes(13.5, step_record.verdict.pose.y_m - 0.2)
+    )
 
 
 def _tells_another_kind(records: Records) -> list[Record]:
-    act = acts_of(records, "r1")[5]
-    log = own_log(act)
-    return put(records, act, says(logging([*log[:-1], log[-1] ^ 1])))
+    step_record = acts_of(records, "r1")[5]
+    log = own_log(step_record)
+    return put(records, step_record, says(logging([*log[:-1], log[-1] ^ 1])))
 
 
 def _leaves_one_out(records: Records) -> list[Record]:
-    act = acts_of(records, "r1")[5]
-    log = own_log(act)
-    return put(records, act, says(logging([*log[:3], *log[4:]])))
+    step_record = acts_of(records, "r1")[5]
+    log = own_log(step_record)
+    return put(records, step_record, says(logging([*log[:3], *log[4:]])))
 
 
 def _tells_too_much(records: Records) -> list[Record]:
-    act = acts_of(records, "r1")[5]
-    return put(records, act, says(logging([*own_log(act), 2 * 17])))
+    step_record = acts_of(records, "r1")[5]
+    return put(records, step_record, says(logging([*own_log(step_record), 2 * 17])))
 
 
 def _calls_far_frontier_none(records: Records) -> list[Record]:
-    act = acts_of(records, "r1")[5]
+    step_record = acts_of(records, "r1")[5]
     far = dead_frontier(ROOMS.frame, ROOMS.frame.cell_of(14.5, 1.5))
-    change = says(lambda news: having(logging([*own_log(act), far])(news), r1=1))
-    return put(records, act, change)
+    change = says(lambda news: having(logging([*own_log(step_record), far])(news), r1=1))
+    return put(records, step_record, change)
 
 
 def _calls_near_frontier_none(records: Records) -> list[Record]:
-    act = acts_of(records, "r1")[-1]
+    step_record = acts_of(records, "r1")[-1]
     near = dead_frontier(ROOMS.frame, ROOMS.frame.cell_of(2.5, 2.5))
-    change = says(lambda news: having(logging([*own_log(act), near])(news), r1=1))
-    return put(records, act, change)
+    change = says(lambda news: having(logging([*own_log(step_record), near])(news), r1=1))
+    return put(records, step_record, change)
 
 
 def _starts_late(records: Records) -> list[Record]:
-    act = acts_of(records, "r1")[5]
-    return put(records, act, says(logging(own_log(act), start=10_000)))
+    step_record = acts_of(records, "r1")[5]
+    return put(records, step_record, says(logging(own_log(step_record), start=10_000)))
 
 
 def _sends_rubbish(records: Records) -> list[Record]:
-    act = acts_of(records, "r1")[5]
-    return put(records, act, says(lambda news: msgspec.structs.replace(news, logs=b"\xff")))
+    step_record = acts_of(records, "r1")[5]
+    return put(records, step_record, says(lambda news: msgspec.structs.replace(news, logs=b"\xff")))
 
 
 def _sends_weights(records: Records) -> list[Record]:
     """A suffix of entries with a value each, as on a density."""
-    act = acts_of(records, "r1")[5]
+    step_record = acts_of(records, "r1")[5]
     valued = uints(0, 0, 1, 1) + uints(4, 1)
-    return put(records, act, says(lambda news: msgspec.structs.replace(news, logs=valued)))
+    return put(records, step_record, says(lambda news: msgspec.structs.replace(news, logs=valued)))
 
 
 def _hides_a_scan(records: Records) -> list[Record]:
     """Its version vector stays behind its scans."""
-    before, act = next(
-        (before, act)
-        for before, act in zip(acts_of(records, "r1"), acts_of(records, "r1")[1:], strict=False)
-        if news_of(before).have[0:2] != news_of(act).have[0:2]
+    before, step_record = next(
+        (before, step_record)
+        for before, step_record in zip(
+            acts_of(records, "r1"), acts_of(records, "r1")[1:], strict=False
+        )
+        if news_of(before).version_vector[0:2] != news_of(step_record).version_vector[0:2]
     )
-    have = news_of(before).have
-    return put(records, act, says(lambda news: msgspec.structs.replace(news, have=have)))
+    version_vector = news_of(before).version_vector
+    return put(
+        records,
+        step_record,
+        says(lambda news: msgspec.structs.replace(news, version_vector=version_vector)),
+    )
 
 
 def _forgets(records: Records) -> list[Record]:
@@ -232,7 +252,12 @@ def _forgets(records: Records) -> list[Record]:
 
 def _sees_what_is_not_there(records: Records) -> list[Record]:
     """The true map has a free cell less than the robots saw, far from all ways."""
-    stood_m = [act.ruling.pose for batch in batches(records) for act in batch.acts if act.ruling]
+    stood_m = [
+        step_record.verdict.pose
+        for batch in batches(records)
+        for step_record in batch.step_records
+        if step_record.verdict
+    ]
     away_m = {
         (x, y): min(math.hypot(pose.x_m - x, pose.y_m - y) for pose in stood_m)
         for x, y in map(ROOMS.frame.centre_of, np.flatnonzero(ROOMS.cells == FREE).tolist())
@@ -258,24 +283,24 @@ def _holds_more_than_there_is(records: Records) -> list[Record]:
 
 
 def _forwards_something_else(records: Records) -> list[Record]:
-    act = acts_of(records, "r1")[-1]
-    return put(records, act, says(logging([2 * 17], origin=1)))
+    step_record = acts_of(records, "r1")[-1]
+    return put(records, step_record, says(logging([2 * 17], origin=1)))
 
 
 def _forwards_too_much(records: Records) -> list[Record]:
-    act = acts_of(records, "r1")[-1]
-    return put(records, act, says(logging([2 * 17], origin=1, start=10_000)))
+    step_record = acts_of(records, "r1")[-1]
+    return put(records, step_record, says(logging([2 * 17], origin=1, start=10_000)))
 
 
 def _gives_up(records: Records) -> list[Record]:
-    act = acts_of(records, "r1")[3]
+    step_record = acts_of(records, "r1")[3]
 
-    def change(act: StepRecord) -> StepRecord:
-        assert act.outputs is not None
-        rests = msgspec.structs.replace(act.outputs, state=State.FINISHED)
-        return msgspec.structs.replace(act, outputs=rests)
+    def change(step_record: StepRecord) -> StepRecord:
+        assert step_record.outputs is not None
+        rests = msgspec.structs.replace(step_record.outputs, state=State.FINISHED)
+        return msgspec.structs.replace(step_record, outputs=rests)
 
-    return put(records, act, change)
+    return put(records, step_record, change)
 
 
 def _minds_walls(*overrides: str) -> Callable[[Records], list[Record]]:
@@ -352,15 +377,19 @@ def test_frontier_may_be_called_none_after_heading_for_it_in_vain() -> None:
     """A robot that has had the same goal for `planner.patience` steps may give it up from afar."""
     slow = (*ALONE, "vehicle.speed_m_s=4")
     records = explored(*slow)
-    acts = acts_of(records, "r1")
-    first = next(i for i, act in enumerate(acts) if act.outputs and act.outputs.goal)
-    act = acts[first + 1]
-    assert act.outputs is not None
-    assert act.outputs.goal is not None
-    assert act.outputs.goal == acts[first].outputs.goal  # type: ignore[union-attr]
-    cell = ROOMS.frame.cell_of(*act.outputs.goal)
-    tells = logging([*own_log(act), dead_frontier(ROOMS.frame, cell)])
-    given_up = put(records, act, says(lambda news: having(tells(news), r1=1)))
+    step_records = acts_of(records, "r1")
+    first = next(
+        i
+        for i, step_record in enumerate(step_records)
+        if step_record.outputs and step_record.outputs.goal
+    )
+    step_record = step_records[first + 1]
+    assert step_record.outputs is not None
+    assert step_record.outputs.goal is not None
+    assert step_record.outputs.goal == step_records[first].outputs.goal  # type: ignore[union-attr]
+    cell = ROOMS.frame.cell_of(*step_record.outputs.goal)
+    tells = logging([*own_log(step_record), dead_frontier(ROOMS.frame, cell)])
+    given_up = put(records, step_record, says(lambda news: having(tells(news), r1=1)))
 
     def accused(records: Records) -> bool:
         return any("calls a frontier none" in line for line in check(records).complaints)
@@ -419,18 +448,18 @@ def test_checker_stands_what_nobody_can_read() -> None:
     for record in records:
         told = record
         if isinstance(record, Batch):
-            acts = tuple(
+            step_records = tuple(
                 says(
                     lambda news: msgspec.structs.replace(
                         news,
-                        have=rng.bytes(int(rng.integers(0, 9))),
+                        version_vector=rng.bytes(int(rng.integers(0, 9))),
                         logs=rng.bytes(int(rng.integers(0, 30))),
                     )
-                )(act)
-                for act in record.acts
+                )(step_record)
+                for step_record in record.step_records
             )
-            told = msgspec.structs.replace(record, acts=acts)
-        checker.take(told)
+            told = msgspec.structs.replace(record, step_records=step_records)
+        checker.observe(told)
 
     assert checker.count > 0
 
@@ -470,7 +499,7 @@ def test_robot_that_goes_on_with_its_old_log_is_named() -> None:
     fault = "{kind='kill', who=['r2'], from_s=0.75, until_s=1.5}"
     records = explored(f"faults=[{fault}]")
     start = next(r for r in records if isinstance(r, ProcessEvent) and r.what == "start")
-    reborn = msgspec.structs.replace(start, epoch=1)
+    reborn = msgspec.structs.replace(start, incarnation=1)
     told = [reborn if record is start else record for record in records]
 
     assert {"map", "epoch"} <= {each.partition(":")[0] for each in check(told).complaints}

@@ -57,7 +57,7 @@ def measured(records: Iterable[Record]) -> DensityMetrics:
     """What records are measured by."""
     metrics = DensityMetrics()
     for record in records:
-        metrics.take(record)
+        metrics.observe(record)
     return metrics
 
 
@@ -94,15 +94,15 @@ class Line:
             np.array(SAMPLES_M), np.zeros((0, 2)), np.array([[0.0, 0.0], [40.0, 0.0]])
         )
         self.metrics = DensityMetrics()
-        self.metrics.take(opening_of(scenario, 1, site, {"r1": (), "r2": ()}))
+        self.metrics.observe(opening_of(scenario, 1, site, {"r1": (), "r2": ()}))
         self.tick = 0
 
-    def play(self, *acts: StepRecord) -> None:
+    def play(self, *step_records: StepRecord) -> None:
         """One period."""
         self.tick += 1
-        self.metrics.take(Batch(self.tick * PERIOD_NS, acts, (), 0))
+        self.metrics.observe(Batch(self.tick * PERIOD_NS, step_records, (), 0))
 
-    def act(
+    def step_record(
         self,
         name: ParticipantId,
         x_m: float,
@@ -122,7 +122,7 @@ class Line:
         )
 
     def rows(self) -> list[DensityRow]:
-        self.metrics.take(Ending(self.tick * PERIOD_NS, "done"))
+        self.metrics.observe(Ending(self.tick * PERIOD_NS, "done"))
         return self.metrics.rows
 
 
@@ -138,8 +138,8 @@ def test_bounds_by_hand_without_a_supervisor() -> None:
     stand on their samples.
     """
     line = Line()
-    line.play(line.act("r1", 5.0, 0, 1), line.act("r2", 35.0, 1, 1))
-    line.play(line.act("r1", 10.0, 0, 0), line.act("r2", 30.0, 1, 0))
+    line.play(line.step_record("r1", 5.0, 0, 1), line.step_record("r2", 35.0, 1, 1))
+    line.play(line.step_record("r1", 10.0, 0, 0), line.step_record("r2", 30.0, 1, 0))
 
     # pending at 1: 1/4 * 5 + 2/4 * 25 for each; of the true rest: 1/4 * 5 for each
     # pending at 2: 2/4 * 20 for each; of the true rest: nothing
@@ -153,8 +153,8 @@ def test_bounds_by_hand_without_a_supervisor() -> None:
 def test_bounds_by_hand_with_a_supervisor() -> None:
     """Eq. 11: every robot counts the common weights, which are the least of all views."""
     line = Line("coordination=centralized")
-    line.play(line.act("r1", 5.0, 0, 1), line.act("r2", 35.0, 1, 1))
-    line.play(line.act("r1", 10.0, 0, 0), line.act("r2", 30.0, 1, 0))
+    line.play(line.step_record("r1", 5.0, 0, 1), line.step_record("r2", 35.0, 1, 1))
+    line.play(line.step_record("r1", 10.0, 0, 0), line.step_record("r2", 30.0, 1, 0))
 
     assert bounds(line.rows()) == [
         (40.0, 10.0, 40.0),
@@ -166,9 +166,9 @@ def test_bounds_by_hand_with_a_supervisor() -> None:
 def test_tight_bound_ends_when_a_sample_is_filled_twice() -> None:
     """From the tick on in which more is shipped to a sample than it takes, there is none."""
     line = Line()
-    line.play(line.act("r1", 10.0, 0, 1), line.act("r2", 30.0, 1, 1))
-    line.play(line.act("r1", 10.0, 0, 0), line.act("r2", 20.0, 0, 1))
-    line.play(line.act("r1", 20.0, 1, 1), line.act("r2", 10.0, 1, 0))
+    line.play(line.step_record("r1", 10.0, 0, 1), line.step_record("r2", 30.0, 1, 1))
+    line.play(line.step_record("r1", 10.0, 0, 0), line.step_record("r2", 20.0, 0, 1))
+    line.play(line.step_record("r1", 20.0, 1, 1), line.step_record("r2", 10.0, 1, 0))
     rows = line.rows()
 
     assert [row.w_ub_tight is None for row in rows] == [False, False, True, True]
@@ -179,8 +179,8 @@ def test_tight_bound_ends_when_a_sample_is_filled_twice() -> None:
 def test_ledger_counts_what_was_really_shipped() -> None:
     """With the ledger the mass left is the truth, whatever the views hold."""
     line = Line("merge=ledger")
-    line.play(line.act("r1", 10.0, 0, 1), line.act("r2", 10.0, 0, 1))
-    line.play(line.act("r1", 10.0, 0, 0), line.act("r2", 30.0, 1, 1))
+    line.play(line.step_record("r1", 10.0, 0, 1), line.step_record("r2", 10.0, 0, 1))
+    line.play(line.step_record("r1", 10.0, 0, 0), line.step_record("r2", 30.0, 1, 1))
     rows = line.rows()
 
     assert [row.mass_left for row in rows] == [1.0, 0.5, 0.25]
@@ -190,9 +190,9 @@ def test_ledger_counts_what_was_really_shipped() -> None:
 def test_mass_left_is_that_of_the_least_view_even_if_views_rise() -> None:
     """A record that is not sound is measured as it stands: the minimum over all views, sample by sample."""
     line = Line()
-    line.play(line.act("r1", 10.0, 0, 0), line.act("r2", 10.0, 0, 1))
-    line.play(line.act("r1", 10.0, 0, 2), line.act("r2", 10.0, 1, 1))
-    line.play(line.act("r2", 10.0, 0, 2))
+    line.play(line.step_record("r1", 10.0, 0, 0), line.step_record("r2", 10.0, 0, 1))
+    line.play(line.step_record("r1", 10.0, 0, 2), line.step_record("r2", 10.0, 1, 1))
+    line.play(line.step_record("r2", 10.0, 0, 2))
 
     assert [row.mass_left for row in line.rows()] == [1.0, 0.5, 0.5, 0.75]
 
@@ -201,7 +201,10 @@ def test_mass_left_is_that_of_the_least_view_even_if_views_rise() -> None:
 def test_refused_spending_counts_for_nothing(violation: str) -> None:
     """What the world did not let happen is neither shipped nor energy."""
     line = Line()
-    line.play(line.act("r1", 0.0, 0, 1, (violation,)), line.act("r2", 40.0, 1, 1, ("speed",)))
+    line.play(
+        line.step_record("r1", 0.0, 0, 1, (violation,)),
+        line.step_record("r2", 40.0, 1, 1, ("speed",)),
+    )
     rows = line.rows()
 
     assert rows[-1].energy_spent == 1
@@ -280,20 +283,20 @@ def test_views_follow_the_robots(coordination: str, merge: tuple[str, ...]) -> N
 
     def compare(record: Record) -> None:
         nonlocal compared
-        for act in record.acts if isinstance(record, Batch) else ():
-            assert act.outputs is not None
-            fallen = pairs.decode(act.outputs.lowered, 60)
+        for step_record in record.step_records if isinstance(record, Batch) else ():
+            assert step_record.outputs is not None
+            fallen = pairs.decode(step_record.outputs.lowered, 60)
             assert fallen is not None
-            views[act.name][fallen[0]] = fallen[1]
-            held = weights_of(machines[act.name])
-            assert views[act.name].tolist() == held.tolist()
-            if act.outputs.weights:
-                assert subscribers[act.name].take(act.outputs.weights)
-                assert published(subscribers[act.name]) == held.tolist()
+            views[step_record.name][fallen[0]] = fallen[1]
+            held = weights_of(machines[step_record.name])
+            assert views[step_record.name].tolist() == held.tolist()
+            if step_record.outputs.weights:
+                assert subscribers[step_record.name].apply(step_record.outputs.weights)
+                assert published(subscribers[step_record.name]) == held.tolist()
             compared += 1
 
-    stage = Simulation(scenario, 1, site, [compare])
-    simulate(stage, in_process(machines), 1, lambda: False)
+    simulation = Simulation(scenario, 1, site, [compare])
+    simulate(simulation, in_process(machines), 1, lambda: False)
 
     assert compared > 80
 
@@ -323,7 +326,7 @@ def full_runs() -> Callable[[str], Result]:
             scenario = find(name)
             site = WorldSetup.of(scenario, 0)
             recording = Recording(scenario, 0, "in-process")
-            play(scenario, 0, site, [recording.take])
+            play(scenario, 0, site, [recording.observe])
             results[name] = recording.finish()
         return results[name]
 
@@ -368,33 +371,48 @@ def test_counts_are_those_of_the_record(played: Play) -> None:
     records = played("radio.range_m=60", "radio.drop=0.4", "sensor.range_m=20")
     result = result_of(measured(records))
     batches = [record for record in records if isinstance(record, Batch)]
-    verdicts = [verdict for batch in batches for verdict in batch.verdicts]
-    acts = [act for batch in batches for act in batch.acts]
+    decisions = [decision for batch in batches for decision in batch.decisions]
+    step_records = [step_record for batch in batches for step_record in batch.step_records]
     opening = records[0]
     assert isinstance(opening, Opening)
     finds = [find for found in opening.first_look.values() for find in found]
-    finds += [find for act in acts if act.ruling for find in act.ruling.found]
-    steps = [act.outputs.step for act in acts if act.outputs and act.heard]
+    finds += [
+        find
+        for step_record in step_records
+        if step_record.verdict
+        for find in step_record.verdict.found
+    ]
+    steps = [
+        step_record.outputs.step
+        for step_record in step_records
+        if step_record.outputs and step_record.heard
+    ]
 
-    assert result.drops == sum(verdict.due_ns == DROPPED for verdict in verdicts)
-    assert result.deliveries + result.drops == len(verdicts)
+    assert result.drops == sum(decision.due_ns == DROPPED for decision in decisions)
+    assert result.deliveries + result.drops == len(decisions)
     assert result.out_of_range_refused == sum(batch.out_of_range for batch in batches)
     assert (result.detected, result.targets) == (len(finds), 40)
     assert result.detection_rate == len(finds) / 40
-    assert result.energy_spent == sum(bool(act.outputs and act.outputs.spent) for act in acts)
+    assert result.energy_spent == sum(
+        bool(step_record.outputs and step_record.outputs.spent) for step_record in step_records
+    )
     assert result.first_contact_tick == steps[0]
-    assert result.finished_tick == max(act.outputs.step for act in acts if act.outputs) > 20
+    assert (
+        result.finished_tick
+        == max(step_record.outputs.step for step_record in step_records if step_record.outputs)
+        > 20
+    )
 
 
 def test_absences_and_refused_messages_are_counted() -> None:
     """Who gave no outputs, and what robots and world-sim turned away."""
     line = Line()
-    line.metrics.take(Batch(PERIOD_NS, (), (), 0, absent=("r1", "r2")))
+    line.metrics.observe(Batch(PERIOD_NS, (), (), 0, absent=("r1", "r2")))
     pose = Pose(0.0, 0.0)
     refusing = Outputs(1, pose, refused=3)
-    act = StepRecord("r1", PERIOD_NS, Observation(0, pose), (), refusing, StepVerdict(pose))
-    line.metrics.take(Batch(2 * PERIOD_NS, (act,), (), 0))
-    line.metrics.take(Batch(3 * PERIOD_NS, (act,), (), 0))
+    step_record = StepRecord("r1", PERIOD_NS, Observation(0, pose), (), refusing, StepVerdict(pose))
+    line.metrics.observe(Batch(2 * PERIOD_NS, (step_record,), (), 0))
+    line.metrics.observe(Batch(3 * PERIOD_NS, (step_record,), (), 0))
     line.rows()
 
     assert result_of(line.metrics).absences == 2
@@ -440,10 +458,10 @@ def test_what_befell_processes_is_counted(played: Play) -> None:
     assert result.rejoin_s.count == 2
     assert result.rejoin_s.max_s == pytest.approx(0.08)  # killed at 0.55 s: at 1.12 s, 1.2 s
     assert result.messages_refused == sum(
-        verdict.sequence >= FORGED_FIRST and verdict.due_ns != DROPPED
+        decision.sequence >= FORGED_FIRST and decision.due_ns != DROPPED
         for record in records
         if isinstance(record, Batch)
-        for verdict in record.verdicts
+        for decision in record.decisions
     ) - _unheard(records)
     assert "1 new incarnation" in summary(result)
 
@@ -451,9 +469,14 @@ def test_what_befell_processes_is_counted(played: Play) -> None:
 def _unheard(records: Sequence[Record]) -> int:
     """What was forged and reached somebody who was dead, or at rest for ever."""
     batches = [record for record in records if isinstance(record, Batch)]
-    heard = sum(n >= FORGED_FIRST for b in batches for act in b.acts for _, n in act.heard)
-    ruled = [v for b in batches for v in b.verdicts if v.due_ns != DROPPED]
-    return sum(verdict.sequence >= FORGED_FIRST for verdict in ruled) - heard
+    heard = sum(
+        n >= FORGED_FIRST
+        for b in batches
+        for step_record in b.step_records
+        for _, n in step_record.heard
+    )
+    ruled = [v for b in batches for v in b.decisions if v.due_ns != DROPPED]
+    return sum(decision.sequence >= FORGED_FIRST for decision in ruled) - heard
 
 
 def test_times_to_rejoin_are_quantiles_that_happened() -> None:
@@ -472,8 +495,8 @@ def test_view_of_a_new_incarnation_is_full_again(played: Play) -> None:
     before = after = 0
     for record in records:
         before = int(metrics._tally.views[1].sum()) if isinstance(record, ProcessEvent) else before
-        metrics.take(record)
-        if isinstance(record, ProcessEvent) and record.epoch:
+        metrics.observe(record)
+        if isinstance(record, ProcessEvent) and record.incarnation:
             after = int(metrics._tally.views[1].sum())
             break
 
@@ -487,12 +510,14 @@ def test_unfinished_team_has_no_finishing_tick() -> None:
     pose = Pose(0.0, 0.0)
     for name, state in (("r1", State.FINISHED), ("r2", State.EXHAUSTED)):
         outputs = Outputs(1, pose, state=state)
-        act = StepRecord(name, PERIOD_NS, Observation(0, pose), (), outputs, StepVerdict(pose))
-        line.metrics.take(Batch(PERIOD_NS, (act,), (), 0))
+        step_record = StepRecord(
+            name, PERIOD_NS, Observation(0, pose), (), outputs, StepVerdict(pose)
+        )
+        line.metrics.observe(Batch(PERIOD_NS, (step_record,), (), 0))
     line.rows()
 
     assert result_of(line.metrics).finished_tick is None
-    assert line.metrics.glance().robots_done == 2
+    assert line.metrics.snapshot().robots_done == 2
 
 
 def test_bytes_are_payload_on_the_bus() -> None:
@@ -502,8 +527,10 @@ def test_bytes_are_payload_on_the_bus() -> None:
     outbox = (Envelope("r1", 1, EVERYBODY, bytes(20)), Envelope("r1", 2, "r2", bytes(10)))
     for name in ("r1", "r2", SUPERVISOR):
         outputs = Outputs(1, pose, weights=bytes(6), outbox=outbox if name != "r2" else ())
-        act = StepRecord(name, PERIOD_NS, Observation(0, pose), (), outputs, StepVerdict(pose))
-        line.metrics.take(Batch(PERIOD_NS, (act,), (), 0))
+        step_record = StepRecord(
+            name, PERIOD_NS, Observation(0, pose), (), outputs, StepVerdict(pose)
+        )
+        line.metrics.observe(Batch(PERIOD_NS, (step_record,), (), 0))
     line.rows()
     wire = result_of(line.metrics).bytes_per_robot_tick
 
@@ -549,19 +576,19 @@ def test_bound_and_mass_never_rise_in_turn(played: Play) -> None:
 
 def test_glance_before_anything_is_empty() -> None:
     """Progress can be asked for at any time."""
-    assert DensityMetrics().glance().energy_spent == 0
+    assert DensityMetrics().snapshot().energy_spent == 0
 
 
 def test_glance_tells_the_rate_of_deliveries() -> None:
     """Deliveries a simulated second, over the last rows."""
     line = Line()
-    verdicts = (DeliveryDecision("r1", 1, "r2", 0), DeliveryDecision("r2", 1, "r1", DROPPED))
+    decisions = (DeliveryDecision("r1", 1, "r2", 0), DeliveryDecision("r2", 1, "r1", DROPPED))
     for tick in range(1, 31):
-        line.metrics.take(Batch(tick * PERIOD_NS, (), verdicts, 0))
-    glance = line.metrics.glance()
+        line.metrics.observe(Batch(tick * PERIOD_NS, (), decisions, 0))
+    snapshot = line.metrics.snapshot()
 
-    assert glance.messages_per_s == pytest.approx(10.0)
-    assert glance.now_ns == 29 * PERIOD_NS
+    assert snapshot.messages_per_s == pytest.approx(10.0)
+    assert snapshot.now_ns == 29 * PERIOD_NS
 
 
 def test_period_of_rows_is_chosen_by_size() -> None:
@@ -585,7 +612,7 @@ def test_metrics_file_has_the_rows(tmp_path: Path) -> None:
     scenario = mission("merge=min", "claims=false", "metrics.every=1")
     site = WorldSetup.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process", tmp_path)
-    play(scenario, 1, site, [recording.take])
+    play(scenario, 1, site, [recording.observe])
     recording.finish()
     head, *lines = (tmp_path / "metrics.csv").read_text(encoding="utf-8").splitlines()
     rows = recording.metrics.rows

@@ -19,7 +19,7 @@ from kantor_worldsim.record.columnar import (
     ColumnarBatch,
     ColumnarDecoder,
     head_of,
-    parts_of_news,
+    parts_of_gossip,
     skip,
 )
 from kantor_worldsim.record.records import (
@@ -53,33 +53,33 @@ def pairs(packed: bytes, samples: int) -> list[list[int]] | None:
 
 def plain(batch: Batch, roster: tuple[str, ...], samples: int) -> list[Any]:
     """What the tables hold, taken from the Structs."""
-    acts: list[Any] = []
-    for act in batch.acts:
-        out, ruling = act.outputs, act.ruling
+    step_records: list[Any] = []
+    for step_record in batch.step_records:
+        out, verdict = step_record.outputs, step_record.verdict
         told: list[Any] = [
-            place(act.name, roster),
-            act.now_ns,
-            [[place(source, roster), sequence] for source, sequence in act.heard],
-            act.observation.step,
-            act.skew_ns,
+            place(step_record.name, roster),
+            step_record.now_ns,
+            [[place(source, roster), sequence] for source, sequence in step_record.heard],
+            step_record.observation.step,
+            step_record.skew_ns,
         ]
-        if out is not None and ruling is not None:
-            refused = {"step", "energy", "units"} & set(ruling.violations)
-            told += [out.step, out.energy_spent, int(out.state), out.refused, len(ruling.found)]
-            fast = [i for i, what in enumerate(ruling.violations, 1) if what == "speed"]
-            told += [len(ruling.violations), bool(refused), max(fast, default=0)]
+        if out is not None and verdict is not None:
+            refused = {"step", "energy", "units"} & set(verdict.violations)
+            told += [out.step, out.energy_spent, int(out.state), out.refused, len(verdict.found)]
+            fast = [i for i, what in enumerate(verdict.violations, 1) if what == "speed"]
+            told += [len(verdict.violations), bool(refused), max(fast, default=0)]
             told += [len(out.weights)]
             told += [sum(len(envelope.body) for envelope in out.outbox)]
-            told += [[ruling.pose.x_m, ruling.pose.y_m]]
+            told += [[verdict.pose.x_m, verdict.pose.y_m]]
             told += [None if out.goal is None else [*out.goal], out.weights]
             told += [pairs(out.spent, samples), pairs(out.lowered, samples)]
             told += [[addressed(e, roster) for e in out.outbox]]
-        acts.append(told)
-    verdicts = [
+        step_records.append(told)
+    decisions = [
         [place(v.source, roster), v.sequence, place(v.target, roster), v.due_ns]
-        for v in batch.verdicts
+        for v in batch.decisions
     ]
-    return [acts, verdicts, [addressed(e, roster) for e in batch.injected]]
+    return [step_records, decisions, [addressed(e, roster) for e in batch.injected]]
 
 
 def addressed(envelope: Envelope, roster: tuple[str, ...]) -> list[Any]:
@@ -88,50 +88,66 @@ def addressed(envelope: Envelope, roster: tuple[str, ...]) -> list[Any]:
     return [place(source, roster), sequence, place(target, roster), body]
 
 
-def tabled(reading: ColumnarBatch) -> list[Any]:
+def tabled(columns: ColumnarBatch) -> list[Any]:
     """The same from the tables."""
 
     def rows(table: np.ndarray, first: int, count: int) -> list[list[int]] | None:
         return None if count == of.NOT_DECODED else table[first : first + count].tolist()
 
     def bodies(sent: list[list[int]] | None) -> list[Any]:
-        return [[*head, reading.payload[at:end]] for *head, at, end in sent or ()]
+        return [[*head, columns.payload[at:end]] for *head, at, end in sent or ()]
 
-    acts: list[Any] = []
-    for row in range(int(reading.sizes[of.ACTS])):
-        act = reading.acts[row].tolist()
-        heard = rows(reading.heard, act[of.HEARD], act[of.HEARD_COUNT])
-        told: list[Any] = [act[of.PLACE], act[of.NOW_NS], heard]
-        told += [act[of.OBSERVED], act[of.SKEW_NS]]
-        if act[of.PRESENT]:
-            told += [act[of.STEP], act[of.ENERGY], act[of.STATE], act[of.REFUSED], act[of.FINDS]]
-            told += [act[of.VIOLATIONS], bool(act[of.VOID]), act[of.TOO_FAST]]
-            told += [act[of.WEIGHTS_BYTES]]
-            *pose_m, goal_x_m, goal_y_m = reading.poses_m[row].tolist()
-            begin, end = act[of.WEIGHTS], act[of.WEIGHTS] + act[of.WEIGHTS_BYTES]
-            told += [act[of.BODY_BYTES], pose_m]
-            told += [[goal_x_m, goal_y_m] if act[of.HEADS] else None, reading.payload[begin:end]]
-            told += [rows(reading.pairs, act[of.SPENT], act[of.SPENT_COUNT])]
-            told += [rows(reading.pairs, act[of.LOWERED], act[of.LOWERED_COUNT])]
-            told += [bodies(rows(reading.sent, act[of.SENT], act[of.SENT_COUNT]))]
-        acts.append(told)
-    verdicts = rows(reading.verdicts, 0, int(reading.sizes[of.VERDICTS]))
-    injected = rows(reading.injected, 0, int(reading.sizes[of.INJECTED]))
-    return [acts, verdicts, bodies(injected)]
+    step_records: list[Any] = []
+    for row in range(int(columns.sizes[of.ACTS])):
+        step_record = columns.step_records[row].tolist()
+        heard = rows(columns.heard, step_record[of.HEARD], step_record[of.HEARD_COUNT])
+        told: list[Any] = [step_record[of.PLACE], step_record[of.NOW_NS], heard]
+        told += [step_record[of.OBSERVED], step_record[of.SKEW_NS]]
+        if step_record[of.PRESENT]:
+            told += [
+                step_record[of.STEP],
+                step_record[of.ENERGY],
+                step_record[of.STATE],
+                step_record[of.REFUSED],
+                step_record[of.FINDS],
+            ]
+            told += [
+                step_record[of.VIOLATIONS],
+                bool(step_record[of.VOID]),
+                step_record[of.TOO_FAST],
+            ]
+            told += [step_record[of.WEIGHTS_BYTES]]
+            *pose_m, goal_x_m, goal_y_m = columns.poses_m[row].tolist()
+            begin, end = (
+                step_record[of.WEIGHTS],
+                step_record[of.WEIGHTS] + step_record[of.WEIGHTS_BYTES],
+            )
+            told += [step_record[of.BODY_BYTES], pose_m]
+            told += [
+                [goal_x_m, goal_y_m] if step_record[of.HEADS] else None,
+                columns.payload[begin:end],
+            ]
+            told += [rows(columns.pairs, step_record[of.SPENT], step_record[of.SPENT_COUNT])]
+            told += [rows(columns.pairs, step_record[of.LOWERED], step_record[of.LOWERED_COUNT])]
+            told += [bodies(rows(columns.sent, step_record[of.SENT], step_record[of.SENT_COUNT]))]
+        step_records.append(told)
+    decisions = rows(columns.decisions, 0, int(columns.sizes[of.VERDICTS]))
+    injected = rows(columns.injected, 0, int(columns.sizes[of.INJECTED]))
+    return [step_records, decisions, bodies(injected)]
 
 
 @pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
 def test_tables_hold_what_the_record_holds(played: Play, coordination: str) -> None:
     """Over a whole mission with loss and copies: every number of every batch, also from given bytes."""
     records = played(*LOSSY, f"coordination={coordination}")
-    opening, reader, given = records[0], ColumnarDecoder(), ColumnarDecoder()
+    opening, decoder, given = records[0], ColumnarDecoder(), ColumnarDecoder()
     assert isinstance(opening, Opening)
-    reader.read(opening)
+    decoder.read(opening)
     given.read(opening)
     for record in records:
         if isinstance(record, Batch):
             told = plain(record, opening.scenario.roster, 60)
-            assert tabled(ColumnarBatch(*reader.read(record))) == told
+            assert tabled(ColumnarBatch(*decoder.read(record))) == told
             payload = encode_record(record)
             assert tabled(ColumnarBatch(*given.read(decode_record(payload), payload))) == told
 
@@ -174,10 +190,10 @@ ODD = Batch(
 
 def test_odd_values_are_read_too(played: Play) -> None:
     """Whatever a record may hold, the tables hold it."""
-    reader = ColumnarDecoder()
-    reader.read(played()[0])
+    decoder = ColumnarDecoder()
+    decoder.read(played()[0])
 
-    assert tabled(ColumnarBatch(*reader.read(ODD))) == plain(ODD, ROSTER, 60)
+    assert tabled(ColumnarBatch(*decoder.read(ODD))) == plain(ODD, ROSTER, 60)
 
 
 def test_tables_grow_with_what_comes(played: Play) -> None:
@@ -186,24 +202,24 @@ def test_tables_grow_with_what_comes(played: Play) -> None:
     entries = Pairs().encode(np.arange(60).repeat(100), np.arange(6000), 6000)
     outputs = Outputs(1, Pose(0.0, 0.0), lowered=entries)
     look = Observation(0, Pose(0.0, 0.0))
-    act = StepRecord(
+    step_record = StepRecord(
         "r1", 1, look, tuple(("r2", i) for i in range(3000)), outputs, StepVerdict(look.pose)
     )
-    batch = Batch(1, (act,), many, 0)
-    reader = ColumnarDecoder()
-    reader.read(played()[0])
+    batch = Batch(1, (step_record,), many, 0)
+    decoder = ColumnarDecoder()
+    decoder.read(played()[0])
 
-    assert tabled(ColumnarBatch(*reader.read(batch))) == plain(batch, ROSTER, 60)
+    assert tabled(ColumnarBatch(*decoder.read(batch))) == plain(batch, ROSTER, 60)
 
 
 def test_record_is_read_once_for_all(played: Play) -> None:
     """Referees that share a reader share its work."""
     records = played()
-    reader = ColumnarDecoder()
-    reader.read(records[0])
+    decoder = ColumnarDecoder()
+    decoder.read(records[0])
 
-    assert reader.read(records[1]) is reader.read(records[1])
-    assert reader.read(records[1])[0] == encode_record(records[1])
+    assert decoder.read(records[1]) is decoder.read(records[1])
+    assert decoder.read(records[1])[0] == encode_record(records[1])
 
 
 # Msgpack, beside the library.
@@ -255,13 +271,19 @@ def readable(body: bytes) -> tuple[int, bytes, bytes] | None:
         news = decode_gossip(body)
     except RefusedError:
         return None
-    return news.epoch, news.have, news.logs
+    return news.incarnation, news.version_vector, news.logs
 
 
 def parts(body: bytes) -> tuple[int, bytes, bytes] | None:
     framed = b"\xc0\xc0" + body + b"\xc0"
-    epoch, have, have_end, logs, logs_end = parts_of_news(framed, 2, 2 + len(body))
-    return None if logs_end < 0 else (epoch, framed[have:have_end], framed[logs:logs_end])
+    incarnation, version_vector, have_end, logs, logs_end = parts_of_gossip(
+        framed, 2, 2 + len(body)
+    )
+    return (
+        None
+        if logs_end < 0
+        else (incarnation, framed[version_vector:have_end], framed[logs:logs_end])
+    )
 
 
 _ALL_FIELDS = GossipMessage(1, 0, 0.0, 0.0, b"", b"", b"\x00", b"\x00")
@@ -282,7 +304,7 @@ def test_news_is_read_as_the_codec_does(news: GossipMessage, at: int, byte: int,
     changed = bytearray(body)
     changed[at % len(body)] = byte
 
-    assert parts(body) == (news.epoch, news.have, news.logs)
+    assert parts(body) == (news.incarnation, news.version_vector, news.logs)
     assert parts(body[: max(0, len(body) - cut - 1)]) is None
     assert parts(bytes(changed)) in (None, readable(bytes(changed)))
 
@@ -319,19 +341,19 @@ def test_odd_news(tree: Any, *, single: bool) -> None:
 
 def test_record_holds_more_fields_some_day(played: Play) -> None:
     """Fields that are added at the end are passed over."""
-    reader = ColumnarDecoder()
-    reader.read(played()[0])
+    decoder = ColumnarDecoder()
+    decoder.read(played()[0])
     tree = msgspec.msgpack.decode(encode_record(ODD))
     tree.append({"new": 1})
-    for act in tree[2]:
-        act[2].append("new")
-        act.append({"new": [1, 2]})
-        for part in (act[4], act[5]):
+    for step_record in tree[2]:
+        step_record[2].append("new")
+        step_record.append({"new": [1, 2]})
+        for part in (step_record[4], step_record[5]):
             if part is not None:
                 part.append(b"new")
-    for verdict in tree[3]:
-        verdict.append(1.0)
-    sizes, *tables = (table.copy() for table in ColumnarBatch(*reader.read(ODD))[1:])
+    for decision in tree[3]:
+        decision.append(1.0)
+    sizes, *tables = (table.copy() for table in ColumnarBatch(*decoder.read(ODD))[1:])
     told = plain(ODD, ROSTER, 60)
     payload = msgspec.msgpack.encode(tree)
     bits = tables[1].view(np.int64)
@@ -344,16 +366,16 @@ def test_record_holds_more_fields_some_day(played: Play) -> None:
 @given(changes=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), max_size=4))
 def test_garbled_batch_stays_within_its_tables(changes: list[tuple[int, int]]) -> None:
     """No bytes lead outside: rows behind the tables stay as they were."""
-    small = msgspec.structs.replace(ODD, acts=(ODD.acts[0], ODD.acts[2]))
+    small = msgspec.structs.replace(ODD, step_records=(ODD.step_records[0], ODD.step_records[2]))
     payload = bytearray(encode_record(small))
     for at, byte in changes:
         payload[at % len(payload)] = byte
     rows = len(payload) // 2 + 1
     around = [np.full((rows + 8, columns), 77, dtype=np.int64) for columns in (25, 2, 5, 4, 2, 5)]
-    acts, heard, sent, verdicts, pairs, injected = (table[:rows] for table in around)
+    step_records, heard, sent, decisions, pairs, injected = (table[:rows] for table in around)
     poses_m = np.zeros((rows, 4))
     sizes, bits = np.zeros(6, dtype=np.int64), poses_m.view(np.int64)
-    tables = (sizes, acts, poses_m, heard, sent, verdicts, pairs, injected, bits)
+    tables = (sizes, step_records, poses_m, heard, sent, decisions, pairs, injected, bits)
     of._read_batch(bytes(payload), *tables, 3, of.STRANGER, 60)
 
     assert all(bool((table[rows:] == 77).all()) for table in around)

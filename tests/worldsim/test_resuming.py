@@ -46,7 +46,7 @@ def cut_short() -> Iterator[Cut]:
         recording = Recording(mission(*ROOMY), 1, "wall", folder, speed=3.0)
         made.append(recording)
         for record in records:
-            recording.take(record)
+            recording.observe(record)
         return recording
 
     yield cut
@@ -88,7 +88,7 @@ def test_a_resumed_recording_ends_as_one_that_was_never_cut(
         past = Past.of(tmp_path / "thrice")
         recording = Recording(past.opening.scenario, 1, "wall", tmp_path / "thrice", past=past)
         for record in records[begin:end]:
-            recording.take(record)
+            recording.observe(record)
         if end < len(records):
             drop(recording)
     thrice = recording.finish()
@@ -107,10 +107,11 @@ def test_a_resumed_recording_ends_as_one_that_was_never_cut(
 KILLED_AGAIN = """
 import os, signal, sys
 from pathlib import Path
-from kantor_worldsim.journal import Journal
-from kantor_worldsim.recording import Past, Recording
+from kantor_worldsim.record.journal import Journal
+from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.record.run_folder import Past
 
-take, taken = Journal.take, 0
+take, taken = Journal.append, 0
 
 def count(self, record, payload=b""):
     global taken
@@ -119,7 +120,7 @@ def count(self, record, payload=b""):
     if taken == int(sys.argv[2]):
         os.kill(os.getpid(), signal.SIGKILL)
 
-Journal.take = count
+Journal.append = count
 past = Past.of(Path(sys.argv[1]))
 Recording(past.opening.scenario, 1, "wall", Path(sys.argv[1]), past=past)
 """

@@ -45,16 +45,16 @@ class Theatre:
             np.zeros((12, 2)), np.array([[3.0, 0.0]]), np.array(list(STARTS.values()))
         )
         self.records: list[Record] = []
-        self.stage = Simulation(scenario, 1, site, [self.records.append])
+        self.simulation = Simulation(scenario, 1, site, [self.records.append])
         self.step = 0
 
-    def play(self, **acts: Outputs | None) -> Batch:
+    def play(self, **step_records: Outputs | None) -> Batch:
         """One period in which these participants act."""
         self.step += 1
         now_ns = self.step * PERIOD_NS
-        given = {name: self.stage.inputs(name, now_ns) for name in acts}
-        steps = [Step(name, given[name], outputs) for name, outputs in acts.items()]
-        self.stage.settle(now_ns, steps)
+        given = {name: self.simulation.inputs(name, now_ns) for name in step_records}
+        steps = [Step(name, given[name], outputs) for name, outputs in step_records.items()]
+        self.simulation.settle(now_ns, steps)
         batch = self.records[-1]
         assert isinstance(batch, Batch)
         return batch
@@ -75,7 +75,7 @@ def outputs(
 
 
 def act_of(batch: Batch, name: ParticipantId) -> StepRecord:
-    return next(act for act in batch.acts if act.name == name)
+    return next(step_record for step_record in batch.step_records if step_record.name == name)
 
 
 def test_record_opens_with_all_that_the_run_starts_from() -> None:
@@ -84,7 +84,7 @@ def test_record_opens_with_all_that_the_run_starts_from() -> None:
     (opening,) = theatre.records
 
     assert isinstance(opening, Opening)
-    assert opening.scenario == theatre.stage.scenario
+    assert opening.scenario == theatre.simulation.scenario
     assert opening.site.starts_m.tolist() == [list(place) for place in STARTS.values()]
     assert opening.first_look == {"r1": ((0, 3.0, 0.0),), "r2": (), "r3": ()}
     assert (opening.units.sample, opening.units.point) == (5, 2)
@@ -99,8 +99,8 @@ def test_everybody_is_heard_from_where_its_step_began() -> None:
         for step in (1, 2)
     )
 
-    assert first.verdicts == ()
-    assert [(v.source, v.target) for v in second.verdicts] == [("r1", "r2"), ("r2", "r1")]
+    assert first.decisions == ()
+    assert [(v.source, v.target) for v in second.decisions] == [("r1", "r2"), ("r2", "r1")]
     assert (first.out_of_range, second.out_of_range) == (6, 4)
 
 
@@ -108,10 +108,10 @@ def test_inbox_is_handed_out_once() -> None:
     """What has been given to a participant is not given to it again."""
     theatre = Theatre()
     theatre.play(r1=outputs(1, (0.0, 0.0), "r2", "r2"))
-    first = theatre.stage.inputs("r2", 2 * PERIOD_NS)
+    first = theatre.simulation.inputs("r2", 2 * PERIOD_NS)
 
     assert [envelope.sequence for envelope in first.inbox] == [10, 11]
-    assert theatre.stage.inputs("r2", 2 * PERIOD_NS).inbox == ()
+    assert theatre.simulation.inputs("r2", 2 * PERIOD_NS).inbox == ()
 
 
 def test_act_is_recorded_with_what_led_to_it() -> None:
@@ -119,16 +119,16 @@ def test_act_is_recorded_with_what_led_to_it() -> None:
     theatre = Theatre()
     first = theatre.play(r1=outputs(1, (0.0, 0.0), EVERYBODY))
     second = theatre.play(r2=outputs(1, (20.0, 0.0), source="r2"))
-    act = act_of(second, "r2")
+    step_record = act_of(second, "r2")
     mailbag = EnvelopeIndex()
     mailbag.post(first)
 
-    assert act.heard == (("r1", 10),)
-    assert (act.now_ns, act.observation.pose) == (2 * PERIOD_NS, Pose(24.0, 0.0))
-    assert act.ruling is not None
-    assert act.ruling.pose == Pose(20.0, 0.0)
-    assert mailbag.inputs(act) == Inputs(
-        2 * PERIOD_NS, act.observation, (Envelope("r1", 10, EVERYBODY, b"hello"),)
+    assert step_record.heard == (("r1", 10),)
+    assert (step_record.now_ns, step_record.observation.pose) == (2 * PERIOD_NS, Pose(24.0, 0.0))
+    assert step_record.verdict is not None
+    assert step_record.verdict.pose == Pose(20.0, 0.0)
+    assert mailbag.inputs(step_record) == Inputs(
+        2 * PERIOD_NS, step_record.observation, (Envelope("r1", 10, EVERYBODY, b"hello"),)
     )
 
 
@@ -170,24 +170,24 @@ def test_unsound_outputs_are_as_if_missing(name: str) -> None:
     absent, present = act_of(batch, "r1"), act_of(batch, "r2")
 
     assert batch.absent == ("r1",)
-    assert (absent.outputs, absent.ruling) == (None, None)
+    assert (absent.outputs, absent.verdict) == (None, None)
     assert present.outputs is not None
-    assert [(v.source, v.target) for v in batch.verdicts] == [("r2", "r1")]
-    assert theatre.stage.inputs("r1", 2 * PERIOD_NS).observation.pose == Pose(0.0, 0.0)
-    assert not theatre.stage.acted("r1")
-    assert theatre.stage.acted("r2")
+    assert [(v.source, v.target) for v in batch.decisions] == [("r2", "r1")]
+    assert theatre.simulation.inputs("r1", 2 * PERIOD_NS).observation.pose == Pose(0.0, 0.0)
+    assert not theatre.simulation.acted("r1")
+    assert theatre.simulation.acted("r2")
 
 
 def test_turn_is_asked_again_until_it_is_answered() -> None:
     """The same inputs, whatever came since; the inbox is on record with the answer."""
     theatre = Theatre()
     theatre.play(r2=outputs(1, (20.0, 0.0), "r1", source="r2"))
-    turn = theatre.stage.turn("r1", 2 * PERIOD_NS, skew_ns=7)
-    theatre.stage.settle(2 * PERIOD_NS, [turn])
+    turn = theatre.simulation.turn("r1", 2 * PERIOD_NS, skew_ns=7)
+    theatre.simulation.settle(2 * PERIOD_NS, [turn])
     silent = theatre.records[-1]
     theatre.play(r2=outputs(2, (20.0, 0.0), "r1", source="r2"))
-    again = theatre.stage.turn("r1", 4 * PERIOD_NS)
-    theatre.stage.settle(4 * PERIOD_NS, [again.answered(outputs(1, (1.0, 0.0)))])
+    again = theatre.simulation.turn("r1", 4 * PERIOD_NS)
+    theatre.simulation.settle(4 * PERIOD_NS, [again.answered(outputs(1, (1.0, 0.0)))])
     answered = theatre.records[-1]
     assert isinstance(silent, Batch)
     assert isinstance(answered, Batch)
@@ -197,7 +197,7 @@ def test_turn_is_asked_again_until_it_is_answered() -> None:
     assert [act_of(batch, "r1").heard for batch in (silent, answered)] == [(), (("r2", 10),)]
     assert act_of(answered, "r1").now_ns == act_of(silent, "r1").now_ns == 2 * PERIOD_NS
     assert turn.inputs.now_ns == 2 * PERIOD_NS + 7
-    assert theatre.stage.unanswered("r1") is None
+    assert theatre.simulation.unanswered("r1") is None
 
 
 # The end.
@@ -211,10 +211,10 @@ def test_mission_is_done_when_everybody_rests() -> None:
         r2=outputs(1, (24.0, 0.0), state=State.EXHAUSTED, source="r2"),
         r3=outputs(1, (90.0, 0.0), source="r3"),
     )
-    before = theatre.stage.over
+    before = theatre.simulation.over
     theatre.play(r3=outputs(2, (90.0, 0.0), state=State.FINISHED, source="r3"))
 
-    assert (before, theatre.stage.over) == (None, "done")
+    assert (before, theatre.simulation.over) == (None, "done")
 
 
 @pytest.mark.parametrize(
@@ -234,12 +234,14 @@ def test_those_who_left_are_not_waited_for(
 ) -> None:
     """Done when all who are left rest; deserted when nobody is left and somebody had work."""
     theatre = Theatre()
-    acts = {name: outputs(1, STARTS[name], state=State.FINISHED, source=name) for name in resting}
-    if acts:
-        theatre.play(**acts)
-    theatre.stage.gone = set(gone)
+    step_records = {
+        name: outputs(1, STARTS[name], state=State.FINISHED, source=name) for name in resting
+    }
+    if step_records:
+        theatre.play(**step_records)
+    theatre.simulation.gone = set(gone)
 
-    assert theatre.stage.over == over
+    assert theatre.simulation.over == over
 
 
 def test_supervisor_is_not_waited_for() -> None:
@@ -248,14 +250,14 @@ def test_supervisor_is_not_waited_for() -> None:
     for name, place in STARTS.items():
         theatre.play(**{name: outputs(1, place, state=State.FINISHED, source=name)})
 
-    assert theatre.stage.over == "done"
+    assert theatre.simulation.over == "done"
 
 
 def test_record_is_closed_with_the_reason() -> None:
     """The ending says when and why."""
     theatre = Theatre()
     theatre.play(r1=outputs(1, (0.0, 0.0)))
-    theatre.stage.end("interrupted")
+    theatre.simulation.end("interrupted")
 
     assert theatre.records[-1] == Ending(PERIOD_NS, "interrupted")
 
@@ -264,10 +266,12 @@ def test_time_of_the_stage_never_runs_back() -> None:
     """A step that is told late does not turn the clock of the mission back."""
     theatre = Theatre()
     theatre.play(r1=outputs(1, (0.0, 0.0)))
-    late = theatre.stage.inputs("r2", PERIOD_NS // 2)
-    theatre.stage.settle(PERIOD_NS // 2, [Step("r2", late, outputs(1, (24.0, 0.0), source="r2"))])
+    late = theatre.simulation.inputs("r2", PERIOD_NS // 2)
+    theatre.simulation.settle(
+        PERIOD_NS // 2, [Step("r2", late, outputs(1, (24.0, 0.0), source="r2"))]
+    )
 
-    assert theatre.stage.now_ns == PERIOD_NS
+    assert theatre.simulation.now_ns == PERIOD_NS
 
 
 # On a map.
@@ -319,9 +323,14 @@ def test_mission_on_a_map_is_the_same_from_its_opening(overrides: tuple[str, ...
 def test_robots_on_a_map_explore_it() -> None:
     """They see its walls and no others, hit none, and are done."""
     records = explored(FLAT)
-    rulings = [act.ruling for record in records if isinstance(record, Batch) for act in record.acts]
+    verdicts = [
+        step_record.verdict
+        for record in records
+        if isinstance(record, Batch)
+        for step_record in record.step_records
+    ]
     ending = records[-1]
 
     assert isinstance(ending, Ending)
     assert ending.reason == "done"
-    assert not any(ruling.violations or ruling.bumped for ruling in rulings if ruling)
+    assert not any(verdict.violations or verdict.bumped for verdict in verdicts if verdict)

@@ -18,7 +18,7 @@ from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN
 from kantor_protocol.base.machine import Inputs, Outputs
 from kantor_protocol.node.recovery import KillableNode
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
-from kantor_protocol.replication.replica import Replica, read_have
+from kantor_protocol.replication.replica import Replica, read_version_vector
 from kantor_protocol.wire.messages import decode_gossip
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
@@ -44,20 +44,20 @@ RUNS = {
 
 
 def surveyed(records: Records) -> MapTracker:
-    survey = MapTracker()
+    map_tracker = MapTracker()
     for record in records:
-        survey.take(record)
-    return survey
+        map_tracker.observe(record)
+    return map_tracker
 
 
 def acts_of(records: Records) -> list[tuple[int, StepRecord]]:
     """What robots did, each with its tick."""
     return [
-        (record.now_ns // 100_000_000, act)
+        (record.now_ns // 100_000_000, step_record)
         for record in records
         if isinstance(record, Batch)
-        for act in record.acts
-        if act.name != "supervisor"
+        for step_record in record.step_records
+        if step_record.name != "supervisor"
     ]
 
 
@@ -72,35 +72,37 @@ class Witness:
         self.first: dict[int, int] = {}
         self.own: dict[str, set[int]] = {name: set() for name in names}
         logs: dict[str, dict[int, int]] = {name: {} for name in scenario.roster}
-        have = {name: [0] * len(scenario.roster) for name in names}
+        version_vector = {name: [0] * len(scenario.roster) for name in names}
         evidence = {
             name: OccupancyLog(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
             for name in names
         }
         last: dict[str, tuple[int, object]] = dict.fromkeys(names, (-1, None))
-        for tick, act in acts_of(records):
-            look, (step, pose) = act.observation, last[act.name]
+        for tick, step_record in acts_of(records):
+            look, (step, pose) = step_record.observation, last[step_record.name]
             if look.step > step:
-                last[act.name] = look.step, look.pose
+                last[step_record.name] = look.step, look.pose
                 moved = look.pose != pose
-                for entry in evidence[act.name].take(look.scan, look.pose, moved=moved).tolist():
+                for entry in (
+                    evidence[step_record.name].observe(look.scan, look.pose, moved=moved).tolist()
+                ):
                     if entry < 2 * self.frame.cells:
                         self.first.setdefault(entry // 2, tick)
-                        self.own[act.name].add(entry // 2)
-            assert act.outputs is not None
-            for envelope in act.outputs.outbox:
+                        self.own[step_record.name].add(entry // 2)
+            assert step_record.outputs is not None
+            for envelope in step_record.outputs.outbox:
                 news = decode_gossip(envelope.body)
                 rows = read_logs(news.logs, valued=False)
-                told = read_have(news.have, len(scenario.roster))
+                told = read_version_vector(news.version_vector, len(scenario.roster))
                 assert rows is not None
                 assert told is not None
-                have[act.name] = told
+                version_vector[step_record.name] = told
                 for origin, position, entry, _ in rows.tolist():
                     logs[scenario.roster[origin]][position] = entry
         self.held = {
             name: self.own[name].union(
                 logs[origin][i] // 2
-                for origin, length in zip(scenario.roster, have[name], strict=True)
+                for origin, length in zip(scenario.roster, version_vector[name], strict=True)
                 for i in range(length)
                 if origin != name and logs[origin][i] < 2 * self.frame.cells
             )
@@ -108,8 +110,8 @@ class Witness:
         }
 
 
-def in_survey(survey: MapTracker) -> dict[int, int]:
-    ticks = survey.books.first_tick
+def in_survey(map_tracker: MapTracker) -> dict[int, int]:
+    ticks = map_tracker.state.first_tick
     return {int(cell): int(ticks[cell]) for cell in np.flatnonzero(ticks >= 0)}
 
 
@@ -117,35 +119,35 @@ def in_survey(survey: MapTracker) -> dict[int, int]:
 def test_stamps_and_holdings_are_those_of_the_record(run: str) -> None:
     """Who saw what first, and who knows what by the logs that it says it holds."""
     records = explored(*RUNS[run])
-    survey, witness = surveyed(records), Witness(records)
-    counts = survey.observable.ravel()
+    map_tracker, witness = surveyed(records), Witness(records)
+    counts = map_tracker.observable.ravel()
 
-    assert in_survey(survey) == witness.first
-    assert survey.seen == sum(counts[cell] for cell in witness.first)
+    assert in_survey(map_tracker) == witness.first
+    assert map_tracker.seen == sum(counts[cell] for cell in witness.first)
     for i, name in enumerate(witness.own):
-        held = np.flatnonzero(survey.books.held[i] & KIND)
+        held = np.flatnonzero(map_tracker.state.held[i] & KIND)
         assert set(held.tolist()) == witness.held[name]
-        assert survey.held_cells[i] == counts[held].sum()
-        assert survey.own_cells[i] == sum(counts[cell] for cell in witness.own[name])
+        assert map_tracker.held_cells[i] == counts[held].sum()
+        assert map_tracker.own_cells[i] == sum(counts[cell] for cell in witness.own[name])
 
 
 def test_robots_know_what_their_own_charts_show() -> None:
     """What a robot holds is what it makes a map of, void frontiers and all."""
     records = explored("radio.range_m=100")
-    survey = surveyed(records)
+    map_tracker = surveyed(records)
     frame = ROOMS.frame
     replica = Replica(1, 2, entries(frame), None, ledger=True, claims=False)
     chart = FusedMap(frame, 2)
     for place in (0, 1):
-        count = survey.books.written.item(place, TOLD)
+        count = map_tracker.state.written.item(place, TOLD)
         replica.store.length[place] = 0
         replica.reserve(count)
-        replica.store.logs[place, :count, 0] = survey.books.told[place, :count]
+        replica.store.logs[place, :count, 0] = map_tracker.state.told[place, :count]
         replica.store.length[place] = count
     chart.fold(replica)
 
     for place in (0, 1):
-        assert np.array_equal(survey.books.held[place] & KIND, chart.cells)
+        assert np.array_equal(map_tracker.state.held[place] & KIND, chart.cells)
 
 
 def _frontiers(ground: Ground, counts: npt.NDArray[np.bool_], known: npt.NDArray[np.bool_]) -> int:
@@ -159,45 +161,49 @@ def _frontiers(ground: Ground, counts: npt.NDArray[np.bool_], known: npt.NDArray
 def test_moments_are_those_of_the_stamps(run: str) -> None:
     """95 and 99 % and completion, tick by tick."""
     records = explored(*RUNS[run])
-    survey = surveyed(records)
-    ticks, counts = survey.books.first_tick, survey.observable
+    map_tracker = surveyed(records)
+    ticks, counts = map_tracker.state.first_tick, map_tracker.observable
     seen = [
-        ((ticks >= 0) & (ticks <= tick) & counts.ravel()).sum() / survey.total
-        for tick in range(survey.tick + 1)
+        ((ticks >= 0) & (ticks <= tick) & counts.ravel()).sum() / map_tracker.total
+        for tick in range(map_tracker.tick + 1)
     ]
-    known = [(ticks >= 0) & (ticks <= tick) for tick in range(survey.tick + 1)]
+    known = [(ticks >= 0) & (ticks <= tick) for tick in range(map_tracker.tick + 1)]
     left = [_frontiers(ROOMS, counts, now.reshape(counts.shape)) for now in known]
 
-    assert survey.t95_tick == next(i for i, share in enumerate(seen) if share >= 0.95)
-    assert survey.t99_tick == next(i for i, share in enumerate(seen) if share >= 0.99)
-    assert survey.completed_tick == next(i for i, many in enumerate(left) if i and not many)
-    assert sorted(survey.stamps.tolist()) == sorted(ticks[counts.ravel() & (ticks >= 0)].tolist())
+    assert map_tracker.t95_tick == next(i for i, share in enumerate(seen) if share >= 0.95)
+    assert map_tracker.t99_tick == next(i for i, share in enumerate(seen) if share >= 0.99)
+    assert map_tracker.completed_tick == next(i for i, many in enumerate(left) if i and not many)
+    assert sorted(map_tracker.stamps.tolist()) == sorted(
+        ticks[counts.ravel() & (ticks >= 0)].tolist()
+    )
 
 
 def test_all_know_later_than_somebody() -> None:
     """What one has seen takes a while to reach all; who hears nobody must see it all itself."""
     together, alone = surveyed(explored()), surveyed(explored(*RUNS["alone"]))
 
-    for survey in (together, alone):
-        assert survey.t99_tick is not None
-        assert survey.all_t99_tick is not None
-        assert survey.all_t99_tick >= survey.t99_tick
+    for map_tracker in (together, alone):
+        assert map_tracker.t99_tick is not None
+        assert map_tracker.all_t99_tick is not None
+        assert map_tracker.all_t99_tick >= map_tracker.t99_tick
     assert alone.all_t99_tick > together.all_t99_tick
 
 
 def test_ways_are_the_sum_of_moves() -> None:
     """From pose to pose as the world ruled them."""
     records = explored()
-    survey = surveyed(records)
+    map_tracker = surveyed(records)
     for i, name in enumerate(("r1", "r2")):
         places = [(1.5, 1.5) if i == 0 else (9.5, 1.5)]
         places += [
-            (act.ruling.pose.x_m, act.ruling.pose.y_m)
-            for _, act in acts_of(records)
-            if act.name == name and act.ruling
+            (step_record.verdict.pose.x_m, step_record.verdict.pose.y_m)
+            for _, step_record in acts_of(records)
+            if step_record.name == name and step_record.verdict
         ]
-        assert survey.ways_m[i] == pytest.approx(sum(math.dist(a, b) for a, b in pairwise(places)))
-        assert survey.poses_m[i] == places[-1]
+        assert map_tracker.ways_m[i] == pytest.approx(
+            sum(math.dist(a, b) for a, b in pairwise(places))
+        )
+        assert map_tracker.poses_m[i] == places[-1]
 
 
 def test_bumps_are_counted_where_they_happen() -> None:
@@ -205,27 +211,27 @@ def test_bumps_are_counted_where_they_happen() -> None:
     records = list(explored())
     batch = records[5]
     assert isinstance(batch, Batch)
-    assert batch.acts[0].ruling is not None
-    bumped = msgspec.structs.replace(batch.acts[0].ruling, bumped=True)
-    act = msgspec.structs.replace(batch.acts[0], ruling=bumped)
-    records[5] = msgspec.structs.replace(batch, acts=(act, *batch.acts[1:]))
+    assert batch.step_records[0].verdict is not None
+    bumped = msgspec.structs.replace(batch.step_records[0].verdict, bumped=True)
+    step_record = msgspec.structs.replace(batch.step_records[0], verdict=bumped)
+    records[5] = msgspec.structs.replace(batch, step_records=(step_record, *batch.step_records[1:]))
 
     assert surveyed(records).bumps == [(bumped.pose.x_m, bumped.pose.y_m)]
 
 
 def test_referees_may_share_a_survey() -> None:
     """A record that is handed on twice counts once."""
-    reader = ColumnarDecoder()
-    survey = MapTracker(reader)
+    decoder = ColumnarDecoder()
+    map_tracker = MapTracker(decoder)
     for record in explored():
-        reader.read(record)
-        survey.take(record)
-        survey.take(record)
+        decoder.read(record)
+        map_tracker.observe(record)
+        map_tracker.observe(record)
 
     once = surveyed(explored())
-    assert survey.seen == once.seen
-    assert survey.log_bytes == once.log_bytes
-    assert survey.ways_m == once.ways_m
+    assert map_tracker.seen == once.seen
+    assert map_tracker.log_bytes == once.log_bytes
+    assert map_tracker.ways_m == once.ways_m
 
 
 @pytest.mark.parametrize("radio", [(), ("radio.range_m=0.01", "radio.beacon=state")])
@@ -234,9 +240,11 @@ def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
     scenario = on_map(*radio)
     site = site_of(scenario)
     records: list[Record] = []
-    stage = Simulation(scenario, 1, site, [records.append])
+    simulation = Simulation(scenario, 1, site, [records.append])
     build = functools.partial(participant, "r1", scenario, 1, site)
-    play_all = in_process(team(scenario, 1, site) | {"r1": KillableNode(build, stage.body("r1"))})
+    play_all = in_process(
+        team(scenario, 1, site) | {"r1": KillableNode(build, simulation.body("r1"))}
+    )
     rounds = iter(range(10_000))
 
     def lossy(inputs: Mapping[str, Inputs]) -> Mapping[str, Outputs]:
@@ -245,7 +253,7 @@ def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
             del outputs["r1"]
         return outputs
 
-    reason = simulate(stage, lossy, 1, lambda: False)
+    reason = simulate(simulation, lossy, 1, lambda: False)
 
     assert reason == "done"
     assert check(records).complaints == []
@@ -269,13 +277,13 @@ def test_any_small_map_is_explored_and_judged(ground: Ground, data: st.DataObjec
     )
     records: list[Record] = []
     reason = play(scenario, 1, site_of(scenario, ground), [records.append])
-    survey, witness = surveyed(records), Witness(records)
+    map_tracker, witness = surveyed(records), Witness(records)
 
     assert reason == "done"
     assert check(records).complaints == []
-    assert in_survey(survey) == witness.first
-    assert survey.seen == survey.total
-    assert survey.completed_tick is not None
+    assert in_survey(map_tracker) == witness.first
+    assert map_tracker.seen == map_tracker.total
+    assert map_tracker.completed_tick is not None
 
 
 def test_kinds_are_two_bits() -> None:

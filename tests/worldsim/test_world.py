@@ -46,7 +46,7 @@ def world(*targets: Place, overrides: tuple[str, ...] = ()) -> World:
     return World(mission("sensor.range_m=5", *overrides), 1, site(*targets))
 
 
-def act(
+def step_record(
     there: World,
     step: int,
     place: Place = (0.0, 0.0),
@@ -77,29 +77,29 @@ def act(
 def test_move_is_no_longer_than_speed_times_time(place: Place, violations: tuple[str]) -> None:
     """A longer move is refused whole: the robot stays where it was."""
     there = world()
-    ruling = act(there, 1, place)
+    verdict = step_record(there, 1, place)
 
-    assert ruling.violations == violations
-    assert there.pose("r1") == ruling.pose == (Pose(0.0, 0.0) if violations else Pose(*place))
-    assert there.observe("r1").pose == ruling.pose
+    assert verdict.violations == violations
+    assert there.pose("r1") == verdict.pose == (Pose(0.0, 0.0) if violations else Pose(*place))
+    assert there.observe("r1").pose == verdict.pose
 
 
 def test_time_that_has_passed_counts() -> None:
     """A robot that was silent may have moved on; one that was refused may not move twice as far."""
     there = world()
 
-    assert act(there, 1, (30.0, 0.0), now_ns=3 * PERIOD_NS).violations == ()
-    assert act(there, 2, (60.0, 0.0), now_ns=4 * PERIOD_NS).violations == ("speed",)
-    assert act(there, 3, (50.0, 0.0), now_ns=5 * PERIOD_NS).violations == ("speed",)
-    assert act(there, 4, (40.0, 0.0), now_ns=6 * PERIOD_NS).violations == ()
+    assert step_record(there, 1, (30.0, 0.0), now_ns=3 * PERIOD_NS).violations == ()
+    assert step_record(there, 2, (60.0, 0.0), now_ns=4 * PERIOD_NS).violations == ("speed",)
+    assert step_record(there, 3, (50.0, 0.0), now_ns=5 * PERIOD_NS).violations == ("speed",)
+    assert step_record(there, 4, (40.0, 0.0), now_ns=6 * PERIOD_NS).violations == ()
 
 
 def test_supervisor_stands() -> None:
     """The supervisor cannot move at all."""
     there = world(overrides=("coordination=centralized",))
 
-    assert act(there, 1, (50.0, 50.0), name=SUPERVISOR).violations == ()
-    assert act(there, 2, (50.0, 50.1), name=SUPERVISOR).violations == ("speed",)
+    assert step_record(there, 1, (50.0, 50.0), name=SUPERVISOR).violations == ()
+    assert step_record(there, 2, (50.0, 50.1), name=SUPERVISOR).violations == ("speed",)
     assert there.pose(SUPERVISOR) == Pose(50.0, 50.0)
 
 
@@ -107,12 +107,12 @@ def test_supervisor_stands() -> None:
 def test_stale_step_changes_nothing(step: int, now_ns: int) -> None:
     """A step that was seen already, or lies in the past, is refused with all that is in it."""
     there = world((8.0, 0.0), overrides=("energy.steps=1",))
-    act(there, 2, (2.0, 0.0))
-    stale = act(there, step, (8.0, 0.0), SPENT, now_ns=now_ns)
+    step_record(there, 2, (2.0, 0.0))
+    stale = step_record(there, step, (8.0, 0.0), SPENT, now_ns=now_ns)
 
     assert stale == StepVerdict(Pose(2.0, 0.0), violations=("step",))
     assert (there.observe("r1").step, there.observe("r1").pose) == (2, Pose(2.0, 0.0))
-    assert act(there, 3, (8.0, 0.0), SPENT).violations == ()
+    assert step_record(there, 3, (8.0, 0.0), SPENT).violations == ()
 
 
 # Bodies.
@@ -121,14 +121,14 @@ def test_stale_step_changes_nothing(step: int, now_ns: int) -> None:
 def test_body_outlives_whoever_drives_it() -> None:
     """Pose, step and gauge go on through all incarnations; the world notes which one it is."""
     there = world(overrides=("energy.steps=2",))
-    act(there, 1, (2.0, 0.0), SPENT)
+    step_record(there, 1, (2.0, 0.0), SPENT)
     first = there.body("r1")
-    changed = [there.begin("r1", epoch) for epoch in (0, 3, 3)]
-    rulings = [act(there, step, (2.0, 0.0), SPENT).violations for step in (2, 3)]
+    changed = [there.begin("r1", incarnation) for incarnation in (0, 3, 3)]
+    verdicts = [step_record(there, step, (2.0, 0.0), SPENT).violations for step in (2, 3)]
 
     assert first == Body(Pose(2.0, 0.0), 1, 1, 0)
     assert changed == [False, True, False]
-    assert rulings == [(), ("energy",)]
+    assert verdicts == [(), ("energy",)]
     assert there.body("r1") == Body(Pose(2.0, 0.0), 3, 2, 3)
     assert there.body("r2") == Body(Pose(90.0, 20.0))
 
@@ -139,11 +139,11 @@ def test_body_outlives_whoever_drives_it() -> None:
 def test_budget_is_not_exceeded() -> None:
     """A robot ships as many points as it has energy for, and no more."""
     there = world(overrides=("energy.steps=2",))
-    rulings = [act(there, step, spent=SPENT).violations for step in range(1, 5)]
+    verdicts = [step_record(there, step, spent=SPENT).violations for step in range(1, 5)]
 
-    assert rulings == [(), (), ("energy",), ("energy",)]
-    assert act(there, 5, (1.0, 0.0)).violations == ()
-    assert act(there, 1, (90.0, 20.0), SPENT, name="r2").violations == ()
+    assert verdicts == [(), (), ("energy",), ("energy",)]
+    assert step_record(there, 5, (1.0, 0.0)).violations == ()
+    assert step_record(there, 1, (90.0, 20.0), SPENT, name="r2").violations == ()
 
 
 @pytest.mark.parametrize(
@@ -161,19 +161,19 @@ def test_point_that_is_no_point_is_refused(spent: bytes) -> None:
     """More units than a point holds, none, or what does not decode: no energy is spent on it."""
     there = world(overrides=("energy.steps=1",))
 
-    assert act(there, 1, spent=spent).violations == ("units",)
-    assert act(there, 2, spent=SPENT).violations == ()
-    assert act(there, 3, spent=SPENT).violations == ("energy",)
+    assert step_record(there, 1, spent=spent).violations == ("units",)
+    assert step_record(there, 2, spent=SPENT).violations == ()
+    assert step_record(there, 3, spent=SPENT).violations == ("energy",)
 
 
 def test_sound_parts_of_a_step_happen() -> None:
     """What is wrong is refused, the rest stands: each part is judged alone."""
     there = world((8.0, 0.0))
-    unsound = act(there, 1, (99.0, 0.0), b"\x80")
+    unsound = step_record(there, 1, (99.0, 0.0), b"\x80")
 
     assert unsound.violations == ("speed", "units")
     assert there.observe("r1").step == 1
-    assert act(there, 2, (5.0, 0.0), b"\x80") == StepVerdict(
+    assert step_record(there, 2, (5.0, 0.0), b"\x80") == StepVerdict(
         Pose(5.0, 0.0), ((0, 8.0, 0.0),), ("units",)
     )
 
@@ -204,7 +204,7 @@ def test_first_look_is_at_time_0() -> None:
 def test_target_is_found_once() -> None:
     """Neither the robot that found it nor another finds it again."""
     there = world((8.0, 0.0), (9.0, 0.0), (80.0, 20.0))
-    found = [act(there, step, (4.0, 0.0)).found for step in (1, 2)]
+    found = [step_record(there, step, (4.0, 0.0)).found for step in (1, 2)]
     there.accept("r2", 10 * PERIOD_NS, Outputs(1, Pose(10.0, 0.0)))
 
     assert found == [((0, 8.0, 0.0), (1, 9.0, 0.0)), ()]
@@ -214,11 +214,11 @@ def test_target_is_found_once() -> None:
 def test_finds_are_told_with_the_step_that_made_them() -> None:
     """However often one looks, and no longer than until the next step."""
     there = world((8.0, 0.0))
-    act(there, 1, (4.0, 0.0))
+    step_record(there, 1, (4.0, 0.0))
     told = [there.observe("r1").detected for _ in range(2)]
-    act(there, 1, (4.0, 0.0))
+    step_record(there, 1, (4.0, 0.0))
     told.append(there.observe("r1").detected)
-    act(there, 2, (4.0, 0.0))
+    step_record(there, 2, (4.0, 0.0))
 
     assert told == [(0,), (0,), (0,)]
     assert there.observe("r1").detected == ()
@@ -228,7 +228,7 @@ def test_only_where_a_robot_ends_up_counts() -> None:
     """What it passes on the way is not seen: endpoints only."""
     there = world((5.0, 4.9), overrides=("sensor.range_m=5",))
 
-    assert act(there, 1, (10.0, 0.0)).found == ()
+    assert step_record(there, 1, (10.0, 0.0)).found == ()
 
 
 def test_supervisor_sees_nothing() -> None:
@@ -236,7 +236,7 @@ def test_supervisor_sees_nothing() -> None:
     there = world((50.0, 50.0), overrides=("coordination=centralized",))
 
     assert SUPERVISOR not in there.first_look()
-    assert act(there, 1, (50.0, 50.0), name=SUPERVISOR).found == ()
+    assert step_record(there, 1, (50.0, 50.0), name=SUPERVISOR).found == ()
 
 
 def walked(*targets: Place, periods: int) -> list[Place]:
@@ -252,7 +252,7 @@ def test_walking_target_stands_where_it_was_found() -> None:
     there = world(start, overrides=("targets.diffusion_m=3.0", "sensor.range_m=4"))
     places = [walked(start, periods=step)[0] for step in range(1, 200)]
     near = [math.hypot(*place) <= 4.0 for place in places]
-    finds = [(step, found) for step in range(1, 200) if (found := act(there, step).found)]
+    finds = [(step, found) for step in range(1, 200) if (found := step_record(there, step).found)]
     first = near.index(True)
 
     assert sum(near) > 1
@@ -264,7 +264,7 @@ def test_targets_walk_whether_anybody_acts_or_not() -> None:
     there = world((200.0, 0.0), (300.0, 0.0), overrides=("targets.diffusion_m=3.0",))
     place = walked((200.0, 0.0), (300.0, 0.0), periods=40)[0]
 
-    assert act(there, 1, place, now_ns=40 * PERIOD_NS + 99).found == ((0, *place),)
+    assert step_record(there, 1, place, now_ns=40 * PERIOD_NS + 99).found == ((0, *place),)
 
 
 # Everything at once.
@@ -294,18 +294,18 @@ def test_no_robot_gets_around_the_rules(
     step, now_ns, pose, shipped = 0, 0, Pose(0.0, 0.0), 0
     for its_step, period, x_m, y_m, spent in moves:
         at_ns = period * PERIOD_NS
-        ruling = act(there, its_step, (x_m, y_m), spent, now_ns=at_ns)
-        way_m = math.hypot(ruling.pose.x_m - pose.x_m, ruling.pose.y_m - pose.y_m)
+        verdict = step_record(there, its_step, (x_m, y_m), spent, now_ns=at_ns)
+        way_m = math.hypot(verdict.pose.x_m - pose.x_m, verdict.pose.y_m - pose.y_m)
         stale = its_step <= step or at_ns < now_ns
 
-        assert ("step" in ruling.violations) == stale
+        assert ("step" in verdict.violations) == stale
         assert way_m <= (0.0 if stale else 100.0 * (at_ns - now_ns) * 1e-9 * (1.0 + 1e-5))
-        pose = ruling.pose
+        pose = verdict.pose
         if not stale:
             step, now_ns = its_step, at_ns
-        if spent and not {"step", "units", "energy"} & set(ruling.violations):
+        if spent and not {"step", "units", "energy"} & set(verdict.violations):
             shipped += 1
-        found += [target for target, _, _ in ruling.found]
+        found += [target for target, _, _ in verdict.found]
 
     assert shipped <= 3
     assert len(set(found)) == len(found)
@@ -396,10 +396,10 @@ def test_what_is_free_is_not_cut(stand: Stand, share: float, heading: float) -> 
 def test_wall_stops_a_move(start: Place, wanted: Place, end: Place | None) -> None:
     """Just before the wall, or where it was; it is counted, told, and breaks no rule."""
     there = on(ROOM, start)
-    ruling = there.accept("r1", PERIOD_NS, Outputs(1, Pose(*wanted, 0.5, 9.0)))
+    verdict = there.accept("r1", PERIOD_NS, Outputs(1, Pose(*wanted, 0.5, 9.0)))
     truth = Pose(*wanted, 0.5, 9.0) if end is None else Pose(*end, 0.5, 0.0)
 
-    assert ruling == StepVerdict(truth, bumped=end is not None)
+    assert verdict == StepVerdict(truth, bumped=end is not None)
     assert there.pose("r1") == truth
     look = there.observe("r1")
     assert (look.pose, look.bumped) == (truth, end is not None)
@@ -408,10 +408,10 @@ def test_wall_stops_a_move(start: Place, wanted: Place, end: Place | None) -> No
 def test_corners_are_not_cut() -> None:
     """Between two walls that meet at a corner there is no way through."""
     there = on(drawn("#.", ".#"), (0.5, 0.5))
-    ruling = there.accept("r1", PERIOD_NS, Outputs(1, Pose(1.5, 1.5)))
+    verdict = there.accept("r1", PERIOD_NS, Outputs(1, Pose(1.5, 1.5)))
 
-    assert ruling.bumped
-    assert max(ruling.pose.x_m, ruling.pose.y_m) < 1.0
+    assert verdict.bumped
+    assert max(verdict.pose.x_m, verdict.pose.y_m) < 1.0
 
 
 def test_bump_is_told_of_the_last_step_alone() -> None:
@@ -425,8 +425,8 @@ def test_bump_is_told_of_the_last_step_alone() -> None:
         (3, (9.0, 2.5)),
         (4, (0.5, 2.5)),
     ]:
-        ruling = there.accept("r1", step * PERIOD_NS, Outputs(step, Pose(*place)))
-        told.append((ruling.violations, ruling.bumped, there.observe("r1").bumped))
+        verdict = there.accept("r1", step * PERIOD_NS, Outputs(step, Pose(*place)))
+        told.append((verdict.violations, verdict.bumped, there.observe("r1").bumped))
 
     assert told == [
         ((), True, True),
@@ -470,9 +470,9 @@ def test_supervisor_is_in_no_cell() -> None:
     there = on(
         ROOM, (0.5, 0.5), overrides=("coordination=centralized", "supervisor.pose_m=[1.5, 1.5]")
     )
-    ruling = there.accept(SUPERVISOR, PERIOD_NS, Outputs(1, Pose(1.5, 1.5)))
+    verdict = there.accept(SUPERVISOR, PERIOD_NS, Outputs(1, Pose(1.5, 1.5)))
 
-    assert ruling == StepVerdict(Pose(1.5, 1.5))
+    assert verdict == StepVerdict(Pose(1.5, 1.5))
     assert there.observe(SUPERVISOR).scan == b""
 
 

@@ -43,7 +43,7 @@ class _Room(NamedTuple):
 def ship(
     grid: SampleIndex,
     store: ReplicaArrays,
-    manner: ReplicaConfig,
+    config: ReplicaConfig,
     x: float,
     y: float,
     point: int,
@@ -59,7 +59,7 @@ def ship(
     while left > 0 and nearest(grid, x, y, _NO_SKIP, room.best, room.near) > 0:
         j = room.near[0]
         units = min(left, store.weights[j])
-        spend(store, manner, j, units)
+        spend(store, config, j, units)
         if store.weights[j] <= 0:
             remove(grid, j)
         room.sample[count] = j
@@ -114,8 +114,8 @@ def _ship_packed(
         counters,
     )
     # Of the manner, spending reads only whose log it is and what an entry means.
-    manner = ReplicaConfig(me, ledger != 0, False, False, False, 0, 0, 0, 0)
-    count = ship(grid, store, manner, x, y, point, _Room(best, near, sample, units))
+    config = ReplicaConfig(me, ledger != 0, False, False, False, 0, 0, 0, 0)
+    count = ship(grid, store, config, x, y, point, _Room(best, near, sample, units))
     used: int = pack_pairs(sample, units, count, out)
     return used
 
@@ -166,11 +166,11 @@ class Belief:
 
     def _follow_store(self) -> None:
         """Have kernels work on the store as it is: it moves when logs grow or origins come."""
-        store, manner = self.replica.store, self.replica.manner
+        store, config = self.replica.store, self.replica.config
         self._store = store
         self._to_ship: tuple[Any, ...] = (
             *(*self.grid, *store, *self._room, self._packed),
-            *(manner.me, int(manner.ledger), self._units.point),
+            *(config.me, int(config.ledger), self._units.point),
         )
         self.to_choose: tuple[Any, ...] = (
             *self.grid,
@@ -178,7 +178,7 @@ class Belief:
             store.claims,
             store.counters,
             np.zeros(self.replica.slots, dtype=np.int64),
-            manner.me if manner.claims else NOBODY,
+            config.me if config.claims else NOBODY,
         )
         """Grid, weights and claims as arguments of a planner's kernel; see `kernels.kernel`."""
 

@@ -92,10 +92,10 @@ def order_in(register: npt.NDArray[np.int64], robot: int, cells: int) -> int:
 class Assignment:
     """Asks the strategy when somebody needs a target."""
 
-    def __init__(self, scenario: Scenario, terrain: CostMap, seed: int, me: int | None) -> None:
+    def __init__(self, scenario: Scenario, cost_map: CostMap, seed: int, me: int | None) -> None:
         """me: the robot that asks, or None for the supervisor."""
         planner = scenario.planner
-        self._terrain = terrain
+        self._cost_map = cost_map
         self._me = me
         self._allocator = ALLOCATORS[planner.name](scenario, seed, me)
         self._on_events = planner.replan_on == "events"
@@ -112,9 +112,9 @@ class Assignment:
         members, others = self._chosen(group, tick)
         if not members:
             return {}
-        self._asked |= dict.fromkeys((m.robot for m in members), self._terrain.chart.revision)
+        self._asked |= dict.fromkeys((m.robot for m in members), self._cost_map.fused_map.revision)
         situation = Situation(
-            self._terrain, self._frontiers(group), members, others, tuple(absent), tick
+            self._cost_map, self._frontiers(group), members, others, tuple(absent), tick
         )
         tasks = self._allocator.assign(situation)
         return {member.robot: task for member, task in zip(members, tasks, strict=True)}
@@ -137,15 +137,15 @@ class Assignment:
         )
 
     def _needs(self, member: Member) -> bool:
-        chart, target = self._terrain.chart, member.task.target
+        fused_map, target = self._cost_map.fused_map, member.task.target
         if target == NOWHERE:
-            return self._asked.get(member.robot) != chart.revision
-        if member.arrived or chart.void[target]:
+            return self._asked.get(member.robot) != fused_map.revision
+        if member.arrived or fused_map.void[target]:
             return True
-        return self._on_events and not chart.is_frontier(target)
+        return self._on_events and not fused_map.is_frontier(target)
 
     def _frontiers(self, group: Sequence[Member]) -> npt.NDArray[np.int64]:
         """All but those at which somebody stands that has looked around."""
-        frontiers = self._terrain.chart.frontiers
+        frontiers = self._cost_map.fused_map.frontiers
         looked = [m.task.target for m in group if m.arrived]
         return frontiers[~np.isin(frontiers, looked)] if looked else frontiers

@@ -17,12 +17,12 @@ _FREE_P = 0.05
 class CostMap:
     """A chart with its costs, by the scenario's rule. Costs are in cells of open floor."""
 
-    def __init__(self, scenario: Scenario, chart: FusedMap) -> None:
-        self.chart = chart
-        self.frame = chart.frame
-        self.sensor_cells = scenario.sensor.range_m / chart.frame.resolution_m
+    def __init__(self, scenario: Scenario, fused_map: FusedMap) -> None:
+        self.fused_map = fused_map
+        self.frame = fused_map.frame
+        self.sensor_cells = scenario.sensor.range_m / fused_map.frame.resolution_m
         self._planner = scenario.planner
-        self._routes = Routes(chart.frame.rows, chart.frame.columns)
+        self._routes = Routes(fused_map.frame.rows, fused_map.frame.columns)
         self._revision = -1
         self._cost = np.zeros(0)
         self._travel: dict[int, npt.NDArray[np.float64]] = {}
@@ -30,8 +30,8 @@ class CostMap:
     @property
     def cost(self) -> npt.NDArray[np.float64]:
         """(cells,) of crossing each; inf where no way leads: walls, and what is unknown."""
-        if self._revision != self.chart.revision:
-            self._revision = self.chart.revision
+        if self._revision != self.fused_map.revision:
+            self._revision = self.fused_map.revision
             self._travel = {}
             self._cost = self._measured()
         return self._cost
@@ -51,7 +51,7 @@ class CostMap:
 
         until: cells that are farther than this one may have too high a value.
         """
-        cost = np.where(self.chart.cells == UNKNOWN, 1.0, self.cost)
+        cost = np.where(self.fused_map.cells == UNKNOWN, 1.0, self.cost)
         return self._routes.spread(self._with(cell, cost), cell, until=until).copy()
 
     def way(self, cell: int, target: int) -> npt.NDArray[np.int64]:
@@ -72,13 +72,13 @@ class CostMap:
         return cost
 
     def _measured(self) -> npt.NDArray[np.float64]:
-        chart, planner = self.chart, self._planner
+        fused_map, planner = self.fused_map, self._planner
         if planner.cost == "length":
-            return length_cost(chart.cells == FREE)
+            return length_cost(fused_map.cells == FREE)
         shape = (self.frame.rows, self.frame.columns)
         smoothed = smoothed_cost(
-            chart.p_occ().reshape(shape),
-            chart.explored().reshape(shape),
+            fused_map.p_occ().reshape(shape),
+            fused_map.explored().reshape(shape),
             sigma_cells=planner.smoothing_cells,
             p_max=planner.occupied_from,
         )

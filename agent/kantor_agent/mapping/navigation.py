@@ -34,9 +34,9 @@ def _farthest_in_sight(
 class Navigator:
     """Keeps the way to the target, and cuts its corners where nothing stands in between."""
 
-    def __init__(self, terrain: CostMap) -> None:
-        self._terrain = terrain
-        self._frame = terrain.frame
+    def __init__(self, cost_map: CostMap) -> None:
+        self._cost_map = cost_map
+        self._frame = cost_map.frame
         self._target = NOWHERE
         self._way: npt.NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self._beyond: npt.NDArray[np.float64] = np.zeros(0)
@@ -52,7 +52,7 @@ class Navigator:
         ahead = self._look_ahead(pose) if target == self._target else -1
         if ahead < 0:
             self._target, self._passed = target, 0
-            self._way = self._terrain.way(cell, target)
+            self._way = self._cost_map.way(cell, target)
             self._beyond = self._to_the_end()
             ahead = self._look_ahead(pose)
         if ahead < 0:  # it stands beside a corner
@@ -76,7 +76,7 @@ class Navigator:
         frame = self._frame
         return int(
             _farthest_in_sight(
-                self._terrain.chart.cells.reshape(frame.rows, frame.columns),
+                self._cost_map.fused_map.cells.reshape(frame.rows, frame.columns),
                 self._way,
                 self._passed,
                 *frame.uv(pose.x_m, pose.y_m),

@@ -171,7 +171,7 @@ def _rise(value: np.ndarray, heap: np.ndarray, place: np.ndarray, cell: int, at:
 
 
 @kernel
-def _take(value: np.ndarray, heap: np.ndarray, place: np.ndarray, size: int) -> int:
+def _pop_least(value: np.ndarray, heap: np.ndarray, place: np.ndarray, size: int) -> int:
     """Take the cell of the lowest value from a heap of so many."""
     first, last = heap[0], heap[size - 1]
     at, below, end = 0, 1, size - 1
@@ -203,7 +203,7 @@ def spread_by_heap(
     value[source] = 0.0
     heap[0], place[source], size = source, 0, 1
     while size > 0:
-        cell = _take(value, heap, place, size)
+        cell = _pop_least(value, heap, place, size)
         size -= 1
         if cell == until:
             return

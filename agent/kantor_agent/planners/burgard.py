@@ -149,16 +149,16 @@ class Burgard:
 
     def assign(self, situation: Situation, /) -> list[Task]:
         """A frontier for each member; none for those that can reach none."""
-        terrain, frontiers = situation.terrain, situation.frontiers
-        ways = [terrain.travel(member.cell)[frontiers] for member in situation.members]
-        value = np.array(ways) / terrain.sensor_cells
+        cost_map, frontiers = situation.cost_map, situation.frontiers
+        ways = [cost_map.travel(member.cell)[frontiers] for member in situation.members]
+        value = np.array(ways) / cost_map.sensor_cells
         picked = self._coordinated(situation, value) if self._planner.coordinated else _own(value)
         return [Task(int(frontiers[f])) if f >= 0 else Task() for f in picked.tolist()]
 
     def _coordinated(
         self, situation: Situation, value: npt.NDArray[np.float64]
     ) -> npt.NDArray[np.int64]:
-        terrain, planner = situation.terrain, self._planner
+        cost_map, planner = situation.cost_map, self._planner
         held = [member.task.target for member in situation.others]
         taken = [target for target in (*held, *situation.absent) if target != NOWHERE]
         picked = np.empty(value.shape[0], dtype=np.int64)
@@ -167,12 +167,12 @@ class Burgard:
             situation.frontiers,
             np.array(taken, dtype=np.int64),
             planner.beta,
-            terrain.sensor_cells,
-            self._shares(terrain.chart.ranges),
+            cost_map.sensor_cells,
+            self._shares(cost_map.fused_map.ranges),
             planner.discount == "subtract",
             planner.sight,
-            terrain.chart.cells,
-            terrain.frame.columns,
+            cost_map.fused_map.cells,
+            cost_map.frame.columns,
             np.empty(value.shape[1]),
             picked,
         )

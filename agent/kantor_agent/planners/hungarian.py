@@ -56,10 +56,10 @@ class Hungarian:
 
     def assign(self, situation: Situation, /) -> list[Task]:
         """A frontier for each member; none for those that can reach none."""
-        terrain, frontiers = situation.terrain, situation.frontiers
+        cost_map, frontiers = situation.cost_map, situation.frontiers
         if frontiers.size == 0:
             return [Task() for _ in situation.members]
-        ways = [terrain.travel(member.cell)[frontiers] for member in situation.members]
+        ways = [cost_map.travel(member.cell)[frontiers] for member in situation.members]
         travel = np.array(ways)
         picked = travel.argmin(axis=1)
         spots = _spots(situation, travel.min(axis=0))
@@ -80,8 +80,8 @@ def _spots(situation: Situation, cheapest: npt.NDArray[np.float64]) -> npt.NDArr
         situation.frontiers,
         order,
         np.array(taken, dtype=np.int64),
-        _APART * situation.terrain.sensor_cells,
-        situation.terrain.frame.columns,
+        _APART * situation.cost_map.sensor_cells,
+        situation.cost_map.frame.columns,
         kept,
     )
     return kept[:count]

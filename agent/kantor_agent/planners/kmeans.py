@@ -384,14 +384,14 @@ class KMeans:
 
     def assign(self, situation: Situation, /) -> list[Task]:
         """Every member's target, with its region as a memo. Without frontiers nothing is to be done."""
-        terrain, frontiers, members, others, _, _ = situation
+        cost_map, frontiers, members, others, _, _ = situation
         if not (members and frontiers.size):
             return [Task(NOWHERE, member.task.memo) for member in members]
         group = sorted((*members, *others), key=lambda member: member.robot)
         cells = np.array([member.cell for member in group])
-        starts = np.array([self._start(member, terrain.frame) for member in group])
-        travel = np.stack([terrain.travel(member.cell)[frontiers] for member in group])
-        regions = Regions(terrain, frontiers, cells, starts, travel)
+        starts = np.array([self._start(member, cost_map.frame) for member in group])
+        travel = np.stack([cost_map.travel(member.cell)[frontiers] for member in group])
+        regions = Regions(cost_map, frontiers, cells, starts, travel)
         mine = [group.index(member) for member in members]
         targets = _targets(situation, regions, travel, mine)
         return [Task(targets[i], (_assignments(group[i], 1), *regions.places[i])) for i in mine]
@@ -417,12 +417,12 @@ class Regions:
     """A partition of what is unknown, and whose each part is (sections IV.A and IV.B)."""
 
     def __init__(
-        self, terrain: CostMap, frontiers: Ints, robots: Ints, starts: Ints, travel: Floats
+        self, cost_map: CostMap, frontiers: Ints, robots: Ints, starts: Ints, travel: Floats
     ) -> None:
         """robots: (n,) their cells. starts: (n, 2) centroids. travel: (n, frontiers)."""
-        frame, cells = terrain.frame, terrain.chart.cells
+        frame, cells = cost_map.frame, cost_map.fused_map.cells
         region = np.full(frame.cells, NO_REGION)
-        points = _points(terrain.chart, frontiers, region)
+        points = _points(cost_map.fused_map, frontiers, region)
         count = min(robots.shape[0], points.shape[0])
         centroids = starts[:count].astype(np.float64)
         _cluster(points, frame.columns, centroids, region)
@@ -452,10 +452,10 @@ class Regions:
         """(n, 2) the centroid of each one's region, or where it began."""
 
 
-def _points(chart: FusedMap, frontiers: Ints, region: Ints) -> Ints:
+def _points(fused_map: FusedMap, frontiers: Ints, region: Ints) -> Ints:
     """The cells that are to be divided, rising."""
     stack, points = np.empty_like(region), np.empty_like(region)
-    count = gather(chart.cells, chart.frame.columns, frontiers, region, stack, points)
+    count = gather(fused_map.cells, fused_map.frame.columns, frontiers, region, stack, points)
     return points[:count]
 
 
@@ -470,8 +470,8 @@ def _targets(
     situation: Situation, regions: Regions, travel: Floats, mine: list[int]
 ) -> dict[int, int]:
     """Of these robots of the group (section IV.C): first of those that cannot get to their region yet."""
-    terrain, frontiers = situation.terrain, situation.frontiers
-    columns, range_cells = terrain.frame.columns, terrain.sensor_cells
+    cost_map, frontiers = situation.cost_map, situation.frontiers
+    columns, range_cells = cost_map.frame.columns, cost_map.sensor_cells
     costs = travel[mine].min(axis=0)
     spaced, taken = np.zeros((2, frontiers.shape[0]), np.bool_)
     order = np.argsort(costs, kind="stable")
@@ -483,7 +483,7 @@ def _targets(
     for i in sorted(mine, key=lambda i: _has_way(regions, i)):
         for eligible in (spaced, np.ones_like(spaced)):  # rather one of the others than none
             its = (eligible, taken, travel[i], _contour_cell(regions, i), regions.diagonal)
-            j = choose(terrain.chart.cells, columns, frontiers, *its)
+            j = choose(cost_map.fused_map.cells, columns, frontiers, *its)
             if j >= 0:
                 targets[i] = int(frontiers[j])
                 mark_taken(frontiers, columns, targets[i], range_cells, taken)

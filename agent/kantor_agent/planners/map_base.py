@@ -50,7 +50,7 @@ class Member(NamedTuple):
 class Situation(NamedTuple):
     """What is known to all members of a group."""
 
-    terrain: CostMap
+    cost_map: CostMap
     frontiers: npt.NDArray[np.int64]
     """Cells to choose from, rising."""
     members: tuple[Member, ...]

@@ -37,7 +37,7 @@ class DensityRobot:
     ) -> None:
         """body: what it takes over. samples_m: (N, 2), world frame, at time 0."""
         units = Units.of(scenario.energy.points, samples_m.shape[0])
-        replica = build_replica(me, scenario, units, samples_m.shape[0], body.epoch)
+        replica = build_replica(me, scenario, units, samples_m.shape[0], body.incarnation)
         walk = RandomWalk(
             samples_m,
             scenario.samples.diffusion_m,
@@ -47,7 +47,7 @@ class DensityRobot:
             most_steps=_WALK_STEPS_MAX,
         )
         self._replica, self._belief = replica, Belief(walk, units, replica)
-        self._radio = Gossip(me, scenario, body.epoch)
+        self._radio = Gossip(me, scenario, body.incarnation)
         self._planner = PLANNERS[scenario.planner.name](scenario)
         self._vehicle = VEHICLES[scenario.vehicle.name](scenario.vehicle)
         self._publisher = WeightsPublisher(

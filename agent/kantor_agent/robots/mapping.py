@@ -58,13 +58,13 @@ class MappingRobot:
         self._me = scenario.roster.index(me)
         self._frame = frame
         self._robots = scenario.robots.count
-        self._replica = build_replica(me, scenario, None, entries(frame), body.epoch)
-        self._radio = Gossip(me, scenario, body.epoch)
-        self._chart = FusedMap(frame, self._replica.slots)
-        self._terrain = CostMap(scenario, self._chart)
+        self._replica = build_replica(me, scenario, None, entries(frame), body.incarnation)
+        self._radio = Gossip(me, scenario, body.incarnation)
+        self._fused_map = FusedMap(frame, self._replica.slots)
+        self._cost_map = CostMap(scenario, self._fused_map)
         self._evidence = OccupancyLog(frame, scenario.sensor, ranges=scenario.learns_ranges)
-        self._dispatch = Assignment(scenario, self._terrain, seed, self._me)
-        self._navigator = Navigator(self._terrain)
+        self._dispatch = Assignment(scenario, self._cost_map, seed, self._me)
+        self._navigator = Navigator(self._cost_map)
         self._vehicle = VEHICLES[scenario.vehicle.name](scenario.vehicle)
         self._clearance_cells = 2.0 * scenario.vehicle.radius_m / frame.resolution_m
         self._supervisor = scenario.robots.count if scenario.centralized else None
@@ -88,7 +88,7 @@ class MappingRobot:
         self._locate(inputs.observation)
         elapsed_ns = max(0, min(inputs.now_ns - self._now_ns, self._period_ns))
         self._now_ns, self._step = inputs.now_ns, self._step + 1
-        self._chart.fold(self._replica)
+        self._fused_map.fold(self._replica)
         self._give_up()
         if not self._resting:
             self._decide()
@@ -111,9 +111,9 @@ class MappingRobot:
     def _give_up(self) -> None:
         """Tell of a target that showed or led to nothing, before there is another target."""
         target = self._task.target
-        in_vain = self._arrived and self._chart.is_frontier(target)
+        in_vain = self._arrived and self._fused_map.is_frontier(target)
         stuck = not self._arrived and self._step - self._progressed > self._patience
-        if target != NOWHERE and not self._chart.void[target] and (in_vain or stuck):
+        if target != NOWHERE and not self._fused_map.void[target] and (in_vain or stuck):
             self._replica.append(np.array([dead_frontier(self._frame, target)]))
             self._progressed = self._step
 
@@ -133,7 +133,7 @@ class MappingRobot:
 
     def _obey(self, target: int) -> None:
         if target != self._task.target:
-            self._take(Task(target))
+            self._adopt(Task(target))
 
     def _choose(self) -> None:
         registers = self._replica.registers
@@ -142,9 +142,9 @@ class MappingRobot:
         )
         task = self._dispatch.decide(group, absent, self._tick).get(self._me)
         if task is not None:
-            self._take(task)
+            self._adopt(task)
 
-    def _take(self, task: Task) -> None:
+    def _adopt(self, task: Task) -> None:
         if task.target != self._task.target:
             self._arrived = False
             self._progressed, self._left_cells = self._step, math.inf
@@ -154,13 +154,13 @@ class MappingRobot:
         """Whether there may still be something for this robot to do."""
         if self._step <= self._unsure_until:
             return True
-        frontiers = self._chart.frontiers
+        frontiers = self._fused_map.frontiers
         if not frontiers.size:
             return False
-        if self._task.target != NOWHERE and self._chart.is_frontier(self._task.target):
+        if self._task.target != NOWHERE and self._fused_map.is_frontier(self._task.target):
             return True
         cell = self._frame.cell_of(self._pose.x_m, self._pose.y_m)
-        return bool(np.isfinite(self._terrain.travel(cell)[frontiers]).any())
+        return bool(np.isfinite(self._cost_map.travel(cell)[frontiers]).any())
 
     # Acting.
 
@@ -171,7 +171,7 @@ class MappingRobot:
             moved = observation.pose != self._scanned_pose
             self._scanned_pose = observation.pose
             self._replica.append(
-                self._evidence.take(observation.scan, observation.pose, moved=moved)
+                self._evidence.observe(observation.scan, observation.pose, moved=moved)
             )
         self._arrived = self._task.target != NOWHERE and self._is_at(self._task.target)
 
@@ -201,7 +201,7 @@ class MappingRobot:
         here = int(told[registers.me, CELL]) - 1
         return any(
             told[slot, TARGET] == self._task.target + 1
-            and self._terrain.cells_between(int(told[slot, CELL]) - 1, here)
+            and self._cost_map.cells_between(int(told[slot, CELL]) - 1, here)
             <= self._clearance_cells
             for slot in map(registers.newest, range(self._me))
         )

@@ -91,113 +91,113 @@ def _lingering(seed: int, scenario: Scenario) -> Scenario:
 
 
 def _density(seed: int, sort: str) -> Tree:
-    dice = KeyedDraws(seed, _TEAM)
-    robots = dice.whole(2, 8)
-    points = robots * max(30, round(dice.scale(300, 6000) / robots))
-    period_s = dice.scale(0.25, 2.5)
+    draws = KeyedDraws(seed, _TEAM)
+    robots = draws.whole(2, 8)
+    points = robots * max(30, round(draws.scale(300, 6000) / robots))
+    period_s = draws.scale(0.25, 2.5)
     steps = points // robots
-    if dice.coin(0.4):
-        steps = round(steps * dice.between(1.0, 1.6))
+    if draws.coin(0.4):
+        steps = round(steps * draws.between(1.0, 1.6))
     clock = _clock(seed, period_s)
-    side_m = dice.between(100.0, 500.0)
+    side_m = draws.between(100.0, 500.0)
     fastest_s = period_s * (1.0 - clock["spread"])
-    calm_s = short(dice.between(0.3, 0.8) * (points // robots) * fastest_s)
-    stride_m = side_m * dice.scale(0.008, 0.08)
+    calm_s = short(draws.between(0.3, 0.8) * (points // robots) * fastest_s)
+    stride_m = side_m * draws.scale(0.008, 0.08)
     return {
         "calm_s": calm_s,
-        "coordination": "centralized" if dice.coin(_CENTRALIZED) else "decentralized",
-        "merge": "min" if sort == "min" or (sort == "spectral" and dice.coin(0.3)) else "ledger",
+        "coordination": "centralized" if draws.coin(_CENTRALIZED) else "decentralized",
+        "merge": "min" if sort == "min" or (sort == "spectral" and draws.coin(0.3)) else "ledger",
         "claims": sort in {"claims", "walking"},
         "limit_s": short(calm_s + 2.0 * (steps + 100) * period_s * (1.0 + clock["spread"])),
-        "domain": {"min_m": [0.0, 0.0], "max_m": [side_m, dice.between(100.0, 500.0)]},
+        "domain": {"min_m": [0.0, 0.0], "max_m": [side_m, draws.between(100.0, 500.0)]},
         "robots": {"count": robots},
         "starts": {"random": True},
-        "vehicle": _vehicle(dice, stride_m, period_s),
+        "vehicle": _vehicle(draws, stride_m, period_s),
         "clock": clock,
         "energy": {"points": points, "steps": steps},
-        "density": [_gaussian(dice, side_m) for _ in range(dice.whole(1, 3))],
+        "density": [_gaussian(draws, side_m) for _ in range(draws.whole(1, 3))],
         "samples": {
-            "count": round(dice.scale(16, 400)),
-            "diffusion_m": short(dice.scale(0.01, 0.5) * stride_m) if sort == "walking" else 0.0,
+            "count": round(draws.scale(16, 400)),
+            "diffusion_m": short(draws.scale(0.01, 0.5) * stride_m) if sort == "walking" else 0.0,
         },
         "targets": {
-            "count": dice.whole(0, 40),
-            "diffusion_m": dice.scale(0.01, 1.0) if dice.coin(0.3) else 0.0,
+            "count": draws.whole(0, 40),
+            "diffusion_m": draws.scale(0.01, 1.0) if draws.coin(0.3) else 0.0,
         },
-        "sensor": {"range_m": short(side_m * dice.scale(0.01, 0.2))},
+        "sensor": {"range_m": short(side_m * draws.scale(0.01, 0.2))},
         "planner": {
             "name": "spectral" if sort == "spectral" else "transport",
-            "horizon": dice.whole(1, 5),
-            "modes": dice.whole(2, 8),
+            "horizon": draws.whole(1, 5),
+            "modes": draws.whole(2, 8),
         },
         "reach_m": side_m,
     }
 
 
 def _map(seed: int) -> Tree:
-    dice = KeyedDraws(seed, _TEAM)
-    period_s = dice.scale(0.3, 1.0)
-    layout, side_m, resolution_m = dice.one_of(
+    draws = KeyedDraws(seed, _TEAM)
+    period_s = draws.scale(0.3, 1.0)
+    layout, side_m, resolution_m = draws.one_of(
         [("blank", 14.0, 1.0), ("office", 12.0, 0.25), ("unstructured", 24.0, 1.0)]
     )
     return {
-        "calm_s": short(dice.between(8.0, 30.0) * period_s),
-        "coordination": "centralized" if dice.coin(_CENTRALIZED) else "decentralized",
+        "calm_s": short(draws.between(8.0, 30.0) * period_s),
+        "coordination": "centralized" if draws.coin(_CENTRALIZED) else "decentralized",
         "limit_s": 1500.0,
         "map": {
             "layout": layout,
-            "size_m": [side_m, dice.between(side_m, 1.3 * side_m)],
+            "size_m": [side_m, draws.between(side_m, 1.3 * side_m)],
             "resolution_m": resolution_m,
-            "seed": dice.whole(0, 1000),
+            "seed": draws.whole(0, 1000),
         },
-        "robots": {"count": dice.whole(2, 4)},
-        "starts": {"random": True, "spread": dice.one_of(["separate", "together"])},
+        "robots": {"count": draws.whole(2, 4)},
+        "starts": {"random": True, "spread": draws.one_of(["separate", "together"])},
         "vehicle": {
-            "name": dice.one_of(["first-order", "second-order", "unicycle"], [4, 1, 1]),
-            "speed_m_s": short(dice.between(0.6, 1.2) * min(1.0, 2.0 * resolution_m) / period_s),
+            "name": draws.one_of(["first-order", "second-order", "unicycle"], [4, 1, 1]),
+            "speed_m_s": short(draws.between(0.6, 1.2) * min(1.0, 2.0 * resolution_m) / period_s),
         },
         "clock": _clock(seed, period_s),
-        "sensor": {"range_m": dice.between(3.0, 6.0), "beams": dice.whole(16, 64)},
+        "sensor": {"range_m": draws.between(3.0, 6.0), "beams": draws.whole(16, 64)},
         "planner": {
-            "name": dice.one_of(["frontier", "burgard", "market", "kmeans", "hungarian"]),
-            "coverage": dice.one_of(["histogram", "linear", "disc"]),
-            "patience": dice.whole(20, 60),
+            "name": draws.one_of(["frontier", "burgard", "market", "kmeans", "hungarian"]),
+            "coverage": draws.one_of(["histogram", "linear", "disc"]),
+            "patience": draws.whole(20, 60),
         },
         "reach_m": side_m,
     }
 
 
-def _vehicle(dice: KeyedDraws, stride_m: float, period_s: float) -> Tree:
+def _vehicle(draws: KeyedDraws, stride_m: float, period_s: float) -> Tree:
     speed_m_s = short(stride_m / period_s)
     return {
-        "name": dice.one_of(["first-order", "second-order", "unicycle", "dubins"], [6, 1, 1, 1]),
+        "name": draws.one_of(["first-order", "second-order", "unicycle", "dubins"], [6, 1, 1, 1]),
         "speed_m_s": speed_m_s,
-        "acceleration_m_s2": short(speed_m_s / period_s * dice.scale(0.3, 3.0)),
-        "turn_rate_rad_s": short(dice.scale(0.3, 3.0) / period_s),
-        "turn_radius_m": short(stride_m * dice.scale(0.3, 3.0)),
+        "acceleration_m_s2": short(speed_m_s / period_s * draws.scale(0.3, 3.0)),
+        "turn_rate_rad_s": short(draws.scale(0.3, 3.0) / period_s),
+        "turn_radius_m": short(stride_m * draws.scale(0.3, 3.0)),
     }
 
 
-def _gaussian(dice: KeyedDraws, side_m: float) -> Tree:
-    spread_m = side_m * dice.between(0.05, 0.3)
+def _gaussian(draws: KeyedDraws, side_m: float) -> Tree:
+    spread_m = side_m * draws.between(0.05, 0.3)
     return {
-        "mean_m": [dice.between(0.1 * side_m, 0.9 * side_m) for _ in "xy"],
-        "variance_m2": [short(spread_m**2), short(spread_m**2 * dice.between(0.3, 1.0))],
-        "weight": dice.between(0.2, 1.0),
+        "mean_m": [draws.between(0.1 * side_m, 0.9 * side_m) for _ in "xy"],
+        "variance_m2": [short(spread_m**2), short(spread_m**2 * draws.between(0.3, 1.0))],
+        "weight": draws.between(0.2, 1.0),
     }
 
 
 def _clock(seed: int, period_s: float) -> Tree:
     """Most teams step all at once; the others show what clocks do to them."""
-    dice = KeyedDraws(seed, _CLOCK)
-    if dice.coin(0.7):
+    draws = KeyedDraws(seed, _CLOCK)
+    if draws.coin(0.7):
         return {"period_s": period_s, "spread": 0.0}
-    spread = dice.between(0.0, 0.4) if dice.coin(0.4) else 0.0
-    drift_ppm = dice.scale(1.0, 50_000.0) if dice.coin(0.4) else 0.0
-    jitter = dice.between(0.0, 0.8) if dice.coin(0.4) else 0.0
+    spread = draws.between(0.0, 0.4) if draws.coin(0.4) else 0.0
+    drift_ppm = draws.scale(1.0, 50_000.0) if draws.coin(0.4) else 0.0
+    jitter = draws.between(0.0, 0.8) if draws.coin(0.4) else 0.0
     return {
         "period_s": period_s,
-        "order": dice.one_of(["concurrent", "turn"]),
+        "order": draws.one_of(["concurrent", "turn"]),
         "spread": spread,
         "drift_ppm": drift_ppm,
         "jitter_s": short(jitter * period_s * (1.0 - spread) * 0.9),
@@ -205,33 +205,33 @@ def _clock(seed: int, period_s: float) -> Tree:
 
 
 def _publish(seed: int) -> Tree:
-    dice = KeyedDraws(seed, _PUBLISH)
-    return {"weights_every": dice.whole(1, 20), "keyframe_every": dice.whole(1, 30)}
+    draws = KeyedDraws(seed, _PUBLISH)
+    return {"weights_every": draws.whole(1, 20), "keyframe_every": draws.whole(1, 30)}
 
 
 def _radio(seed: int, tree: Tree) -> Tree:
     """Ranges from nobody near to everybody; imperfections that stay when the faults are over."""
-    dice = KeyedDraws(seed, _RADIO)
+    draws = KeyedDraws(seed, _RADIO)
     reach_m, period_s = tree.pop("reach_m"), tree["clock"]["period_s"]
-    if tree["coordination"] == "centralized" and dice.coin(0.6):
+    if tree["coordination"] == "centralized" and draws.coin(0.6):
         middle = 0.5 * reach_m
-        placed = {"pose_m": [middle, middle], "range_m": short(reach_m * dice.scale(0.3, 1.5))}
-        tree["supervisor"] = placed if "map" not in tree or dice.coin(0.5) else {}
-    radio: Tree = {"beacon": dice.one_of(["versions", "state"], [2, 1])}
-    if dice.coin(0.8):
-        radio["range_m"] = short(reach_m * dice.scale(0.1, 1.5))
-    if dice.coin(0.3):
-        radio["drop"] = dice.between(0.0, 0.4)
-    if dice.coin(0.4):
-        radio["delay_s"] = short(dice.scale(0.1, 4.0) * period_s)
-    if dice.coin(0.4):
-        radio["jitter_s"] = short(dice.scale(0.1, 4.0) * period_s)
-    if dice.coin(0.2):
-        radio["duplicate"] = dice.between(0.0, 0.5)
-    if dice.coin(0.2):
-        radio |= {"reorder": dice.between(0.0, 0.5), "reorder_s": short(3.0 * period_s)}
-    if "map" in tree and dice.coin(0.4):
-        radio |= {"line_of_sight": dice.coin(), "wall_loss_m": dice.between(0.0, 3.0)}
+        placed = {"pose_m": [middle, middle], "range_m": short(reach_m * draws.scale(0.3, 1.5))}
+        tree["supervisor"] = placed if "map" not in tree or draws.coin(0.5) else {}
+    radio: Tree = {"beacon": draws.one_of(["versions", "state"], [2, 1])}
+    if draws.coin(0.8):
+        radio["range_m"] = short(reach_m * draws.scale(0.1, 1.5))
+    if draws.coin(0.3):
+        radio["drop"] = draws.between(0.0, 0.4)
+    if draws.coin(0.4):
+        radio["delay_s"] = short(draws.scale(0.1, 4.0) * period_s)
+    if draws.coin(0.4):
+        radio["jitter_s"] = short(draws.scale(0.1, 4.0) * period_s)
+    if draws.coin(0.2):
+        radio["duplicate"] = draws.between(0.0, 0.5)
+    if draws.coin(0.2):
+        radio |= {"reorder": draws.between(0.0, 0.5), "reorder_s": short(3.0 * period_s)}
+    if "map" in tree and draws.coin(0.4):
+        radio |= {"line_of_sight": draws.coin(), "wall_loss_m": draws.between(0.0, 3.0)}
     return radio
 
 
@@ -241,7 +241,7 @@ class Setting(NamedTuple):
     scenario: Scenario
     calm_s: float
     """All is over then."""
-    dice: KeyedDraws
+    draws: KeyedDraws
 
     @property
     def roster(self) -> tuple[ParticipantId, ...]:
@@ -255,117 +255,117 @@ class Setting(NamedTuple):
 
     def window(self, longest_s: float) -> Tree:
         """From somewhere in the first phase for at most so long."""
-        dice, calm_s = self.dice, self.calm_s
-        length_s = min(dice.scale(self.period_s, max(longest_s, 2.0 * self.period_s)), calm_s)
-        from_s = 0.0 if dice.coin(0.1) else dice.unit() * (calm_s - length_s)
+        draws, calm_s = self.draws, self.calm_s
+        length_s = min(draws.scale(self.period_s, max(longest_s, 2.0 * self.period_s)), calm_s)
+        from_s = 0.0 if draws.coin(0.1) else draws.unit() * (calm_s - length_s)
         return {"from_s": short(from_s), "until_s": short(min(from_s + length_s, calm_s))}
 
     def links(self) -> Tree:
         """All links, or those of somebody."""
-        return {"robots": self.dice.some_of(self.roster)} if self.dice.coin(0.4) else {}
+        return {"robots": self.draws.some_of(self.roster)} if self.draws.coin(0.4) else {}
 
     def who(self, *others: ParticipantId) -> Tree:
         """One participant more often than not, of the roster or of the others."""
-        others = others if self.dice.coin(0.2) else ()
-        if SUPERVISOR in self.roster and self.dice.coin(0.25):
+        others = others if self.draws.coin(0.2) else ()
+        if SUPERVISOR in self.roster and self.draws.coin(0.25):
             return {"who": [SUPERVISOR]}
-        return {"who": list(others) or self.dice.some_of(self.roster)}
+        return {"who": list(others) or self.draws.some_of(self.roster)}
 
 
 def _partition(at: Setting) -> Tree:
-    dice = at.dice
-    shape = dice.one_of(["halves", "ring", "bridge", "isolate", "groups"])
+    draws = at.draws
+    shape = draws.one_of(["halves", "ring", "bridge", "isolate", "groups"])
     tree: Tree = {"shape": shape, **at.window(0.8 * at.calm_s)}
     if shape == "isolate":
-        tree["robots"] = dice.some_of(at.roster)
+        tree["robots"] = draws.some_of(at.roster)
     if shape == "groups":
-        sides = [dice.whole(0, 2) for _ in at.roster]
+        sides = [draws.whole(0, 2) for _ in at.roster]
         groups = [
             [name for name, side in zip(at.roster, sides, strict=True) if side == i] for i in (1, 2)
         ]
         tree["groups"] = [group for group in groups if group]
-    if dice.coin(0.35):
-        tree |= {"flap_s": dice.scale(at.period_s, 10.0 * at.period_s)}
-        tree |= {"flap_share": dice.between(0.1, 0.9)} if dice.coin() else {}
+    if draws.coin(0.35):
+        tree |= {"flap_s": draws.scale(at.period_s, 10.0 * at.period_s)}
+        tree |= {"flap_share": draws.between(0.1, 0.9)} if draws.coin() else {}
     return tree
 
 
 def _one_way(at: Setting) -> Tree:
-    ends = at.dice.one_of([("senders",), ("receivers",), ("senders", "receivers")])
-    return at.window(at.calm_s) | {end: at.dice.some_of(at.roster) for end in ends}
+    ends = at.draws.one_of([("senders",), ("receivers",), ("senders", "receivers")])
+    return at.window(at.calm_s) | {end: at.draws.some_of(at.roster) for end in ends}
 
 
 def _burst(at: Setting) -> Tree:
     return {
-        "good_s": at.dice.scale(at.period_s, 30.0 * at.period_s),
-        "bad_s": at.dice.scale(at.period_s, 30.0 * at.period_s),
-        "drop_good": at.dice.between(0.0, 0.2),
-        "drop_bad": at.dice.between(0.5, 1.0),
+        "good_s": at.draws.scale(at.period_s, 30.0 * at.period_s),
+        "bad_s": at.draws.scale(at.period_s, 30.0 * at.period_s),
+        "drop_good": at.draws.between(0.0, 0.2),
+        "drop_bad": at.draws.between(0.5, 1.0),
     }
 
 
 def _bandwidth(at: Setting) -> Tree:
-    tree: Tree = {"bytes_per_s": short(at.dice.scale(10.0, 1000.0) / at.period_s)}
-    return tree | ({"queue_bytes": round(at.dice.scale(10, 3000))} if at.dice.coin() else {})
+    tree: Tree = {"bytes_per_s": short(at.draws.scale(10.0, 1000.0) / at.period_s)}
+    return tree | ({"queue_bytes": round(at.draws.scale(10, 3000))} if at.draws.coin() else {})
 
 
 def _range(at: Setting) -> Tree:
     scenario = at.scenario
     reach_m = scenario.supervisor.range_m if scenario.centralized else scenario.radio.range_m
-    if reach_m < 1e9 and at.dice.coin():
-        return {"factor": at.dice.between(0.0, 0.9)}
-    return {"range_m": short(min(reach_m, 200.0) * at.dice.between(0.0, 0.9))}
+    if reach_m < 1e9 and at.draws.coin():
+        return {"factor": at.draws.between(0.0, 0.9)}
+    return {"range_m": short(min(reach_m, 200.0) * at.draws.between(0.0, 0.9))}
 
 
 def _kill(at: Setting) -> Tree:
-    dice = at.dice
+    draws = at.draws
     who = at.who(WORLD_SIM)
     tree = at.window(0.3 * at.calm_s) | who
     if WORLD_SIM in who["who"]:
         return tree
-    if dice.coin(0.1) and SUPERVISOR not in who["who"]:
-        return {"from_s": tree["from_s"], "who": who["who"][:1], "mid_step": dice.coin()}
-    disk = dice.one_of(["kept", "torn", "lost"], [2, 1, 1])
-    return tree | {"disk": disk, "mid_step": dice.coin(0.4)}
+    if draws.coin(0.1) and SUPERVISOR not in who["who"]:
+        return {"from_s": tree["from_s"], "who": who["who"][:1], "mid_step": draws.coin()}
+    disk = draws.one_of(["kept", "torn", "lost"], [2, 1, 1])
+    return tree | {"disk": disk, "mid_step": draws.coin(0.4)}
 
 
 def _late(at: Setting) -> Tree:
-    return {"until_s": short(at.dice.between(0.05, 0.8) * at.calm_s), **at.who()}
+    return {"until_s": short(at.draws.between(0.05, 0.8) * at.calm_s), **at.who()}
 
 
 def _clock_fault(at: Setting) -> Tree:
-    dice = at.dice
+    draws = at.draws
     tree = at.window(at.calm_s) | at.who()
-    sign = dice.one_of([-1.0, 1.0])
-    if dice.coin(0.8):
-        tree["offset_s"] = sign * dice.scale(0.01, 3600.0)
-    if dice.coin(0.5) or "offset_s" not in tree:
-        tree["rate_ppm"] = float(round(sign * dice.scale(10.0, 50_000.0)))
+    sign = draws.one_of([-1.0, 1.0])
+    if draws.coin(0.8):
+        tree["offset_s"] = sign * draws.scale(0.01, 3600.0)
+    if draws.coin(0.5) or "offset_s" not in tree:
+        tree["rate_ppm"] = float(round(sign * draws.scale(10.0, 50_000.0)))
     return tree
 
 
 _DRAWN: dict[str, Callable[[Setting], Tree]] = {
-    "drop": lambda at: {"probability": at.dice.between(0.05, 0.6)} | at.links(),
+    "drop": lambda at: {"probability": at.draws.between(0.05, 0.6)} | at.links(),
     "burst": lambda at: _burst(at) | at.links(),
     "delay": lambda at: {
-        "delay_s": at.dice.scale(0.05, 10.0),
-        "jitter_s": at.dice.scale(0.05, 10.0) if at.dice.coin() else 0.0,
+        "delay_s": at.draws.scale(0.05, 10.0),
+        "jitter_s": at.draws.scale(0.05, 10.0) if at.draws.coin() else 0.0,
         **at.links(),
     },
     "duplicate": lambda at: {
-        "probability": at.dice.between(0.05, 0.5),
-        "copies": at.dice.whole(1, 3),
-        "delay_s": at.dice.scale(0.01, 10.0),
+        "probability": at.draws.between(0.05, 0.5),
+        "copies": at.draws.whole(1, 3),
+        "delay_s": at.draws.scale(0.01, 10.0),
         **at.links(),
     },
     "replay": lambda at: {
-        "probability": at.dice.between(0.02, 0.5),
-        "age_s": at.dice.scale(at.period_s, at.calm_s + at.period_s),
+        "probability": at.draws.between(0.02, 0.5),
+        "age_s": at.draws.scale(at.period_s, at.calm_s + at.period_s),
         **at.links(),
     },
     "reorder": lambda at: {
-        "probability": at.dice.between(0.05, 0.6),
-        "hold_s": at.dice.scale(at.period_s, 10.0 * at.period_s),
+        "probability": at.draws.between(0.05, 0.6),
+        "hold_s": at.draws.scale(at.period_s, 10.0 * at.period_s),
         **at.links(),
     },
     "one-way": _one_way,
@@ -373,14 +373,14 @@ _DRAWN: dict[str, Callable[[Setting], Tree]] = {
     "clog": lambda at: at.window(30.0) | at.links(),
     "bandwidth": _bandwidth,
     "range": lambda at: _range(at) | at.links(),
-    "hostile": lambda at: {"probability": at.dice.between(0.01, 0.2)} | at.links(),
+    "hostile": lambda at: {"probability": at.draws.between(0.01, 0.2)} | at.links(),
     "kill": _kill,
     "pause": lambda at: at.window(60.0) | at.who(WORLD_SIM),
     "late": _late,
-    "slow": lambda at: {"every": at.dice.whole(2, 12)} | at.window(at.calm_s) | at.who(),
+    "slow": lambda at: {"every": at.draws.whole(2, 12)} | at.window(at.calm_s) | at.who(),
     "full-disk": lambda at: at.window(0.3 * at.calm_s) | at.who(),
     "clock": _clock_fault,
-    "impostor": lambda at: {"from_s": short(at.dice.unit() * at.calm_s), **at.who()},
+    "impostor": lambda at: {"from_s": short(at.draws.unit() * at.calm_s), **at.who()},
 }
 """What is drawn for each class. Whoever says nothing of a window gets one."""
 
@@ -394,9 +394,9 @@ def _faults(seed: int, scenario: Scenario, calm_s: float) -> Iterable[Fault]:
     taken: list[Fault] = []
     for number, kind in enumerate(KINDS):
         at = Setting(scenario, calm_s, KeyedDraws(seed, _A_CLASS + number))
-        if not at.dice.coin(bias):
+        if not at.draws.coin(bias):
             continue
-        for _ in range(at.dice.whole(1, _MANY.get(kind, 2))):
+        for _ in range(at.draws.whole(1, _MANY.get(kind, 2))):
             fault = next(candidates(at, kind, taken), None)
             taken += [] if fault is None else [fault]
     return taken

@@ -56,13 +56,13 @@ class FaultCoverage:
         self.counts: Counter[str] = Counter()
         self._faults: tuple[Fault, ...] = ()
 
-    def take(self, record: Record) -> None:
+    def observe(self, record: Record) -> None:
         """Follow one record."""
         if isinstance(record, Batch):
-            for toll in record.tolls:
-                fault = self._faults[toll.fault]
+            for stats in record.fault_stats:
+                fault = self._faults[stats.fault]
                 if not isinstance(fault, Hostile):
-                    hit = toll.dropped + toll.delayed + toll.doubled + toll.replayed
+                    hit = stats.dropped + stats.delayed + stats.doubled + stats.replayed
                     self._count(fault, "", hit)
             if record.injected:
                 self.counts["hostile"] += len(record.injected)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from kantor_fleet.campaign.keyed_draws import KeyedDraws
-from kantor_protocol.base.incarnations import EPOCHS_MAX
+from kantor_protocol.base.incarnations import INCARNATIONS_MAX
 from kantor_protocol.replication.gossip import build_replica
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.scenario.schema import Scenario
@@ -34,15 +34,15 @@ class _Said(NamedTuple):
 def differing(scenario: Scenario, seed: int, records: Iterable[Record]) -> Iterable[str]:
     """What is wrong with that, if anything; nothing for a mission with a map, which has no weights."""
     said = list(_said(scenario, records)) if not scenario.mapping else []
-    epoch = 1 + max((each.news.epoch for each in said), default=0)
-    if not said or epoch > EPOCHS_MAX:
+    incarnation = 1 + max((each.news.incarnation for each in said), default=0)
+    if not said or incarnation > INCARNATIONS_MAX:
         return
-    dice = KeyedDraws(seed, _SUBJECT)
+    draws = KeyedDraws(seed, _SUBJECT)
     twice = said + said
-    late = [i + dice.unit() * _LATE for i in range(len(twice))]
+    late = [i + draws.unit() * _LATE for i in range(len(twice))]
     shuffled = [twice[i] for i in sorted(range(len(twice)), key=late.__getitem__)]
-    one, other = (_learned(scenario, epoch, order) for order in (said, shuffled))
-    if one.manner.ledger and not np.array_equal(one.store.length, other.store.length):
+    one, other = (_learned(scenario, incarnation, order) for order in (said, shuffled))
+    if one.config.ledger and not np.array_equal(one.store.length, other.store.length):
         yield "join: logs have other lengths when they are learned in another order"
     elif not np.array_equal(one.weights, other.weights):
         yield "join: weights are others when messages are learned in another order, and twice"
@@ -51,21 +51,21 @@ def differing(scenario: Scenario, seed: int, records: Iterable[Record]) -> Itera
 def _said(scenario: Scenario, records: Iterable[Record]) -> Iterable[_Said]:
     places = {name: i for i, name in enumerate(scenario.roster)}
     for record in records:
-        for act in record.acts if isinstance(record, Batch) else ():
-            for envelope in act.outputs.outbox if act.outputs else ():
+        for step_record in record.step_records if isinstance(record, Batch) else ():
+            for envelope in step_record.outputs.outbox if step_record.outputs else ():
                 news = decode_gossip(envelope.body)
-                yield _Said(places[act.name] + news.epoch * len(places), news)
+                yield _Said(places[step_record.name] + news.incarnation * len(places), news)
 
 
-def _learned(scenario: Scenario, epoch: int, said: Sequence[_Said]) -> Replica:
+def _learned(scenario: Scenario, incarnation: int, said: Sequence[_Said]) -> Replica:
     """Somebody who has learned it all."""
     samples = scenario.samples.count or 0
     units = Units.of(scenario.energy.points, samples)
-    replica = build_replica(scenario.roster[0], scenario, units, samples, epoch)
+    replica = build_replica(scenario.roster[0], scenario, units, samples, incarnation)
     before = -1
     for _ in range(_PASSES):
         for slot, news in said:
-            replica.learn(slot, news.have, news.logs, news.claims, news.registers)
+            replica.learn(slot, news.version_vector, news.logs, news.claims, news.registers)
         replica.end_step()
         held = int(replica.store.length.sum())
         if held == before:

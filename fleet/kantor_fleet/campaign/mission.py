@@ -109,12 +109,12 @@ class Follower:
         self.judged: frozenset[str] = frozenset()
         """Rules of liveness that the record could have broken."""
 
-    def take(self, record: Record) -> None:
+    def observe(self, record: Record) -> None:
         """Follow one record."""
-        self.recording.take(record)
+        self.recording.observe(record)
         self.payloads.append(self.recording.payload)
-        self.struck.take(record)
-        self.sightings.take(record)
+        self.struck.observe(record)
+        self.sightings.observe(record)
 
     @property
     def steps(self) -> int:
@@ -133,13 +133,13 @@ class Follower:
 
     def _judged(self) -> list[str]:
         """What referees find who have nothing but the bytes of the record."""
-        reader, liveness = ColumnarDecoder(), LivenessChecker()
-        checker = Checker(reader)
+        decoder, liveness = ColumnarDecoder(), LivenessChecker()
+        checker = Checker(decoder)
         for payload in self.payloads:
             record = decode_record(payload)
-            reader.read(record, payload)
-            checker.take(record)
-            liveness.take(record)
+            decoder.read(record, payload)
+            checker.observe(record)
+            liveness.observe(record)
         self.judged = frozenset(liveness.judged)
         return checker.complaints or liveness.complaints
 
@@ -148,7 +148,7 @@ def _attempt(case: Case) -> dict[str, Any]:
     scenario, seed = case.scenario, case.seed
     site = WorldSetup.of(scenario, seed)
     follower = Follower(scenario, seed)
-    ended = play(scenario, seed, site, [follower.take], stopped=lambda: follower.broken)
+    ended = play(scenario, seed, site, [follower.observe], stopped=lambda: follower.broken)
     result = follower.recording.finish()
     complaints = follower.complaints()
     twice, cut = seed % TWICE_EVERY == 0, seed % CUT_EVERY == 0
@@ -184,22 +184,22 @@ def _differing(scenario: Scenario, seed: int, digest: str) -> Iterable[str]:
 
 def _cut_open(seed: int, payloads: list[bytes]) -> Iterable[str]:
     """The journal as a killed recorder leaves it: every record up to the cut, and nothing wrong in them."""
-    dice = KeyedDraws(seed, _SUBJECT)
+    draws = KeyedDraws(seed, _SUBJECT)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / JOURNAL
         journal = Journal(path)
         for payload in payloads:
-            journal.take(decode_record(payload), payload)
+            journal.append(decode_record(payload), payload)
         journal.close()
         whole = path.read_bytes()
         for _ in range(_CUTS):
-            path.write_bytes(whole[: dice.whole(0, len(whole))])
+            path.write_bytes(whole[: draws.whole(0, len(whole))])
             found = list(read(path))
             if [payload for payload, _ in found] != payloads[: len(found)]:
                 yield "prefix: what is left of a journal that was cut is not what was written"
-            reader = ColumnarDecoder()
-            checker = Checker(reader)
+            decoder = ColumnarDecoder()
+            checker = Checker(decoder)
             for payload, record in found:
-                reader.read(record, payload)
-                checker.take(record)
+                decoder.read(record, payload)
+                checker.observe(record)
             yield from checker.complaints

@@ -79,42 +79,42 @@ def process_scenario(seed: int, speed: float = SPEED, storm_s: float = STORM_S) 
 
 
 def _team(seed: int, speed: float, pace: float, storm_s: float) -> Tree:
-    dice = KeyedDraws(seed, _SUBJECT)
-    robots, merge = dice.whole(4, 6), dice.one_of(["ledger", "min"])
-    period_s = short(speed * dice.between(0.09, 0.14))
+    draws = KeyedDraws(seed, _SUBJECT)
+    robots, merge = draws.whole(4, 6), draws.one_of(["ledger", "min"])
+    period_s = short(speed * draws.between(0.09, 0.14))
     steps = max(20, round(_SPENDING_SHARE * pace * storm_s / period_s))
-    side_m = dice.between(100.0, 400.0)
-    spread = dice.between(0.0, 0.2) if dice.coin() else 0.0
+    side_m = draws.between(100.0, 400.0)
+    spread = draws.between(0.0, 0.2) if draws.coin() else 0.0
     return {
         "name": f"storm-{seed}",
         "summary": f"Seed {seed} of a campaign on processes: {merge}, {robots} robots",
         "coordination": "centralized",
         "merge": merge,
-        "claims": merge == "ledger" and dice.coin(),
+        "claims": merge == "ledger" and draws.coin(),
         "limit_s": short(pace * (storm_s + _REST_S)),
         "domain": {"min_m": [0.0, 0.0], "max_m": [side_m, side_m]},
         "robots": {"count": robots},
         "starts": {"random": True},
-        "vehicle": {"speed_m_s": short(side_m * dice.scale(0.01, 0.06) / period_s)},
+        "vehicle": {"speed_m_s": short(side_m * draws.scale(0.01, 0.06) / period_s)},
         "clock": {
             "period_s": period_s,
             "spread": spread,
-            "drift_ppm": dice.scale(1.0, 10_000.0) if dice.coin() else 0.0,
-            "jitter_s": short(0.2 * dice.unit() * period_s) if dice.coin() else 0.0,
+            "drift_ppm": draws.scale(1.0, 10_000.0) if draws.coin() else 0.0,
+            "jitter_s": short(0.2 * draws.unit() * period_s) if draws.coin() else 0.0,
         },
         "energy": {"points": robots * steps, "steps": steps},
         "density": [
             {
-                "mean_m": [dice.between(0.2 * side_m, 0.8 * side_m) for _ in "xy"],
+                "mean_m": [draws.between(0.2 * side_m, 0.8 * side_m) for _ in "xy"],
                 "variance_m2": [short((0.2 * side_m) ** 2)] * 2,
             }
         ],
-        "samples": {"count": dice.whole(50, 300)},
-        "targets": {"count": dice.whole(0, 20)},
+        "samples": {"count": draws.whole(50, 300)},
+        "targets": {"count": draws.whole(0, 20)},
         "sensor": {"range_m": short(0.05 * side_m)},
         "radio": {
-            "range_m": short(side_m * dice.scale(0.3, 1.5)),
-            "delay_s": short(dice.unit() * period_s) if dice.coin() else 0.0,
+            "range_m": short(side_m * draws.scale(0.3, 1.5)),
+            "delay_s": short(draws.unit() * period_s) if draws.coin() else 0.0,
         },
         "metrics": {"every": 20},
     }
@@ -127,16 +127,16 @@ def _lingering(scenario: Scenario, speed: float) -> Scenario:
 
 
 def _of_links(at: Setting, kind: str) -> Iterator[Fault]:
-    if at.dice.coin(_A_LINK):
-        for _ in range(at.dice.whole(1, 2)):
+    if at.draws.coin(_A_LINK):
+        for _ in range(at.draws.whole(1, 2)):
             yield from (fault for fault in [next(candidates(at, kind, []), None)] if fault)
 
 
 class _Timetable:
     """When which process is hit. Times in here are real seconds since the start."""
 
-    def __init__(self, dice: KeyedDraws, scenario: Scenario, pace: float, storm_s: float) -> None:
-        self._dice, self._scenario = dice, scenario
+    def __init__(self, draws: KeyedDraws, scenario: Scenario, pace: float, storm_s: float) -> None:
+        self._draws, self._scenario = draws, scenario
         self._pace, self._storm_s = pace, storm_s
         names = (*scenario.roster, WORLD_SIM)
         self._taken: dict[ParticipantId, list[tuple[float, float]]] = {name: [] for name in names}
@@ -144,68 +144,68 @@ class _Timetable:
 
     def draw(self) -> list[Fault]:
         """Everything that befalls processes, what has the least room first."""
-        dice, robots = self._dice, self._scenario.robot_ids
+        draws, robots = self._draws, self._scenario.robot_ids
         self._times(_WORLD_SIM_KILLS, lambda: self._kill(WORLD_SIM))
         self._times(_WORLD_SIM_PAUSES, lambda: self._pause(WORLD_SIM))
-        if dice.coin(_PROBABILITIES["late"]):
-            self._late(dice.one_of(robots))
+        if draws.coin(_PROBABILITIES["late"]):
+            self._late(draws.one_of(robots))
         for _ in range(self._some("impostor")):
-            self._strike("impostor", dice.one_of(self._scenario.roster), None, _IMPOSTOR_S)
-        if dice.coin(_LOST):
-            self._lose(dice.one_of(robots))
+            self._strike("impostor", draws.one_of(self._scenario.roster), None, _IMPOSTOR_S)
+        if draws.coin(_LOST):
+            self._lose(draws.one_of(robots))
         self._times(_SUPERVISOR_KILLS, lambda: self._kill(SUPERVISOR))
-        self._times(_ROBOT_KILLS, lambda: self._kill(dice.one_of(robots)))
+        self._times(_ROBOT_KILLS, lambda: self._kill(draws.one_of(robots)))
         self._times(_SUPERVISOR_PAUSES, lambda: self._pause(SUPERVISOR))
-        self._times(_ROBOT_PAUSES, lambda: self._pause(dice.one_of(robots)))
+        self._times(_ROBOT_PAUSES, lambda: self._pause(draws.one_of(robots)))
         for _ in range(self._some("slow")):
-            name, every = dice.one_of(self._scenario.roster), dice.whole(2, 5)
-            self._strike("slow", name, dice.between(1.0, 4.0), every=every)
+            name, every = draws.one_of(self._scenario.roster), draws.whole(2, 5)
+            self._strike("slow", name, draws.between(1.0, 4.0), every=every)
         for _ in range(self._some("full-disk")):
-            name = dice.one_of(self._scenario.roster)
-            self._strike("full-disk", name, dice.between(0.5, 3.0))
+            name = draws.one_of(self._scenario.roster)
+            self._strike("full-disk", name, draws.between(0.5, 3.0))
         for _ in range(self._some("clock")):
-            self._clock(dice.one_of(self._scenario.roster))
+            self._clock(draws.one_of(self._scenario.roster))
         return self._faults
 
     def _times(self, in_storm: float, strike: Callable[[], bool]) -> None:
         """So often, in proportion to the storm; what is over a whole number is a chance."""
         wanted = in_storm * self._storm_s / STORM_S
-        times = max(1, math.floor(wanted + self._dice.unit())) if in_storm >= 1.0 else 0
-        times = times or int(self._dice.coin(min(1.0, wanted)))
+        times = max(1, math.floor(wanted + self._draws.unit())) if in_storm >= 1.0 else 0
+        times = times or int(self._draws.coin(min(1.0, wanted)))
         for _ in range(times):
             for _ in range(_TRIES):
                 if strike():
                     break
 
     def _some(self, kind: str) -> int:
-        return self._dice.whole(1, 2) if self._dice.coin(_PROBABILITIES[kind]) else 0
+        return self._draws.whole(1, 2) if self._draws.coin(_PROBABILITIES[kind]) else 0
 
     def _kill(self, name: ParticipantId) -> bool:
-        dice, length_s = self._dice, self._dice.between(0.3, 2.0)
+        draws, length_s = self._draws, self._draws.between(0.3, 2.0)
         if name == WORLD_SIM:
             return self._strike("kill", name, length_s)
-        disk = dice.one_of(["kept", "torn", "lost"], [2, 1, 1])
-        return self._strike("kill", name, length_s, disk=disk, mid_step=dice.coin(0.3))
+        disk = draws.one_of(["kept", "torn", "lost"], [2, 1, 1])
+        return self._strike("kill", name, length_s, disk=disk, mid_step=draws.coin(0.3))
 
     def _pause(self, name: ParticipantId) -> bool:
         """Some for longer than a lease."""
-        return self._strike("pause", name, self._dice.between(0.2, 2.2))
+        return self._strike("pause", name, self._draws.between(0.2, 2.2))
 
     def _clock(self, name: ParticipantId) -> None:
-        sign, jumps = self._dice.one_of([-1.0, 1.0]), self._dice.coin()
-        wrong: Tree = {"offset_s": sign * self._dice.scale(0.01, 3600.0)}
+        sign, jumps = self._draws.one_of([-1.0, 1.0]), self._draws.coin()
+        wrong: Tree = {"offset_s": sign * self._draws.scale(0.01, 3600.0)}
         if not jumps:
-            wrong = {"rate_ppm": float(round(sign * self._dice.scale(10.0, 50_000.0)))}
-        self._strike("clock", name, self._dice.between(1.0, 10.0), stops=False, **wrong)
+            wrong = {"rate_ppm": float(round(sign * self._draws.scale(10.0, 50_000.0)))}
+        self._strike("clock", name, self._draws.between(1.0, 10.0), stops=False, **wrong)
 
     def _late(self, name: ParticipantId) -> None:
-        until_s = self._dice.between(0.5, min(4.0, 0.3 * self._storm_s))
-        self._take("late", name, 0.0, until_s, {"from_s": 0.0})
+        until_s = self._draws.between(0.5, min(4.0, 0.3 * self._storm_s))
+        self._reserve("late", name, 0.0, until_s, {"from_s": 0.0})
 
     def _lose(self, name: ParticipantId) -> None:
         """Towards the end, for good."""
-        from_s = self._storm_s * self._dice.between(0.8, 0.95)
-        self._take("kill", name, from_s, math.inf, {})
+        from_s = self._storm_s * self._draws.between(0.8, 0.95)
+        self._reserve("kill", name, from_s, math.inf, {})
 
     def _strike(
         self,
@@ -221,11 +221,11 @@ class _Timetable:
         length_s = None if length_s is None else min(length_s, self._storm_s / 3.0)
         room_s = length_s or takes_s
         for _ in range(_TRIES):
-            from_s = _CALM_START_S + self._dice.unit() * (self._storm_s - _CALM_START_S - room_s)
+            from_s = _CALM_START_S + self._draws.unit() * (self._storm_s - _CALM_START_S - room_s)
             if stops and not self._is_free(kind, name, from_s, from_s + room_s):
                 continue
             until_s = None if length_s is None else from_s + length_s
-            if self._take(kind, name, from_s, until_s, dict(more), takes_s if stops else None):
+            if self._reserve(kind, name, from_s, until_s, dict(more), takes_s if stops else None):
                 return True
         return False
 
@@ -243,7 +243,7 @@ class _Timetable:
             for moment_s in (from_s, until_s)
         )
 
-    def _take(
+    def _reserve(
         self,
         kind: str,
         name: ParticipantId,

@@ -98,19 +98,19 @@ class ProcessMission(NamedTuple):
     grown: dict[str, Grown] = {}  # noqa: RUF012  nobody writes to it
 
 
-def soak(order: Soak) -> Exit:
+def soak(config: Soak) -> Exit:
     """Fly mission after mission, up to the first that breaks a rule; what to exit with."""
     started_s = time.monotonic()
     totals = Totals()
     with Interrupts() as interrupts, _own_temporary_folder() as temporary:
-        print(f"warming up; {order.terms.storm_s:g} s of storm in each mission", flush=True)
+        print(f"warming up; {config.terms.storm_s:g} s of storm in each mission", flush=True)
         warm_up()
-        for seed in order.seeds:
+        for seed in config.seeds:
             spent_s = time.monotonic() - started_s
-            if order.minutes is not None and spent_s >= 60.0 * order.minutes:
+            if config.minutes is not None and spent_s >= 60.0 * config.minutes:
                 break
-            place = order.folder / FOLDER / f"seed-{seed}"
-            flight = run_mission(seed, order.terms, place, interrupts, temporary)
+            place = config.folder / FOLDER / f"seed-{seed}"
+            flight = run_mission(seed, config.terms, place, interrupts, temporary)
             if interrupts():
                 break
             totals.add(flight)
@@ -121,7 +121,7 @@ def soak(order: Soak) -> Exit:
     for line in totals.lines(time.monotonic() - started_s):
         print(line)
     if totals.broken is not None:
-        _report(totals.broken, order)
+        _report(totals.broken, config)
     return interrupts.code or (Exit.DONE if totals.met else Exit.NOT_MET)
 
 
@@ -149,22 +149,24 @@ def run_mission(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     exchange = "lockstep" if is_lockstep(seed) else "wall"
-    order = FleetConfig(scenario, seed, exchange, terms.speed, folder)
+    config = FleetConfig(scenario, seed, exchange, terms.speed, folder)
     before = _entries(temporary)
-    failures, grown = _run(order, stopped)
+    failures, grown = _run(config, stopped)
     failures += [f"orphan: process {pid} is there yet" for pid in _orphans()]
     failures += [f"leftover: {name} in {temporary}" for name in _entries(temporary) - before]
     if stopped():
         return ProcessMission(seed, exchange, "interrupted", 0.0, (), Counter())
-    return _judged_apart(order, failures)._replace(wall_s=time.monotonic() - started_s, grown=grown)
+    return _judged_apart(config, failures)._replace(
+        wall_s=time.monotonic() - started_s, grown=grown
+    )
 
 
-def _run(order: FleetConfig, stopped: Interrupts) -> tuple[list[str], dict[str, Grown]]:
+def _run(config: FleetConfig, stopped: Interrupts) -> tuple[list[str], dict[str, Grown]]:
     """Run the fleet to its end; what failed, and how it has grown."""
-    scenario = order.scenario
-    give_up_s = time.monotonic() + scenario.limit_ns * 1e-9 / order.speed + _GRACE_S
+    scenario = config.scenario
+    give_up_s = time.monotonic() + scenario.limit_ns * 1e-9 / config.speed + _GRACE_S
     failures: list[str] = []
-    with local_fleet(order) as fleet:
+    with local_fleet(config) as fleet:
         watch = RssMonitor(fleet)
         periods = 0
         try:
@@ -201,28 +203,28 @@ def _orphans() -> list[int]:
     return left
 
 
-def _judged_apart(order: FleetConfig, failures: list[str]) -> ProcessMission:
+def _judged_apart(config: FleetConfig, failures: list[str]) -> ProcessMission:
     """Judged in a process of its own: a whole record in memory would leave this one as large for ever."""
     context = multiprocessing.get_context("forkserver")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(_judged, order, failures).result()
+        return pool.submit(_judged, config, failures).result()
 
 
-def _judged(order: FleetConfig, failures: list[str]) -> ProcessMission:
+def _judged(config: FleetConfig, failures: list[str]) -> ProcessMission:
     """A mission by what it has left on file."""
-    folder, scenario = order.folder, order.scenario
+    folder, scenario = config.folder, config.scenario
     result = read_result(folder)
     if result is None:
         failures.append("result: there is none")
         return ProcessMission(
-            order.seed, order.exchange, "crashed", 0.0, tuple(failures), Counter()
+            config.seed, config.exchange, "crashed", 0.0, tuple(failures), Counter()
         )
     journal = list(read(folder / JOURNAL))
     records = [record for _, record in journal]
     struck, liveness = FaultCoverage(), LivenessChecker()
     for record in records:
-        struck.take(record)
-        liveness.take(record)
+        struck.observe(record)
+        liveness.observe(record)
     complaints = [*failures, *result.complaints]
     if result.ended != "done" or result.record != "whole":
         complaints.append(f"end: {result.ended}; record {result.record}")
@@ -231,20 +233,25 @@ def _judged(order: FleetConfig, failures: list[str]) -> ProcessMission:
     complaints += [f"{i.who}: let in" for i in _incidents(records) if i.what == "let in"]
     rejoined_s: tuple[float, ...] = ()
     resumed_s: tuple[float, ...] = ()
-    if order.exchange == "lockstep":
-        complaints += _differing(scenario, order.seed, result.digest)
+    if config.exchange == "lockstep":
+        complaints += _differing(scenario, config.seed, result.digest)
     else:
-        rejoined_s, resumed_s = _back_s(scenario, records, order.speed)
+        rejoined_s, resumed_s = _back_s(scenario, records, config.speed)
     return ProcessMission(
-        order.seed,
-        order.exchange,
+        config.seed,
+        config.exchange,
         result.ended,
         0.0,
         tuple(complaints[:10]),
         struck.counts,
         rejoined_s,
         resumed_s,
-        sum(act.outputs is not None for r in records if isinstance(r, Batch) for act in r.acts),
+        sum(
+            step_record.outputs is not None
+            for r in records
+            if isinstance(r, Batch)
+            for step_record in r.step_records
+        ),
         result.incarnations,
         frozenset(liveness.judged),
     )
@@ -292,7 +299,11 @@ def _back_s(
                 ordered_ns[who] = due if who == WORLD_SIM else max(before_ns, due)
             before_ns = record.now_ns
         elif isinstance(record, Batch) and ordered_ns:
-            acted = {act.name for act in record.acts if act.outputs is not None}
+            acted = {
+                step_record.name
+                for step_record in record.step_records
+                if step_record.outputs is not None
+            }
             for who in (acted | ({WORLD_SIM} if acted else set())) & ordered_ns.keys():
                 waited_ns = record.now_ns - ordered_ns.pop(who)
                 back_s[who == WORLD_SIM].append(waited_ns * 1e-9 / speed)
@@ -424,10 +435,10 @@ def _line(flight: ProcessMission, totals: Totals, spent_s: float) -> str:
     )
 
 
-def _report(flight: ProcessMission, order: Soak) -> None:
+def _report(flight: ProcessMission, config: Soak) -> None:
     """Everything that is needed to see it again."""
-    terms = order.terms
-    place = order.folder / FOLDER / f"seed-{flight.seed}"
+    terms = config.terms
+    place = config.folder / FOLDER / f"seed-{flight.seed}"
     (place / SCENARIO).write_text(to_toml(process_scenario(flight.seed, *terms)), encoding="utf-8")
     print(f"VIOLATION  seed {flight.seed} ({flight.exchange})")
     for complaint in flight.complaints:

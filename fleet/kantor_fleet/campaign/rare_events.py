@@ -17,7 +17,7 @@ from kantor_protocol.base.machine import (
     State,
 )
 from kantor_protocol.base.varint import Pairs
-from kantor_protocol.replication.replica import read_have
+from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.faults.links import OneWay, Partition
 from kantor_protocol.scenario.faults.processes import ClockFault, Kill, Late
 from kantor_protocol.scenario.schema import Scenario
@@ -44,7 +44,7 @@ class _RareEvent:
         """Whether there is anything to look for in a mission."""
         return True
 
-    def act(self, act: StepRecord, outputs: Outputs) -> None:
+    def step_record(self, step_record: StepRecord, outputs: Outputs) -> None:
         """Somebody stepped."""
 
     def batch(self, batch: Batch) -> None:
@@ -77,10 +77,10 @@ class _Ears(_RareEvent):
         self._born: dict[ParticipantId, int] = {}
         self._refused: dict[ParticipantId, int] = {}
 
-    def act(self, act: StepRecord, outputs: Outputs) -> None:
-        name, born = act.name, self._born
+    def step_record(self, step_record: StepRecord, outputs: Outputs) -> None:
+        name, born = step_record.name, self._born
         newest = self._newest[name]
-        for source, sequence in act.heard:
+        for source, sequence in step_record.heard:
             if sequence >= FIRST_SEQUENCE:
                 continue
             last = newest.get(source, -1)
@@ -94,13 +94,13 @@ class _Ears(_RareEvent):
             if born and sequence <= born.get(source, -1):
                 self.seen["word of a former incarnation"] += 1
         if outputs.refused != self._refused.get(name, 0):
-            self._note_refused(act, outputs.refused)
+            self._note_refused(step_record, outputs.refused)
 
-    def _note_refused(self, act: StepRecord, refused: int) -> None:
-        if refused > self._refused.get(act.name, 0) and act.heard:
-            forged = any(sequence >= FIRST_SEQUENCE for _, sequence in act.heard)
+    def _note_refused(self, step_record: StepRecord, refused: int) -> None:
+        if refused > self._refused.get(step_record.name, 0) and step_record.heard:
+            forged = any(sequence >= FIRST_SEQUENCE for _, sequence in step_record.heard)
             self.seen["hostile message refused"] += forged
-        self._refused[act.name] = refused
+        self._refused[step_record.name] = refused
 
     def _note_old(
         self, link: tuple[ParticipantId, ParticipantId], sequence: int, newest: int
@@ -115,7 +115,7 @@ class _Ears(_RareEvent):
         if incident.what == "start" and incident.step > 0:
             self._restarted.add(incident.who)
             self._refused[incident.who] = 0
-            if incident.epoch:
+            if incident.incarnation:
                 self._born[incident.who] = incident.step
 
 
@@ -142,10 +142,10 @@ class _Lives(_RareEvent):
     def batch(self, batch: Batch) -> None:
         if not self._looks:
             return
-        for verdict in batch.verdicts:
-            if verdict.due_ns != DROPPED:
-                by_supervisor = verdict.source == SUPERVISOR
-                self._due_ns[by_supervisor] = max(self._due_ns[by_supervisor], verdict.due_ns)
+        for decision in batch.decisions:
+            if decision.due_ns != DROPPED:
+                by_supervisor = decision.source == SUPERVISOR
+                self._due_ns[by_supervisor] = max(self._due_ns[by_supervisor], decision.due_ns)
 
     def incident(self, incident: ProcessEvent) -> None:
         who, now_ns = incident.who, incident.now_ns
@@ -181,15 +181,15 @@ class _Memory(_RareEvent):
         self._lost: dict[ParticipantId, int] = {}
         self._names = self.scenario.roster
 
-    def act(self, act: StepRecord, outputs: Outputs) -> None:
+    def step_record(self, step_record: StepRecord, outputs: Outputs) -> None:
         if not outputs.outbox:
             return
-        name, body = act.name, outputs.outbox[-1].body
+        name, body = step_record.name, outputs.outbox[-1].body
         self._bodies[name] = body
-        if name in self._wanted and _covers(self._have(body), self._wanted[name]):
+        if name in self._wanted and _covers(self._version_vector(body), self._wanted[name]):
             self.seen["late joiner knows all that was known"] += 1
             del self._wanted[name]
-        if name in self._lost and any(self._have(body)[self._lost[name] :][:1]):
+        if name in self._lost and any(self._version_vector(body)[self._lost[name] :][:1]):
             self.seen["log of a former incarnation came back"] += 1
             del self._lost[name]
 
@@ -198,23 +198,28 @@ class _Memory(_RareEvent):
             return
         who = incident.who
         if incident.fault >= 0 and isinstance(self.scenario.faults[incident.fault], Late):
-            known = [self._have(body) for name, body in self._bodies.items() if name != who]
+            known = [
+                self._version_vector(body) for name, body in self._bodies.items() if name != who
+            ]
             width = max(map(len, known), default=0)
-            most = [max(have[i] for have in known if i < len(have)) for i in range(width)]
+            most = [
+                max(version_vector[i] for version_vector in known if i < len(version_vector))
+                for i in range(width)
+            ]
             if any(most):
                 self._wanted[who] = most
-        elif incident.epoch and who in self._bodies:
+        elif incident.incarnation and who in self._bodies:
             count = len(self._names)
-            self._lost[who] = (incident.epoch - 1) * count + self._names.index(who)
+            self._lost[who] = (incident.incarnation - 1) * count + self._names.index(who)
 
-    def _have(self, body: bytes) -> list[int]:
+    def _version_vector(self, body: bytes) -> list[int]:
         """How many entries of every log its sender says that it holds."""
         try:
-            have = decode_gossip(body).have
+            version_vector = decode_gossip(body).version_vector
         except RefusedError:
             return []
-        slots = slots_told(have, len(self._names), claims=self.scenario.claiming)
-        return (slots and read_have(have, slots)) or []
+        slots = slots_told(version_vector, len(self._names), claims=self.scenario.claiming)
+        return (slots and read_version_vector(version_vector, slots)) or []
 
 
 class _Goals(_RareEvent):
@@ -233,10 +238,10 @@ class _Goals(_RareEvent):
         self._goals: dict[ParticipantId, Pair | None] = {}
         self._pairs = Pairs()
 
-    def act(self, act: StepRecord, outputs: Outputs) -> None:
-        before, now = self._goals.get(act.name), outputs.goal
-        self._goals[act.name] = now
-        if before is None or before == now or not act.heard:
+    def step_record(self, step_record: StepRecord, outputs: Outputs) -> None:
+        before, now = self._goals.get(step_record.name), outputs.goal
+        self._goals[step_record.name] = now
+        if before is None or before == now or not step_record.heard:
             return
         sample = self._samples.get(before)
         if sample is None:
@@ -245,7 +250,9 @@ class _Goals(_RareEvent):
         if left.get(sample) == 0 and sample not in dict(self._decoded(outputs.spent)):
             self.seen["merge that removes the current goal"] += 1
         elif now is not None and sample not in left and self.scenario.claiming:
-            shared = any(goal == before for name, goal in self._goals.items() if name != act.name)
+            shared = any(
+                goal == before for name, goal in self._goals.items() if name != step_record.name
+            )
             self.seen["one goal of two, left to one by a claim"] += shared
 
     def _decoded(self, content: bytes) -> Iterator[tuple[int, int]]:
@@ -277,13 +284,13 @@ class _Sides(_RareEvent):
         self._consumed: dict[ParticipantId, dict[int, int]] = {}
         self._pairs = Pairs()
 
-    def act(self, act: StepRecord, outputs: Outputs) -> None:
-        if not outputs.spent or act.now_ns < self._from_ns or not self._open:
+    def step_record(self, step_record: StepRecord, outputs: Outputs) -> None:
+        if not outputs.spent or step_record.now_ns < self._from_ns or not self._open:
             return
         pairs = self._pairs.decode(outputs.spent, self._samples)
         if pairs is not None:
-            latest = dict.fromkeys(pairs[0].tolist(), act.now_ns)
-            self._consumed.setdefault(act.name, {}).update(latest)
+            latest = dict.fromkeys(pairs[0].tolist(), step_record.now_ns)
+            self._consumed.setdefault(step_record.name, {}).update(latest)
 
     def batch(self, batch: Batch) -> None:
         while self._open and batch.now_ns >= (self._open[0][1] or 0):
@@ -318,13 +325,13 @@ class _Ends(_RareEvent):
         self._centralized = self.scenario.centralized
         self._misled = any(isinstance(fault, ClockFault) for fault in self.scenario.faults)
 
-    def act(self, act: StepRecord, outputs: Outputs) -> None:
-        name = act.name
+    def step_record(self, step_record: StepRecord, outputs: Outputs) -> None:
+        name = step_record.name
         if outputs.state is State.EXHAUSTED and name not in self._exhausted:
             self._exhausted.add(name)
-            self.seen["energy ended in contact"] += bool(act.heard)
+            self.seen["energy ended in contact"] += bool(step_record.heard)
         if self._misled:
-            self._read_clock(act)
+            self._read_clock(step_record)
         if self._centralized and name != SUPERVISOR and outputs.outbox:
             alone = outputs.outbox[-1].target == EVERYBODY
             if alone and name not in self._alone:
@@ -334,11 +341,11 @@ class _Ends(_RareEvent):
                 self._alone.discard(name)
                 self.seen["supervisor heard again after it was given up"] += 1
 
-    def _read_clock(self, act: StepRecord) -> None:
-        read_ns = act.now_ns + act.skew_ns
-        if read_ns < self._read_ns.get(act.name, 0):
+    def _read_clock(self, step_record: StepRecord) -> None:
+        read_ns = step_record.now_ns + step_record.skew_ns
+        if read_ns < self._read_ns.get(step_record.name, 0):
             self.seen["clock jumped back"] += 1
-        self._read_ns[act.name] = read_ns
+        self._read_ns[step_record.name] = read_ns
 
 
 _RARE_EVENTS = (_Goals, _Sides, _Lives, _Ears, _Memory, _Ends)
@@ -358,13 +365,13 @@ class RareEvents:
         self._acting: list[Callable[[StepRecord, Outputs], None]] = []
         self._batching: list[Callable[[Batch], None]] = []
 
-    def take(self, record: Record) -> None:
+    def observe(self, record: Record) -> None:
         """Follow one record."""
         if isinstance(record, Batch):
-            for act in record.acts:
-                if act.outputs is not None:
+            for step_record in record.step_records:
+                if step_record.outputs is not None:
                     for look in self._acting:
-                        look(act, act.outputs)
+                        look(step_record, step_record.outputs)
             for follow in self._batching:
                 follow(record)
         elif isinstance(record, ProcessEvent):
@@ -374,7 +381,11 @@ class RareEvents:
             self._sights = [
                 sight(record) for sight in _RARE_EVENTS if sight.can_be(record.scenario)
             ]
-            self._acting = [s.act for s in self._sights if type(s).act is not _RareEvent.act]
+            self._acting = [
+                s.step_record
+                for s in self._sights
+                if type(s).step_record is not _RareEvent.step_record
+            ]
             self._batching = [
                 s.batch for s in self._sights if type(s).batch is not _RareEvent.batch
             ]
@@ -390,6 +401,6 @@ class RareEvents:
         }
 
 
-def _covers(have: list[int], wanted: list[int]) -> bool:
-    padded = have + [0] * (len(wanted) - len(have))
+def _covers(version_vector: list[int], wanted: list[int]) -> bool:
+    padded = version_vector + [0] * (len(wanted) - len(version_vector))
     return all(held >= entries for held, entries in zip(padded, wanted, strict=False))

@@ -53,26 +53,26 @@ def numbered(text: str) -> tuple[int, ...]:
     return parse_seeds(f"0:{text}" if text.strip().isdecimal() else text)
 
 
-def campaign(order: CampaignConfig, start: Callable[[Iterable[Case]], Pool]) -> Exit:
+def campaign(config: CampaignConfig, start: Callable[[Iterable[Case]], Pool]) -> Exit:
     """Run what is not yet done, up to the first violation; what to exit with.
 
     start: the pool, whose work is `attempt`. Raises SweepError, OSError.
     """
     started_s = time.monotonic()
     totals = Totals()
-    with Interrupts() as interrupts, Journal(order.folder / RUNS, Trial) as journal:
-        broken = _known(order, journal, totals)
+    with Interrupts() as interrupts, Journal(config.folder / RUNS, Trial) as journal:
+        broken = _known(config, journal, totals)
         if broken is None:
-            broken = _run(order, journal, totals, start, interrupts)
+            broken = _run(config, journal, totals, start, interrupts)
         for line in totals.lines(time.monotonic() - started_s):
             print(line)
         if totals.missions:
             for table in totals.tables():
                 table_console().print(table)
     if broken is not None:
-        _report(order.folder, broken)
+        _report(config.folder, broken)
         return Exit.NOT_MET
-    return interrupts.code or _verdict(order, totals)
+    return interrupts.code or _verdict(config, totals)
 
 
 def replay(seed: int, folder: Path) -> Exit:
@@ -86,7 +86,7 @@ def replay(seed: int, folder: Path) -> Exit:
         scenario,
         seed,
         WorldSetup.of(scenario, seed),
-        [follower.take],
+        [follower.observe],
         stopped=lambda: follower.broken,
     )
     result = follower.recording.finish()
@@ -99,31 +99,31 @@ def replay(seed: int, folder: Path) -> Exit:
     return Exit.NOT_MET if complaints else Exit.DONE
 
 
-def _known(order: CampaignConfig, journal: Journal, totals: Totals) -> Broken | None:
+def _known(config: CampaignConfig, journal: Journal, totals: Totals) -> Broken | None:
     """Count what was run before; the first of it that broke."""
     first = None
-    for seed in order.seeds:
+    for seed in config.seeds:
         trial = journal.outcomes.get(_key(seed))
         if isinstance(trial, Trial):
             totals.add(trial)
             if trial.violation and first is None:
                 first = Broken(seed, trial)
     if totals.missions:
-        print(f"{totals.missions} missions are known from {order.folder / RUNS}")
+        print(f"{totals.missions} missions are known from {config.folder / RUNS}")
     return first
 
 
 def _run(
-    order: CampaignConfig,
+    config: CampaignConfig,
     journal: Journal,
     totals: Totals,
     start: Callable[[Iterable[Case]], Pool],
     interrupts: Interrupts,
 ) -> Broken | None:
-    left = [seed for seed in order.seeds if _key(seed) not in journal.outcomes]
+    left = [seed for seed in config.seeds if _key(seed) not in journal.outcomes]
     if not left:
         return None
-    with RunsView(len(left)) as view, closing(start(_cases(left, order.minutes))) as pool:
+    with RunsView(len(left)) as view, closing(start(_cases(left, config.minutes))) as pool:
         view.note("starting workers (the first time, kernels are compiled: about half a minute)")
         for done in pool:
             if done is not None:
@@ -175,10 +175,10 @@ def _report(folder: Path, broken: Broken) -> None:
     print(f"             {_command(place / SMALLEST, seed)}")
 
 
-def _verdict(order: CampaignConfig, totals: Totals) -> Exit:
-    if totals.missions < len(order.seeds):
+def _verdict(config: CampaignConfig, totals: Totals) -> Exit:
+    if totals.missions < len(config.seeds):
         print(
-            f"kantor: {totals.missions} of {len(order.seeds)} missions are done; the same command goes on"
+            f"kantor: {totals.missions} of {len(config.seeds)} missions are done; the same command goes on"
         )
     if totals.missions < ENOUGH or not totals.missing:
         return Exit.DONE

@@ -83,5 +83,5 @@ def _run(case: Case) -> Result:
     scenario, seed = case.scenario, case.seed
     site = WorldSetup.of(scenario, seed)
     recording = Recording(scenario, seed, "in-process", exact_every=0 if case.exact else None)
-    play(scenario, seed, site, [recording.take])
+    play(scenario, seed, site, [recording.observe])
     return recording.finish()

@@ -45,11 +45,11 @@ def play(
     scenario: Scenario,
     seed: int,
     site: WorldSetup,
-    listeners: Iterable[Observer],
+    observers: Iterable[Observer],
     *,
     machines: Mapping[ParticipantId, StateMachine] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> str:
     """A mission in this process; why it ended. machines: the team, unless others take its place."""
-    stage = Simulation(scenario, seed, site, listeners)
-    return simulate(stage, in_process(machines or team(scenario, seed, site)), seed, stopped)
+    simulation = Simulation(scenario, seed, site, observers)
+    return simulate(simulation, in_process(machines or team(scenario, seed, site)), seed, stopped)

@@ -43,8 +43,8 @@ _MANNERS = (
 
 def warm_up() -> None:
     """Compile every kernel, or load it from the cache, by tiny missions."""
-    for manner in _MANNERS:
-        _play(_TINY, [*manner, "targets.diffusion_m=1"])
+    for config in _MANNERS:
+        _play(_TINY, [*config, "targets.diffusion_m=1"])
     for planner in sorted(MAP_PLANNERS):
         _play(_TINY_MAP, [f"planner='{planner}'"])
 
@@ -52,4 +52,4 @@ def warm_up() -> None:
 def _play(text: str, overrides: list[str]) -> None:
     scenario = parse(text, "warm-up", overrides)
     recording = Recording(scenario, 0, "in-process")
-    play(scenario, 0, WorldSetup.of(scenario, 0), [recording.take])
+    play(scenario, 0, WorldSetup.of(scenario, 0), [recording.observe])

@@ -161,15 +161,21 @@ def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
         if isinstance(record, ProcessEvent):
             team.follow(record)
         elif isinstance(record, Batch):
-            for act in record.acts:
-                if act.outputs is None:
+            for step_record in record.step_records:
+                if step_record.outputs is None:
                     continue
                 try:
-                    outputs = team.step(act)
+                    outputs = team.step(step_record)
                 except (KeyError, RefusedError):
-                    return False, f"replayed: {act.name} heard at t={act.now_ns} what nobody sent"
-                if outputs != act.outputs:
-                    return False, f"replayed: {act.name} differs at its step {act.outputs.step}"
+                    return (
+                        False,
+                        f"replayed: {step_record.name} heard at t={step_record.now_ns} what nobody sent",
+                    )
+                if outputs != step_record.outputs:
+                    return (
+                        False,
+                        f"replayed: {step_record.name} differs at its step {step_record.outputs.step}",
+                    )
                 steps += 1
             team.mailbag.post(record)
     return True, f"replayed: {steps} steps of {team.count} participants, all the same"
@@ -195,16 +201,16 @@ class _Team:
         who = incident.who
         if incident.what not in {"start", "join"} or who == WORLD_SIM:
             return
-        if self._world.begin(who, incident.epoch):
+        if self._world.begin(who, incident.incarnation):
             self._machines[who] = self._participant(who)
 
-    def step(self, act: StepRecord) -> Outputs:
+    def step(self, step_record: StepRecord) -> Outputs:
         """What comes of an act's inputs. Raises KeyError for what nobody sent."""
-        name = act.name
+        name = step_record.name
         if name not in self._machines:
             self._machines[name] = self._participant(name)
-        outputs = self._machines[name].step(self.mailbag.inputs(act))
-        self._world.accept(name, act.now_ns, outputs)
+        outputs = self._machines[name].step(self.mailbag.inputs(step_record))
+        self._world.accept(name, step_record.now_ns, outputs)
         return outputs
 
     def _participant(self, name: ParticipantId) -> StateMachine:

@@ -91,73 +91,73 @@ class ComposeConfig(NamedTuple):
     hub: str | None = None
 
 
-def compose(order: ComposeConfig, file: Path) -> Exit:
+def compose(config: ComposeConfig, file: Path) -> Exit:
     """Write a fleet's compose file, and beside it what it needs. Raises BusError, ScenarioError, OSError."""
-    _check(order)
+    _check(config)
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(text(order), encoding="utf-8")
+    file.write_text(text(config), encoding="utf-8")
     user = prepare(file.parent)
-    print(f"{file}: {order.robots} robots, run by {user}; next, in {file.parent}/:")
-    if order.hub is None:
+    print(f"{file}: {config.robots} robots, run by {user}; next, in {file.parent}/:")
+    if config.hub is None:
         print("  docker-compose run --rm keys")
     else:
         print("  put each robot's identity into keys/")
-    print(f"  {_up(order)}")
+    print(f"  {_up(config)}")
     return Exit.DONE
 
 
-def _check(order: ComposeConfig) -> None:
-    if not 1 <= order.robots <= ROBOTS_MAX:
-        fail(Exit.USAGE, f"--robots {order.robots}: give 1 to {ROBOTS_MAX}")
-    if order.isolated and order.robots > NETWORKS_MAX:
+def _check(config: ComposeConfig) -> None:
+    if not 1 <= config.robots <= ROBOTS_MAX:
+        fail(Exit.USAGE, f"--robots {config.robots}: give 1 to {ROBOTS_MAX}")
+    if config.isolated and config.robots > NETWORKS_MAX:
         fail(
             Exit.USAGE,
             f"--isolated: a network for each robot, and Docker has room for {NETWORKS_MAX}",
         )
-    if order.hub is not None:
-        check_endpoint(order.hub)
+    if config.hub is not None:
+        check_endpoint(config.hub)
         return
     from kantor_fleet.scenarios.catalog import find  # noqa: PLC0415
 
-    if not order.scenario.startswith("/"):  # a file in the run folder
-        scenario = find(order.scenario, (f"robots.count={order.robots}", *order.overrides))
-        if scenario.centralized and not order.supervisor:
-            fail(Exit.USAGE, f"--scenario {order.scenario}: centralized; add --supervisor")
+    if not config.scenario.startswith("/"):  # a file in the run folder
+        scenario = find(config.scenario, (f"robots.count={config.robots}", *config.overrides))
+        if scenario.centralized and not config.supervisor:
+            fail(Exit.USAGE, f"--scenario {config.scenario}: centralized; add --supervisor")
 
 
-def text(order: ComposeConfig) -> str:
+def text(config: ComposeConfig) -> str:
     """The file. The supervisor stands in a profile of its own, `centralized`."""
-    connect = order.hub or f"tls/worldsim:{_PORT}"
+    connect = config.hub or f"tls/worldsim:{_PORT}"
     protocol, _, place = connect.partition("/")
     port = place.rpartition(":")[2]
-    robots = [_ID.format(i) for i in range(1, order.robots + 1)]
-    people = [*robots, *(["supervisor"] if order.supervisor else [])]
-    networks = people if order.isolated else ["fleet"]
-    parts = [_HEAD.format(title=_title(order), command=_up(order), port=port), "\nservices:\n"]
-    if order.hub is None:
-        overrides = " ".join(order.overrides)
+    robots = [_ID.format(i) for i in range(1, config.robots + 1)]
+    people = [*robots, *(["supervisor"] if config.supervisor else [])]
+    networks = people if config.isolated else ["fleet"]
+    parts = [_HEAD.format(title=_title(config), command=_up(config), port=port), "\nservices:\n"]
+    if config.hub is None:
+        overrides = " ".join(config.overrides)
         parts.append(
             _WORLDSIM.format(
-                scenario=order.scenario,
+                scenario=config.scenario,
                 protocol=protocol,
                 port=port,
-                robots=order.robots,
+                robots=config.robots,
                 overrides=overrides,
                 networks=", ".join(networks),
             )
         )
-        parts.append(_KEYS.format(robots=order.robots, people=_people(order)))
+        parts.append(_KEYS.format(robots=config.robots, people=_people(config)))
     for name in people:
         verb = name if name == "supervisor" else f"agent {name}"
-        network = name if order.isolated else "fleet"
+        network = name if config.isolated else "fleet"
         parts.append(_PARTICIPANT.format(name=name, verb=verb, connect=connect, network=network))
-        if order.hub is None:
+        if config.hub is None:
             parts.append("    depends_on: [worldsim]\n")
             if name == "supervisor":
                 parts.append("    profiles: [centralized]\n")
-    owners = people if order.hub else ["worldsim", *people]
+    owners = people if config.hub else ["worldsim", *people]
     # Nobody in a fleet has any business beyond it, unless its hub is there.
-    inside = "internal: false" if order.hub else "internal: true"
+    inside = "internal: false" if config.hub else "internal: true"
     secrets = "".join(
         f'  {who}: {{file: "${{KANTOR_KEYS:-./keys}}/{who}.toml"}}\n' for who in owners
     )
@@ -166,18 +166,18 @@ def text(order: ComposeConfig) -> str:
     return "".join(parts)
 
 
-def _title(order: ComposeConfig) -> str:
-    whose = "" if order.hub is None else f", which world-sim at {order.hub} awaits"
-    apart = ", each on a network of its own with world-sim" if order.isolated else ""
-    return f"{order.robots} robots in containers{apart}{whose}. Written by `kantor compose`."
+def _title(config: ComposeConfig) -> str:
+    whose = "" if config.hub is None else f", which world-sim at {config.hub} awaits"
+    apart = ", each on a network of its own with world-sim" if config.isolated else ""
+    return f"{config.robots} robots in containers{apart}{whose}. Written by `kantor compose`."
 
 
-def _people(order: ComposeConfig) -> str:
-    return " --supervisor" if order.supervisor else ""
+def _people(config: ComposeConfig) -> str:
+    return " --supervisor" if config.supervisor else ""
 
 
-def _up(order: ComposeConfig) -> str:
-    if order.hub is not None:
+def _up(config: ComposeConfig) -> str:
+    if config.hub is not None:
         return "docker-compose up --detach"
     return "docker-compose up --exit-code-from worldsim"
 

@@ -77,15 +77,15 @@ class FleetConfig(NamedTuple):
 class Fleet:
     """The processes of a local fleet."""
 
-    def __init__(self, order: FleetConfig, connect: str, secrets: Path) -> None:
+    def __init__(self, config: FleetConfig, connect: str, secrets: Path) -> None:
         """Use `local_fleet` to start one."""
         self.connect = connect
         self.observer = credentials.find(secrets, credentials.OBSERVER)
-        self._order = order
+        self._config = config
         self._secrets = secrets
         self._context = multiprocessing.get_context("forkserver")
         self._context.set_forkserver_preload(["kantor_fleet.execution.preloaded"])
-        self._logs, self._state = order.folder / "logs", order.folder / STATE
+        self._logs, self._state = config.folder / "logs", config.folder / STATE
         self._logs.mkdir()
         self._lock = threading.RLock()
         """Around every start, and every look at an exit code: that can be read only once."""
@@ -99,10 +99,10 @@ class Fleet:
         self._frozen: set[ParticipantId] = set()
         self._impostors: dict[ParticipantId, tuple[ForkServerProcess, float]] = {}
         self.world_sim = self._start_world_sim(resume=False)
-        absent = set(late(order.scenario))
+        absent = set(late(config.scenario))
         self.participants: dict[ParticipantId, ForkServerProcess] = {
             name: self._start_participant(name, name)
-            for name in order.scenario.roster
+            for name in config.scenario.roster
             if name not in absent
         }
 
@@ -117,7 +117,7 @@ class Fleet:
         process = self._start(
             "worldsim",
             _be_world_sim,
-            self._order,
+            self._config,
             self.connect,
             self._secrets,
             self._logs / "worldsim.log",
@@ -196,14 +196,14 @@ class Fleet:
                 self.participants[name].kill()
             processes = [self.world_sim, *self.participants.values()]
             processes += [process for process, _ in self._impostors.values()]
-            for act in (None, "terminate", "kill"):
+            for step_record in (None, "terminate", "kill"):
                 for process in processes:
-                    if act is not None and process.exitcode is None:
-                        getattr(process, act)()
+                    if step_record is not None and process.exitcode is None:
+                        getattr(process, step_record)()
                 give_up = time.monotonic() + _GOODBYE_S
                 for process in processes:
                     process.join(max(0.0, give_up - time.monotonic()))
-        if (self._order.folder / RESULT).exists():
+        if (self._config.folder / RESULT).exists():
             shutil.rmtree(self._state, ignore_errors=True)
 
     # Hands.
@@ -299,13 +299,13 @@ class Fleet:
 
 
 @contextmanager
-def local_fleet(order: FleetConfig) -> Iterator[Fleet]:
+def local_fleet(config: FleetConfig) -> Iterator[Fleet]:
     """Start a fleet; on leaving, no process of it is left."""
     with tempfile.TemporaryDirectory(prefix="kantor-") as folder:
         secrets = Path(folder)
-        credentials.issue(secrets, FLEET, order.scenario.roster)
+        credentials.issue(secrets, FLEET, config.scenario.roster)
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        fleet = Fleet(order, free_endpoint(), secrets)
+        fleet = Fleet(config, free_endpoint(), secrets)
         try:
             yield fleet
         finally:
@@ -329,7 +329,7 @@ def watch_progress(fleet: Fleet) -> Iterator[Progress | None]:
 
 
 def _be_world_sim(
-    order: FleetConfig,
+    config: FleetConfig,
     listen: str,
     secrets: Path,
     log: Path,
@@ -344,18 +344,18 @@ def _be_world_sim(
 
     say = log_to(log, "worldsim")
     init_log()
-    scenario, seed = order.scenario, order.seed
+    scenario, seed = config.scenario, config.seed
     past = None
     if resume:
         try:
-            past = Past.of(order.folder)
+            past = Past.of(config.folder)
         except OverError as error:  # it was killed on its way out
             say(str(error))
             return
         except ResumeError:  # nothing has happened yet
             past = None
     site = WorldSetup.of(scenario, seed) if past is None else past.opening.site
-    plan = MissionConfig(scenario, seed, site, order.exchange, order.speed)
+    plan = MissionConfig(scenario, seed, site, config.exchange, config.speed)
     identity = credentials.find(secrets, credentials.HOST)
     users = credentials.users_file(secrets)
     # The terminal and the parent may both say so: one Ctrl-C must not count as two.
@@ -367,10 +367,10 @@ def _be_world_sim(
                 recording = Recording(
                     scenario,
                     seed,
-                    order.exchange,
-                    order.folder,
-                    order.exact_every,
-                    speed=order.speed,
+                    config.exchange,
+                    config.folder,
+                    config.exact_every,
+                    speed=config.speed,
                     past=past,
                 )
                 say(f"run {recording.run}" + (", resumed" if past is not None else ""))
@@ -398,12 +398,12 @@ def _host(identity: Identity, listen: str, users: Path, scenario: Scenario) -> H
 def _hands(pipe: Connection) -> ProcessController:
     """World-sim's end of the hands."""
 
-    def order(deed: Deed) -> bool | None:
+    def config(deed: Deed) -> bool | None:
         pipe.send(deed)
         answer: bool | None = pipe.recv()
         return answer
 
-    return order
+    return config
 
 
 def _be_participant(

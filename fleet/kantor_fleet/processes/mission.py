@@ -36,8 +36,8 @@ def run(
             recording = Recording(scenario, seed, exchange, folder, exact_every)
             code = _run_in_process(scenario, seed, site, recording, interrupts)
         else:
-            order = FleetConfig(scenario, seed, exchange, speed, folder, exact_every)
-            code = _run_processes(order, interrupts)
+            config = FleetConfig(scenario, seed, exchange, speed, folder, exact_every)
+            code = _run_processes(config, interrupts)
         conclude(folder)
         return interrupts.code or code
 
@@ -49,24 +49,24 @@ def _run_in_process(
         warm_up()
         glanced = time.monotonic()
 
-        def glance(_record: Record) -> None:
+        def snapshot(_record: Record) -> None:
             nonlocal glanced
             if time.monotonic() - glanced >= _GLANCE_S:
                 glanced = time.monotonic()
                 view.show(progress(recording.metrics, scenario, "running", ""))
 
-        reason = play(scenario, seed, site, [recording.take, glance], stopped=interrupts)
+        reason = play(scenario, seed, site, [recording.observe, snapshot], stopped=interrupts)
         view.show(progress(recording.metrics, scenario, "over", reason))
     return verdict(recording.finish())
 
 
-def _run_processes(order: FleetConfig, interrupts: Interrupts) -> Exit:
-    with ProgressView(order.scenario.name) as view:
+def _run_processes(config: FleetConfig, interrupts: Interrupts) -> Exit:
+    with ProgressView(config.scenario.name) as view:
         view.note("starting the fleet (the first time, kernels are compiled: about half a minute)")
         warm_up()
         if interrupts():
             return Exit.INTERRUPTED
-        with local_fleet(order) as fleet:
+        with local_fleet(config) as fleet:
             asked = False
             try:
                 for message in watch_progress(fleet):
@@ -82,11 +82,11 @@ def _run_processes(order: FleetConfig, interrupts: Interrupts) -> Exit:
                         view.note("ending the mission")
                         fleet.stop()
             except BusError:
-                view.note(f"world-sim is not there; see {order.folder / 'logs' / 'worldsim.log'}")
+                view.note(f"world-sim is not there; see {config.folder / 'logs' / 'worldsim.log'}")
             fleet.disband()
             code = fleet.world_sim.exitcode
             failed = fleet.any_failed
-    result = read_result(order.folder)
+    result = read_result(config.folder)
     if code or result is None:
         return Exit(code) if code in set(Exit) else Exit.PROCESS_FAILED
     return Exit.PROCESS_FAILED if failed else verdict(result)

@@ -115,7 +115,7 @@ class Run:
         self._left = np.full(self.site.samples_m.shape[0], self._units.sample, dtype=np.int64)
         self._finished_ns: dict[ParticipantId, int] = {}
         self._pairs = Pairs()
-        self.metrics.take(opening)
+        self.metrics.observe(opening)
 
     @classmethod
     def of(cls, records: Iterable[Record]) -> "Run | None":
@@ -159,14 +159,14 @@ class Run:
 
     def follow(self, record: Record) -> None:
         """Take in one record after the opening."""
-        self.metrics.take(record)
+        self.metrics.observe(record)
         if isinstance(record, ProcessEvent):
             self._befall(record)
         if not isinstance(record, Opening):
             self.end_ns = max(self.end_ns, record.now_ns)
         if isinstance(record, Batch):
-            for act in record.acts:
-                self._follow_act(act)
+            for step_record in record.step_records:
+                self._follow_act(step_record)
 
     def _befall(self, incident: ProcessEvent) -> None:
         name, what, now_s = incident.who, incident.what, incident.now_ns * 1e-9
@@ -178,21 +178,21 @@ class Run:
             before, from_s = self._away.pop(name)
             self.outages.append(Outage(name, before, from_s, now_s))
 
-    def _follow_act(self, act: StepRecord) -> None:
-        outputs, ruling = act.outputs, act.ruling
-        if outputs is None or ruling is None:
+    def _follow_act(self, step_record: StepRecord) -> None:
+        outputs, verdict = step_record.outputs, step_record.verdict
+        if outputs is None or verdict is None:
             return
         if self.scenario.merge == "min":
             self._lower(outputs.lowered)
-        elif not {"step", "energy", "units"} & set(ruling.violations):
+        elif not {"step", "energy", "units"} & set(verdict.violations):
             self._spend(outputs.spent)
-        if act.name == SUPERVISOR:
+        if step_record.name == SUPERVISOR:
             return
-        self.trails[act.name].extend(ruling.pose.x_m, ruling.pose.y_m)
-        if act.heard and self.contact_s is None:
-            self.contact_s = act.now_ns * 1e-9
+        self.trails[step_record.name].extend(verdict.pose.x_m, verdict.pose.y_m)
+        if step_record.heard and self.contact_s is None:
+            self.contact_s = step_record.now_ns * 1e-9
         if outputs.state is State.FINISHED:
-            self._finished_ns.setdefault(act.name, act.now_ns)
+            self._finished_ns.setdefault(step_record.name, step_record.now_ns)
 
     def _lower(self, packed: bytes) -> None:
         """With the minimum merge, the common view is the least that anybody has published."""
@@ -215,13 +215,13 @@ def draw_domain(axes: Axes, run: Run) -> None:
     axes.add_patch(outline)
 
 
-def draw_known(axes: Axes, survey: MapTracker, period_s: float) -> None:
+def draw_known(axes: Axes, map_tracker: MapTracker, period_s: float) -> None:
     """The true walls as outlines; what is known by the time at which somebody first saw it."""
-    frame, cells = survey.frame, survey.ground.cells
+    frame, cells = map_tracker.frame, map_tracker.ground.cells
     step = max(1, -(-max(frame.rows, frame.columns) // _CELLS_SHOWN))
-    first_tick = survey.books.first_tick.reshape(cells.shape)[::step, ::step]
+    first_tick = map_tracker.state.first_tick.reshape(cells.shape)[::step, ::step]
     free, known = cells[::step, ::step] == FREE, first_tick >= 0
-    last_s = max(1, survey.tick) * period_s
+    last_s = max(1, map_tracker.tick) * period_s
     paint = ScalarMappable(Normalize(0.0, last_s), _TIME)
     colours = paint.to_rgba(first_tick * period_s)[..., :3]
     colours = np.where(free[..., None], colours, _WALL * colours)
@@ -232,17 +232,17 @@ def draw_known(axes: Axes, survey: MapTracker, period_s: float) -> None:
     axes.imshow(
         colours, origin="lower", extent=(left, right, bottom, top), interpolation="none", zorder=0.2
     )
-    edges_m = _edges(survey)
+    edges_m = _edges(map_tracker)
     if edges_m.shape[0] <= _EDGES_SHOWN:
         outlines = LineCollection(list(edges_m), colors=FAINT, linewidths=0.5, zorder=0.6)
         axes.add_collection(outlines)
     add_scale(axes, paint, "first seen at  0 s", f"{last_s:.4g} s")
 
 
-def _edges(survey: MapTracker) -> Points:
+def _edges(map_tracker: MapTracker) -> Points:
     """(E, 2, 2) borders between free cells and others, world frame."""
-    frame = survey.frame
-    free = np.pad(survey.ground.cells == FREE, 1)
+    frame = map_tracker.frame
+    free = np.pad(map_tracker.ground.cells == FREE, 1)
     row, column = np.nonzero(free[1:, 1:-1] != free[:-1, 1:-1])
     level = np.stack((column, row, column + 1, row), axis=1)
     row, column = np.nonzero(free[1:-1, 1:] != free[1:-1, :-1])
@@ -251,10 +251,10 @@ def _edges(survey: MapTracker) -> Points:
     return np.asarray(cells * frame.resolution_m + np.array(frame.origin_m))
 
 
-def draw_bumps(axes: Axes, survey: MapTracker) -> None:
+def draw_bumps(axes: Axes, map_tracker: MapTracker) -> None:
     """Where robots ended a move at a wall."""
-    if survey.bumps:
-        xy_m = np.array(survey.bumps)
+    if map_tracker.bumps:
+        xy_m = np.array(map_tracker.bumps)
         xy_m = xy_m[thinned(xy_m.shape[0], _POINTS_SHOWN)]
         size = _mark_size(xy_m.shape[0], 30.0)
         _add_marks(axes, xy_m, s=size, c=MISSED, marker="1", lw=1.1, zorder=4.5, label="bump")

@@ -132,8 +132,8 @@ def _draw_map(place: SubFigure, run: Run) -> None:
     """The map as the run left it. Every mark names itself for the legend."""
     axes = place.subplots()
     if isinstance(run.metrics, MapMetrics):
-        draw_known(axes, run.metrics.survey, run.scenario.period_ns * 1e-9)
-        draw_bumps(axes, run.metrics.survey)
+        draw_known(axes, run.metrics.map_tracker, run.scenario.period_ns * 1e-9)
+        draw_bumps(axes, run.metrics.map_tracker)
     else:
         draw_domain(axes, run)
         draw_samples(axes, run)
@@ -195,19 +195,21 @@ def _draw_exploration(place: SubFigure, run: Run, exploration: MapMetrics) -> No
 
 def _draw_explored(axes: Axes, run: Run, exploration: MapMetrics, thin: slice) -> None:
     """What somebody has seen, tick by tick, and what each robot knows, row by row."""
-    survey, period_s = exploration.survey, run.scenario.period_ns * 1e-9
+    map_tracker, period_s = exploration.map_tracker, run.scenario.period_ns * 1e-9
     times_s = [row.time_s for row in exploration.rows[thin]]
     colours = team_colours(run.scenario.robots.count)
     known = np.array(exploration.shares[thin]).T
     for share, colour in zip(known, colours, strict=True):
         axes.plot(times_s, 100.0 * share, color=colour, lw=1.0, alpha=0.9, clip_on=False)
     axes.lines[0].set_label("a robot")
-    seen = 100.0 * np.cumsum(np.bincount(survey.stamps, minlength=1)) / max(1, survey.total)
+    seen = (
+        100.0 * np.cumsum(np.bincount(map_tracker.stamps, minlength=1)) / max(1, map_tracker.total)
+    )
     end = run.end_ns * 1e-9
     ticks_s = np.append(np.arange(seen.shape[0]) * period_s, max(end, 0.0))
     (union,) = axes.plot(ticks_s, np.append(seen, seen[-1]), color=FIRST, lw=2.0, label="anybody")
     handles = [union, axes.lines[0]]
-    for share, tick, mark in ((95.0, survey.t95_tick, "o"), (99.0, survey.t99_tick, "s")):
+    for share, tick, mark in ((95.0, map_tracker.t95_tick, "o"), (99.0, map_tracker.t99_tick, "s")):
         if tick is not None:
             label = f"{share:.0f} %: {tick * period_s:.1f} s"
             style: dict[str, Any] = {"ms": 6.0, "mfc": "white", "mec": FIRST, "label": label}

@@ -101,7 +101,7 @@ def _run_one(case: Case) -> MeasuredRun:
     recording = Recording(
         scenario, seed, "in-process", exact_every=EXACT_EVERY if case.exact else None
     )
-    play(scenario, seed, site, [recording.take], machines=machines | timed)
+    play(scenario, seed, site, [recording.observe], machines=machines | timed)
     spent_ns = sum(each.spent_ns for name, each in timed.items() if name != SUPERVISOR)
     result = recording.finish()
     rows = recording.metrics.rows

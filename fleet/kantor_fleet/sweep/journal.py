@@ -83,7 +83,7 @@ class Journal:
         if whole:
             self._check(first)
             for number, line in enumerate(lines, 2):
-                self._take(number, line)
+                self._restore(number, line)
             self._file.truncate(len(text) - len(torn))
         elif (msgspec.json.encode(self._header) + b"\n").startswith(torn):
             self._file.truncate(0)
@@ -102,7 +102,7 @@ class Journal:
                 f"{self._header.kantor}; give another --out, or remove the file"
             )
 
-    def _take(self, number: int, line: bytes) -> None:
+    def _restore(self, number: int, line: bytes) -> None:
         try:
             run = msgspec.json.decode(line, type=_Line)
             outcome = msgspec.json.decode(run.outcome, type=self._kind)

@@ -43,38 +43,38 @@ class SweepConfig(NamedTuple):
     retry_failed: bool = False
 
 
-def sweep(order: SweepConfig, start: Callable[[Iterable[Case]], Pool]) -> Exit:
+def sweep(config: SweepConfig, start: Callable[[Iterable[Case]], Pool]) -> Exit:
     """Run what is not yet done, write what there is; what to exit with.
 
     start: the pool. Raises SweepError before anything is written; OSError.
     """
-    _check(order)
-    plan = order.plan
-    with Interrupts() as interrupts, Journal(order.folder / RUNS) as journal:
-        _write_plan(order)
-        left = {case: key for key, case in plan.cases() if _is_due(order, journal, key)}
+    _check(config)
+    plan = config.plan
+    with Interrupts() as interrupts, Journal(config.folder / RUNS) as journal:
+        _write_plan(config)
+        left = {case: key for key, case in plan.cases() if _is_due(config, journal, key)}
         code = _run(left, journal, start, interrupts)
         runs = table.finished(plan, journal.outcomes)
         if runs:
-            _conclude(order, runs)
+            _conclude(config, runs)
     total = len(plan.variants) * len(plan.seeds)
     if len(runs) < total and (runs or interrupts()):
         print(f"kantor: {len(runs)} of {total} runs are done; the same command goes on from there")
     return code or _verdict(runs)
 
 
-def _check(order: SweepConfig) -> None:
-    if order.plot is not None and order.plot not in table.MEASURES:
-        near = difflib.get_close_matches(order.plot, table.MEASURES, 1)
+def _check(config: SweepConfig) -> None:
+    if config.plot is not None and config.plot not in table.MEASURES:
+        near = difflib.get_close_matches(config.plot, table.MEASURES, 1)
         known = f"did you mean {near[0]}?" if near else f"known: {', '.join(table.MEASURES)}"
-        raise SweepError(f"--plot {order.plot}: no such measure; {known}")
-    if order.format == "parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise SweepError(f"--plot {config.plot}: no such measure; {known}")
+    if config.format == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise SweepError("--format parquet: needs PyArrow; pip install 'kantor[parquet]'")
 
 
-def _is_due(order: SweepConfig, journal: Journal, key: Key) -> bool:
+def _is_due(config: SweepConfig, journal: Journal, key: Key) -> bool:
     outcome = journal.outcomes.get(key)
-    return outcome is None or (outcome.failed is not None and order.retry_failed)
+    return outcome is None or (outcome.failed is not None and config.retry_failed)
 
 
 def _run(
@@ -107,15 +107,15 @@ def _verdict(runs: Iterable[Run]) -> Exit:
     return Exit.DONE if sound else Exit.NOT_MET
 
 
-def _conclude(order: SweepConfig, runs: Sequence[Run]) -> None:
+def _conclude(config: SweepConfig, runs: Sequence[Run]) -> None:
     """Write the tables and the picture, and print the main measures."""
     from kantor_fleet.sweep.plot import draw  # noqa: PLC0415  matplotlib is slow to import
 
-    plan, folder = order.plan, order.folder
+    plan, folder = config.plan, config.folder
     lines = summary.summarize(plan, runs)
-    _write_tables(order, runs, lines)
+    _write_tables(config, runs, lines)
     main = summary.varying(runs, summary.MAIN) or summary.MAIN
-    shown = list(dict.fromkeys([order.plot, *main] if order.plot else main))
+    shown = list(dict.fromkeys([config.plot, *main] if config.plot else main))
     console = table_console()
     for measure in shown:
         console.print(summary.table_of(plan, lines, measure), markup=False)
@@ -124,10 +124,10 @@ def _conclude(order: SweepConfig, runs: Sequence[Run]) -> None:
     print(f"  {folder}/  ({', '.join(sorted(path.name for path in folder.iterdir()))})")
 
 
-def _write_tables(order: SweepConfig, runs: Sequence[Run], lines: Sequence[summary.Line]) -> None:
-    plan, folder = order.plan, order.folder
+def _write_tables(config: SweepConfig, runs: Sequence[Run], lines: Sequence[summary.Line]) -> None:
+    plan, folder = config.plan, config.folder
     whole = table.rows(plan, runs)
-    if order.format == "parquet":
+    if config.format == "parquet":
         table.write_parquet(folder / "table.parquet", plan, whole)
         (folder / "table.csv").unlink(missing_ok=True)  # it may be of another plan
     else:
@@ -138,9 +138,9 @@ def _write_tables(order: SweepConfig, runs: Sequence[Run], lines: Sequence[summa
     table.write_csv(folder / SUMMARY, summary.columns(plan), summary.rows(plan, lines))
 
 
-def _write_plan(order: SweepConfig) -> None:
+def _write_plan(config: SweepConfig) -> None:
     """What was asked for, every scenario resolved."""
-    plan = order.plan
+    plan = config.plan
     tree = {
         "seeds": plan.seeds,
         "exact": plan.exact,
@@ -154,7 +154,7 @@ def _write_plan(order: SweepConfig) -> None:
         ],
     }
     text = msgspec.json.format(msgspec.json.encode(tree), indent=2)
-    table.replace(order.folder / PLAN, lambda draft: draft.write_bytes(text + b"\n"))
+    table.replace(config.folder / PLAN, lambda draft: draft.write_bytes(text + b"\n"))
 
 
 def _complain(runs: Iterable[Run]) -> None:

@@ -6,15 +6,15 @@ place, and a team of such pays nothing. Slots come in blocks of n: who has heard
 one block for it and for each before.
 """
 
-EPOCHS_MAX = 15
+INCARNATIONS_MAX = 15
 """The last incarnation that a participant may have; the first is 0."""
 
 
 def known_to(slot: int, roster: int) -> int:
     """The slots that whoever has this one knows at least. Raises ValueError for an incarnation too many."""
-    epoch = slot // roster
-    if not 0 <= epoch <= EPOCHS_MAX:
+    incarnation = slot // roster
+    if not 0 <= incarnation <= INCARNATIONS_MAX:
         raise ValueError(
-            f"incarnation {epoch}: the last that a participant may have is {EPOCHS_MAX}"
+            f"incarnation {incarnation}: the last that a participant may have is {INCARNATIONS_MAX}"
         )
-    return (epoch + 1) * roster
+    return (incarnation + 1) * roster

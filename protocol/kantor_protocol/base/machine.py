@@ -52,7 +52,7 @@ class Body(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """The last step that the world has accepted; 0: it has not moved yet."""
     energy_spent: int = 0
     """Its gauge: points shipped, whoever drove it."""
-    epoch: int = 0
+    incarnation: int = 0
     """The incarnation that drove it last. Whoever cannot go on from its own snapshot begins the next
     one: two writers must never share a log."""
 

@@ -32,7 +32,7 @@ def put_int(out: np.ndarray, at: int, value: int) -> int:
 
 
 @kernel
-def take_uint(buffer: bytes | np.ndarray, at: int) -> tuple[int, int]:
+def read_uint(buffer: bytes | np.ndarray, at: int) -> tuple[int, int]:
     """Read a value below 2**63 from `at`: (value, position after it), or (0, MALFORMED)."""
     value = 0
     shift = 0
@@ -49,9 +49,9 @@ def take_uint(buffer: bytes | np.ndarray, at: int) -> tuple[int, int]:
 
 
 @kernel
-def take_int(buffer: bytes | np.ndarray, at: int) -> tuple[int, int]:
-    """Read a signed value; see `take_uint`."""
-    folded, at = take_uint(buffer, at)
+def read_int(buffer: bytes | np.ndarray, at: int) -> tuple[int, int]:
+    """Read a signed value; see `read_uint`."""
+    folded, at = read_uint(buffer, at)
     if folded & 1:
         return -(folded >> 1) - 1, at
     return folded >> 1, at
@@ -88,8 +88,8 @@ def unpack_pairs(buffer: bytes, bound: int, index: np.ndarray, value: np.ndarray
     before = 0
     count = 0
     while at < len(buffer):
-        step, at = take_int(buffer, at)
-        amount, at = take_uint(buffer, at)
+        step, at = read_int(buffer, at)
+        amount, at = read_uint(buffer, at)
         before += step
         if at < 0 or before < 0 or before >= bound or count >= index.shape[0]:
             return MALFORMED
@@ -106,8 +106,8 @@ def sum_pairs(buffer: bytes, bound: int) -> int:
     index = 0
     total = 0
     while at < len(buffer):
-        step, at = take_int(buffer, at)
-        amount, at = take_uint(buffer, at)
+        step, at = read_int(buffer, at)
+        amount, at = read_uint(buffer, at)
         index += step
         if at < 0 or index < 0 or index >= bound or amount > _SUM_MAX - total:
             return MALFORMED

@@ -30,7 +30,7 @@ Build = Callable[[Body], StateMachine]
 class WalContents(NamedTuple):
     """What a diary holds."""
 
-    birth: Body
+    initial_state: Body
     """What the machine took over when it was built."""
     inputs: Sequence[bytes]
     """Encoded Inputs of each of its steps, in order."""
@@ -43,7 +43,7 @@ class WriteAheadLog(Protocol):
         """All that is sound from its beginning on; None if there is nothing."""
         ...
 
-    def begin(self, birth: Body) -> None:
+    def begin(self, initial_state: Body) -> None:
         """Throw away what there is, and begin anew. Raises OSError."""
         ...
 
@@ -55,22 +55,22 @@ class WriteAheadLog(Protocol):
 class RecoverableNode:
     """A machine with its diary. `step` is its only entrance, also for what is encoded already."""
 
-    def __init__(self, build: Build, diary: WriteAheadLog, body: Body) -> None:
+    def __init__(self, build: Build, wal: WriteAheadLog, body: Body) -> None:
         """body: what the world knows of what it takes over. Raises OSError if nothing can be noted."""
-        self._diary = diary
+        self._wal = wal
         self._told: Outputs | None = None
         self._given: Inputs | None = None
-        pages = diary.read()
-        if pages is None or not _covers(pages, body):
-            pages = WalContents(_reincarnated(body), ())
-            diary.begin(pages.birth)
-        self.epoch = pages.birth.epoch
+        entries = wal.read()
+        if entries is None or not _covers(entries, body):
+            entries = WalContents(_reincarnated(body), ())
+            wal.begin(entries.initial_state)
+        self.incarnation = entries.initial_state.incarnation
         """Which incarnation it is."""
-        self._machine = build(pages.birth)
-        self.step_count = pages.birth.step
+        self._machine = build(entries.initial_state)
+        self.step_count = entries.initial_state.step
         """Its last step."""
-        for page in pages.inputs:
-            self._live(decode_inputs(page))
+        for entry in entries.inputs:
+            self._live(decode_inputs(entry))
 
     @property
     def unheard(self) -> tuple[Inputs, Outputs] | None:
@@ -79,14 +79,14 @@ class RecoverableNode:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """The next step, noted ahead; or the last one again. Raises OSError if it cannot be noted."""
-        return self.take(encode(inputs))
+        return self.step_encoded(encode(inputs))
 
-    def take(self, page: bytes, /) -> Outputs:
+    def step_encoded(self, entry: bytes, /) -> Outputs:
         """`step`, of encoded Inputs."""
-        inputs = decode_inputs(page)
+        inputs = decode_inputs(entry)
         if self._told is not None and inputs.observation.step < self.step_count:
             return self._told
-        self._diary.note(page)
+        self._wal.note(entry)
         return self._live(inputs)
 
     def _live(self, inputs: Inputs) -> Outputs:
@@ -106,9 +106,9 @@ class InMemoryLog:
         """All of it."""
         return None if self._birth is None else WalContents(self._birth, tuple(self._inputs))
 
-    def begin(self, birth: Body) -> None:
+    def begin(self, initial_state: Body) -> None:
         """Anew."""
-        self._birth, self._inputs = birth, []
+        self._birth, self._inputs = initial_state, []
 
     def note(self, inputs: bytes) -> None:
         """One more page."""
@@ -129,17 +129,17 @@ class KillableNode:
     def __init__(self, build: Build, body: Body) -> None:
         """body: what it takes over at time 0."""
         self._build = build
-        self._diary = InMemoryLog()
-        self._life: RecoverableNode | None = RecoverableNode(build, self._diary, body)
+        self._wal = InMemoryLog()
+        self._life: RecoverableNode | None = RecoverableNode(build, self._wal, body)
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """See `Life`. Nobody may ask the dead."""
-        return self.take(encode(inputs))
+        return self.step_encoded(encode(inputs))
 
-    def take(self, page: bytes, /) -> Outputs:
+    def step_encoded(self, entry: bytes, /) -> Outputs:
         """`step`, of encoded Inputs."""
         assert self._life is not None
-        return self._life.take(page)
+        return self._life.step_encoded(entry)
 
     def kill(self) -> None:
         """All is gone but the diary."""
@@ -147,16 +147,21 @@ class KillableNode:
 
     def start(self, body: Body, disk: Disk) -> tuple[int, int]:
         """Go on with what is left of the diary; the epoch, and the last step."""
-        self._diary.damage(disk, body.step)
-        self._life = RecoverableNode(self._build, self._diary, body)
-        return self._life.epoch, self._life.step_count
+        self._wal.damage(disk, body.step)
+        self._life = RecoverableNode(self._build, self._wal, body)
+        return self._life.incarnation, self._life.step_count
 
 
-def _covers(pages: WalContents, body: Body) -> bool:
+def _covers(entries: WalContents, body: Body) -> bool:
     """Whether a diary goes as far as the world's knowledge, or farther."""
-    return pages.birth.epoch == body.epoch and pages.birth.step + len(pages.inputs) >= body.step
+    return (
+        entries.initial_state.incarnation == body.incarnation
+        and entries.initial_state.step + len(entries.inputs) >= body.step
+    )
 
 
 def _reincarnated(body: Body) -> Body:
     """The body as a new incarnation takes it over; who has never acted needs none."""
-    return body if body.step == 0 else msgspec.structs.replace(body, epoch=body.epoch + 1)
+    return (
+        body if body.step == 0 else msgspec.structs.replace(body, incarnation=body.incarnation + 1)
+    )

@@ -102,7 +102,7 @@ class _Node:
         self._say = say
         self._path = state / f"{identity.user}.diary"
         self._mission: Mission | None = None
-        self._diary: WalFile | None = None
+        self._wal: WalFile | None = None
         self._life: RecoverableNode | None = None
         self._owed: Inputs | None = None
         """Lockstep: the turn that has not been answered."""
@@ -120,7 +120,7 @@ class _Node:
             if isinstance(message, Stop):
                 return message.reason
             if message is not None:
-                self._take(message)
+                self._handle(message)
             try:
                 self._act()
             except OSError as error:
@@ -141,10 +141,10 @@ class _Node:
             self.refused += 1
             return None
 
-    def _take(self, message: ToParticipant) -> None:
+    def _handle(self, message: ToParticipant) -> None:
         if isinstance(message, StepRequest):
             if self._wall is not None:
-                self._wall.take(message.inputs)
+                self._wall.enqueue(message.inputs)
             else:
                 self._owed = message.inputs
         elif isinstance(message, Stop) or message.nonce != self._line.nonce:
@@ -167,7 +167,10 @@ class _Node:
 
     def _goes_as_far_as(self, body: Body) -> bool:
         life = self._life
-        return life is not None and (life.epoch, life.step_count) >= (body.epoch, body.step)
+        return life is not None and (life.incarnation, life.step_count) >= (
+            body.incarnation,
+            body.step,
+        )
 
     def _act(self) -> None:
         """Do what is due. Raises OSError if it cannot be noted."""
@@ -192,20 +195,26 @@ class _Node:
 
     def _live(self, mission: Mission) -> None:
         """Go on from the diary, or begin one."""
-        if self._diary is not None:
-            self._diary.close()
-        self._diary = WalFile(self._path, mission.run)
-        self._life = RecoverableNode(partial(self._build, mission), self._diary, mission.body)
+        if self._wal is not None:
+            self._wal.close()
+        self._wal = WalFile(self._path, mission.run)
+        self._life = RecoverableNode(partial(self._build, mission), self._wal, mission.body)
         if self._life.step_count:
-            came = "new incarnation" if self._life.epoch > mission.body.epoch else "goes on"
-            self._say(f"{self._me}: {came}, epoch {self._life.epoch}, step {self._life.step_count}")
+            came = (
+                "new incarnation"
+                if self._life.incarnation > mission.body.incarnation
+                else "goes on"
+            )
+            self._say(
+                f"{self._me}: {came}, epoch {self._life.incarnation}, step {self._life.step_count}"
+            )
         self._tell_ready()
 
     def _tell_ready(self) -> None:
         life = self._life
         if life is not None:
             now_ns = 0 if self._wall is None else self._wall.now_ns
-            ready = Ready(VERSION, self._line.nonce, life.epoch, life.step_count, now_ns)
+            ready = Ready(VERSION, self._line.nonce, life.incarnation, life.step_count, now_ns)
             self._line.send(encode(ready), patiently=True)
 
     # Wall: the own clock.
@@ -217,7 +226,7 @@ class _Node:
         elif self._wall is not None:
             self._wall.skew_ns = go.skew_ns
             if go.observation is not None:
-                self._wall.take(Inputs(go.now_ns, go.observation))
+                self._wall.enqueue(Inputs(go.now_ns, go.observation))
             self._wall.said_ns = 0
 
     @property
@@ -226,19 +235,19 @@ class _Node:
         return life is not None and wall is not None and life.step_count > wall.accepted
 
     def _act_by_own_clock(self, wall: "WallClock") -> None:
-        life, diary = self._life, self._diary
-        if life is None or diary is None:
+        life, wal = self._life, self._wal
+        if life is None or wal is None:
             return
         now_ns = wall.now_ns
         if wall.is_due(now_ns) and wall.accepted == life.step_count:
-            diary.skew_ns = wall.skew_ns
+            wal.skew_ns = wall.skew_ns
             inputs = wall.inputs(now_ns)
             outputs = life.step(inputs)
             wall.inbox.clear()
-            self._report(diary.skew_ns, wall)
+            self._report(wal.skew_ns, wall)
             self._show(outputs, now_ns)
         elif self._unheard and wall.silent_s >= RETRY_S:
-            self._report(diary.skew_ns, wall)
+            self._report(wal.skew_ns, wall)
 
     def _report(self, skew_ns: int, wall: "WallClock") -> None:
         """Say what it did last. skew_ns: of its clock when it did."""

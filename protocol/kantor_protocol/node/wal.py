@@ -35,14 +35,14 @@ _LOCK_S = 0.5
 
 class _Header(msgspec.Struct, frozen=True, array_like=True):
     run: str
-    birth: Body
+    initial_state: Body
 
 
 class _SoundPrefix(NamedTuple):
     """What is sound of a file."""
 
     header: _Header
-    pages: list[bytes]
+    entries: list[bytes]
     """Encoded inputs."""
     skew_ns: int
     """Of the last page."""
@@ -81,15 +81,15 @@ class WalFile:
             return None
         self._end, self._crc, self.skew_ns = sound.ends[-1], sound.crc, sound.skew_ns
         os.ftruncate(self._file, self._end)
-        return WalContents(sound.header.birth, sound.pages)
+        return WalContents(sound.header.initial_state, sound.entries)
 
-    def begin(self, birth: Body) -> None:
+    def begin(self, initial_state: Body) -> None:
         """Throw away what there is, and begin anew. Raises OSError, and then the old file is still there."""
         draft = self._path.with_name(f".{self._path.name}.{os.getpid()}")
         file = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
             _owned(file)
-            content = msgspec.msgpack.encode(_Header(self._run, birth))
+            content = msgspec.msgpack.encode(_Header(self._run, initial_state))
             crc = zlib.crc32(_MAGIC)
             frame, crc = _frame(content, crc)
             _write(file, _MAGIC + frame, 0)
@@ -123,8 +123,8 @@ def tear(path: Path, step: int) -> None:
     sound = _sound_prefix(path.read_bytes())
     if sound is None:
         return
-    kept = max(0, step - sound.header.birth.step - 1)
-    if kept < len(sound.pages):
+    kept = max(0, step - sound.header.initial_state.step - 1)
+    if kept < len(sound.entries):
         os.truncate(path, (sound.ends[kept] + sound.ends[kept + 1]) // 2)
 
 
@@ -169,17 +169,17 @@ def _sound_prefix(content: bytes) -> _SoundPrefix | None:
         header = msgspec.msgpack.decode(first, type=_Header)
     except (StopIteration, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return None
-    pages, ends, skew_ns = [], [end], 0
+    entries, ends, skew_ns = [], [end], 0
     for frame, end, frame_crc in frames:
         try:
-            decode_inputs(page := frame[_SKEW.size :])
+            decode_inputs(entry := frame[_SKEW.size :])
         except RefusedError:
             break
         (skew_ns,) = _SKEW.unpack_from(frame)
-        pages.append(page)
+        entries.append(entry)
         ends.append(end)
         crc = frame_crc
-    return _SoundPrefix(header, pages, skew_ns, ends, crc)
+    return _SoundPrefix(header, entries, skew_ns, ends, crc)
 
 
 def _frames(content: bytes) -> Iterator[tuple[bytes, int, int]]:

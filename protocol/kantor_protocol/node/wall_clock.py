@@ -58,7 +58,7 @@ class WallClock:
         while self._clock.due_ns(self._ordinal) <= now_ns:
             self._ordinal += 1
 
-    def take(self, inputs: Inputs) -> None:
+    def enqueue(self, inputs: Inputs) -> None:
         """Note what has arrived."""
         self.inbox += inputs.inbox
         if inputs.observation.step >= self._observation.step:

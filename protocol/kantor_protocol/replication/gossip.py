@@ -32,12 +32,12 @@ class Gossip:
     until it hears it again: what a supervisor missed meanwhile it gets as any neighbour does.
     """
 
-    def __init__(self, me: ParticipantId, scenario: Scenario, epoch: int = 0) -> None:
+    def __init__(self, me: ParticipantId, scenario: Scenario, incarnation: int = 0) -> None:
         """epoch: which incarnation speaks."""
         self.refused = 0
         """Messages that were malformed, too old or from nobody in the roster."""
         roster = scenario.roster
-        self._me, self._epoch, self._origins = me, epoch, len(roster)
+        self._me, self._incarnation, self._origins = me, incarnation, len(roster)
         self._places = {name: i for i, name in enumerate(roster) if name != me}
         self._supervisor = self._supervisor_slot = self._places.get(SUPERVISOR, NOBODY)
         """Its place, and the slot of its newest incarnation; NOBODY without one."""
@@ -56,8 +56,8 @@ class Gossip:
             if place is None:
                 self.refused += 1
                 continue
-            slot = place + news.epoch * self._origins
-            if not learn(slot, news.have, news.logs, news.claims, news.registers):
+            slot = place + news.incarnation * self._origins
+            if not learn(slot, news.version_vector, news.logs, news.claims, news.registers):
                 self.refused += 1
             elif place == self._supervisor:
                 self._supervisor_slot = max(self._supervisor_slot, slot)
@@ -68,27 +68,27 @@ class Gossip:
         alone = self._supervisor == NOBODY or self._unheard_steps > CONTACT_PERIODS
         slot = NOBODY if alone else self._supervisor_slot
         target = EVERYBODY if alone else SUPERVISOR
-        have, logs, claims = replica.compose(slot)
+        version_vector, logs, claims = replica.compose(slot)
         news = GossipMessage(
             version=VERSION,
             step=step,
             x_m=pose.x_m,
             y_m=pose.y_m,
-            have=have,
+            version_vector=version_vector,
             logs=logs,
             claims=claims,
             registers=replica.registers.compose(slot),
-            epoch=self._epoch,
+            incarnation=self._incarnation,
         )
         return Envelope(source=self._me, sequence=step, target=target, body=encode_gossip(news))
 
 
 def build_replica(
-    me: ParticipantId, scenario: Scenario, units: Units | None, samples: int, epoch: int = 0
+    me: ParticipantId, scenario: Scenario, units: Units | None, samples: int, incarnation: int = 0
 ) -> Replica:
     """An empty replica for an incarnation of a participant of a scenario; see Replica."""
     origins = len(scenario.roster)
-    slot = epoch * origins + scenario.roster.index(me)
+    slot = incarnation * origins + scenario.roster.index(me)
     relay, beacon = me == SUPERVISOR, scenario.radio.beacon == "state"
     patience = ack_timeout_steps(me, scenario)
     return Replica(

@@ -174,7 +174,7 @@ class OccupancyLog:
         self._touched = np.zeros(cells, dtype=np.int64)
         self._changed = np.zeros(cells, dtype=np.int64)
 
-    def take(self, scan: bytes, pose: Pose, *, moved: bool) -> npt.NDArray[np.int64]:
+    def observe(self, scan: bytes, pose: Pose, *, moved: bool) -> npt.NDArray[np.int64]:
         """Add a scan made at a pose: (k,) entries for the log, rising. A scan of the wrong size is void.
 
         moved: since the scan before; from a place that it knows a robot learns nothing of ranges.

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from kantor_protocol.base.incarnations import known_to
 from kantor_protocol.base.kernels import kernel
-from kantor_protocol.base.varint import MALFORMED, put_int, put_uint, take_int, take_uint
+from kantor_protocol.base.varint import MALFORMED, put_int, put_uint, read_int, read_uint
 
 Register = npt.NDArray[np.int64]
 
@@ -54,13 +54,13 @@ def add(
 
 
 @kernel
-def _take_head(
+def _read_head(
     content: bytes | np.ndarray, at: int, origins: int, width: int
 ) -> tuple[int, int, int, int]:
     """Read what precedes the numbers of a register: (origin, stamp, numbers, position), or MALFORMED."""
-    origin, at = take_uint(content, at)
-    stamp, at = take_uint(content, at)
-    numbers, at = take_uint(content, at)
+    origin, at = read_uint(content, at)
+    stamp, at = read_uint(content, at)
+    numbers, at = read_uint(content, at)
     if at < 0 or origin >= origins or stamp < 1 or stamp > STAMP_MAX or numbers > width:
         return 0, 0, 0, MALFORMED
     return origin, stamp, numbers, at
@@ -75,14 +75,14 @@ def _sound(content: bytes, told: int, width: int, sums: bool) -> bool:
     """
     at = 0
     for _ in range(told):
-        stamp, at = take_uint(content, at)
+        stamp, at = read_uint(content, at)
         if at < 0 or stamp > STAMP_MAX:
             return False
     while at < len(content):
-        _origin, _stamp, numbers, at = _take_head(content, at, told, width)
+        _origin, _stamp, numbers, at = _read_head(content, at, told, width)
         bound = NUMBER_MAX
         for i in range(numbers):
-            number, at = take_int(content, at)
+            number, at = read_int(content, at)
             if at < 0 or number > bound or number < (0 if sums and i == 0 else -bound):
                 return False
             bound = number if sums and i == 0 else bound
@@ -108,15 +108,15 @@ def _learn(
     width = values.shape[1]
     at = 0
     for origin in range(told):
-        stamp, at = take_uint(content, at)
+        stamp, at = read_uint(content, at)
         known[source, origin] = max(known[source, origin], stamp)
     while 0 <= at < len(content):
-        origin, stamp, numbers, at = _take_head(content, at, told, width)
+        origin, stamp, numbers, at = _read_head(content, at, told, width)
         news = at >= 0 and origin != me and stamp > stamps[origin]
         for i in range(width if at >= 0 else 0):
             number = 0
             if i < numbers:
-                number, at = take_int(content, at)
+                number, at = read_int(content, at)
             if news:
                 total[i] += number - values[origin, i]
                 values[origin, i] = number
@@ -131,13 +131,13 @@ def _is_due(
     heard: np.ndarray,
     learnt: np.ndarray,
     sent: np.ndarray,
-    law: np.ndarray,
+    settings: np.ndarray,
     origin: int,
     target: int,
     step: int,
 ) -> bool:
     """Whether a register belongs in a message to everybody (target < 0), or to one participant."""
-    me, relay, beacon, patience = law[0], law[1], law[2], law[3]
+    me, relay, beacon, patience = settings[0], settings[1], settings[2], settings[3]
     stamp = stamps[origin]
     if stamp == 0:
         return False
@@ -163,14 +163,14 @@ def _compose(
     heard: np.ndarray,
     learnt: np.ndarray,
     sent: np.ndarray,
-    law: np.ndarray,
+    settings: np.ndarray,
     out: np.ndarray,
     target: int,
     step: int,
 ) -> int:
     """Write stamps and registers; the bytes used."""
     origins, width = values.shape
-    me = law[0]
+    me = settings[0]
     at = 0
     for origin in range(origins):
         at = put_uint(out, at, stamps[origin])
@@ -179,7 +179,7 @@ def _compose(
         origin = (step + turn) % origins if turn else me
         if (turn and origin == me) or at + longest > out.shape[0]:
             continue
-        if _is_due(stamps, known, heard, learnt, sent, law, origin, target, step):
+        if _is_due(stamps, known, heard, learnt, sent, settings, origin, target, step):
             at = put_uint(out, at, origin)
             at = put_uint(out, at, stamps[origin])
             numbers = width  # zeros at the end are left out
@@ -215,7 +215,7 @@ class Registers:
         self.me = me
         self._roster = origins
         self._sums = sums
-        self._law = np.array([me, relay, beacon, max(1, patience_steps)], dtype=np.int64)
+        self._settings = np.array([me, relay, beacon, max(1, patience_steps)], dtype=np.int64)
         self._step = 0
         self.total = np.zeros(width, dtype=np.int64)
         """(width,) the sum over origins."""
@@ -313,7 +313,7 @@ class Registers:
             self._heard,
             self._learnt,
             self._sent,
-            self._law,
+            self._settings,
             self._out,
             target,
             self._step,
@@ -330,12 +330,12 @@ def _find(content: bytes, origins: int, wanted: int, register: np.ndarray) -> in
     width = register.shape[0]
     at = 0
     for _ in range(origins):
-        _stamp, at = take_uint(content, at)
+        _stamp, at = read_uint(content, at)
     found = 0
     while 0 <= at < len(content):
-        origin, stamp, numbers, at = _take_head(content, at, origins, width)
+        origin, stamp, numbers, at = _read_head(content, at, origins, width)
         for i in range(numbers):
-            number, at = take_int(content, at)
+            number, at = read_int(content, at)
             if at >= 0 and origin == wanted:
                 register[i] = number
         if origin == wanted:

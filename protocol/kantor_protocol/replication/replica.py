@@ -41,7 +41,7 @@ import numpy.typing as npt
 
 from kantor_protocol.base.incarnations import known_to
 from kantor_protocol.base.kernels import kernel
-from kantor_protocol.base.varint import Pairs, take_uint
+from kantor_protocol.base.varint import Pairs, read_uint
 from kantor_protocol.replication.registers import Registers
 from kantor_protocol.replication.replica_kernels import (
     ENTRIES_MAX,
@@ -95,7 +95,7 @@ class Replica:
         weighed = samples if units else 0
         units = units or Units(whole=0, sample=0, point=0)
         self.registers = Registers(me, origins, 0) if registers is None else registers
-        self.manner = ReplicaConfig(
+        self.config = ReplicaConfig(
             me=me,
             ledger=ledger,
             claims=claims,
@@ -112,13 +112,13 @@ class Replica:
             logs=np.zeros((rows, 256, 2), dtype=np.int32),
             length=np.zeros(slots, dtype=np.int64),
             known=np.zeros((slots, 2 * slots), dtype=np.int32),
-            sending=_unsent(slots, self.manner.patience),
+            sending=_unsent(slots, self.config.patience),
             claims=_unclaimed(slots),
             lowered=np.zeros(weighed, dtype=np.int32),
             mark=np.zeros(weighed, dtype=np.int32),
             counters=np.array([0, 1, weighed], dtype=np.int64),
         )
-        self._law = np.array(self.manner, dtype=np.int64)
+        self._settings = np.array(self.config, dtype=np.int64)
         self._fit_rooms()
 
     def _fit_rooms(self) -> None:
@@ -126,7 +126,7 @@ class Replica:
         slots = self.slots
         self._out = np.zeros(20 * ENTRIES_MAX + 120 * slots + 64, dtype=np.uint8)
         self._least = np.zeros(2 * slots, dtype=np.int32)
-        self._fields = (*self.store, self._law)
+        self._fields = (*self.store, self._settings)
 
     @property
     def slots(self) -> int:
@@ -144,20 +144,20 @@ class Replica:
         return self.store.counters.item(HOLDING) == 0
 
     def learn(
-        self, source: int, have: bytes, logs: bytes, claims: bytes, registers: bytes = b""
+        self, source: int, version_vector: bytes, logs: bytes, claims: bytes, registers: bytes = b""
     ) -> bool:
         """Take in a message; False, and nothing changed, when it is malformed."""
         told = 0
         if registers:
-            told = count_slots(have, self.manner.roster, 2 if self.manner.claims else 1)
+            told = count_slots(version_vector, self.config.roster, 2 if self.config.claims else 1)
             if not self.registers.sound(registers, told):
                 return False
-        outcome = learn(*self._fields, have, logs, claims, source)
+        outcome = learn(*self._fields, version_vector, logs, claims, source)
         while outcome != LEARNT:
             if outcome == MALFORMED:
                 return False
             self._make_room(outcome)
-            outcome = learn(*self._fields, have, logs, claims, source)
+            outcome = learn(*self._fields, version_vector, logs, claims, source)
         if registers:
             self.registers.learn(source, registers, told)
         return True
@@ -172,13 +172,13 @@ class Replica:
     def append(self, indices: npt.NDArray[np.int64]) -> None:
         """Put (k,) bare indices, each below the bound, behind the own log."""
         self.reserve(indices.shape[0])
-        me, length = self.manner.me, int(self.store.length[self.manner.me])
+        me, length = self.config.me, int(self.store.length[self.config.me])
         self.store.logs[me, length : length + indices.shape[0], 0] = indices
         self.store.length[me] += indices.shape[0]
 
     def reserve(self, entries: int) -> None:
         """Make room for this many more entries in every log."""
-        written = self.store.length if self.manner.ledger else self.store.length[self.manner.me]
+        written = self.store.length if self.config.ledger else self.store.length[self.config.me]
         self._lengthen(int(written.max()) + entries)
 
     def _lengthen(self, needed: int) -> None:
@@ -191,7 +191,7 @@ class Replica:
         logs = np.zeros((rows, capacity, 2), dtype=np.int32)
         logs[:, : self.store.logs.shape[1]] = self.store.logs
         self.store = self.store._replace(logs=logs)
-        self._fields = (*self.store, self._law)
+        self._fields = (*self.store, self._settings)
 
     def _widen(self, slots: int) -> None:
         """Make room for this many origins: another incarnation was heard of."""
@@ -201,10 +201,10 @@ class Replica:
         known[:before, slots : slots + before] = old.known[:, before:]
         length = np.zeros(slots, dtype=np.int64)
         length[:before] = old.length
-        sending, claims = _unsent(slots, self.manner.patience), _unclaimed(slots)
+        sending, claims = _unsent(slots, self.config.patience), _unclaimed(slots)
         sending[:, :before], claims[:, :before] = old.sending, old.claims
         logs = old.logs
-        if self.manner.ledger:
+        if self.config.ledger:
             logs = np.zeros((slots, *old.logs.shape[1:]), dtype=np.int32)
             logs[:before] = old.logs
         self.store = old._replace(
@@ -215,7 +215,7 @@ class Replica:
 
     def claim(self, sample: int, now_ns: int) -> None:
         """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
-        claim(self.store.claims, self.store.counters, self.manner.me, sample, now_ns)
+        claim(self.store.claims, self.store.counters, self.config.me, sample, now_ns)
 
     def compose(self, target: int = NOBODY) -> tuple[bytes, bytes, bytes]:
         """(have, logs, claims) for one message to everybody, or to one participant."""
@@ -262,15 +262,15 @@ def _unclaimed(slots: int) -> npt.NDArray[np.int64]:
 
 
 @kernel
-def _read_have(have: np.ndarray, lengths: np.ndarray) -> int:
+def _read_version_vector(version_vector: np.ndarray, lengths: np.ndarray) -> int:
     at = 0
     for origin in range(lengths.shape[0]):
-        lengths[origin], at = take_uint(have, at)
+        lengths[origin], at = read_uint(version_vector, at)
     return at
 
 
-def read_have(have: bytes, origins: int) -> list[int] | None:
+def read_version_vector(version_vector: bytes, origins: int) -> list[int] | None:
     """The log lengths in a version vector, by slot; origins: see `slots.slots_told`. None if malformed."""
     lengths = np.zeros(origins, dtype=np.int64)
-    at = _read_have(np.frombuffer(have, dtype=np.uint8), lengths)
+    at = _read_version_vector(np.frombuffer(version_vector, dtype=np.uint8), lengths)
     return None if at < 0 else lengths.tolist()

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.kernels import kernel
-from kantor_protocol.base.varint import put_int, put_uint, skip_numbers, take_int, take_uint
+from kantor_protocol.base.varint import put_int, put_uint, read_int, read_uint, skip_numbers
 from kantor_protocol.replication.registers import FRESH_STEPS
 from kantor_protocol.wire.version_vector import count_slots
 
@@ -119,32 +119,32 @@ def _append(store: ReplicaArrays, row: int, origin: int, index: int, value: int)
 
 
 @kernel
-def spend(store: ReplicaArrays, manner: ReplicaConfig, index: int, units: int) -> None:
+def spend(store: ReplicaArrays, config: ReplicaConfig, index: int, units: int) -> None:
     """Ship `units` to a sample and log it. The log must have room for one more entry."""
     _lower(store, index, store.weights[index] - units)
-    if manner.ledger:
-        _append(store, manner.me, manner.me, index, units)
+    if config.ledger:
+        _append(store, config.me, config.me, index, units)
     else:
-        _append(store, 0, manner.me, index, store.weights[index])
+        _append(store, 0, config.me, index, store.weights[index])
 
 
 @kernel
 def _merge_entry(
-    store: ReplicaArrays, manner: ReplicaConfig, origin: int, index: int, value: int
+    store: ReplicaArrays, config: ReplicaConfig, origin: int, index: int, value: int
 ) -> None:
-    if manner.ledger:
+    if config.ledger:
         _append(store, origin, origin, index, value)
         if value > 0 and store.weights[index] > 0:
             _lower(store, index, max(0, store.weights[index] - value))
     elif value < store.weights[index]:
         _lower(store, index, value)
-        _append(store, 0, manner.me, index, value)
+        _append(store, 0, config.me, index, value)
 
 
 @kernel
 def _walk_suffixes(
     store: ReplicaArrays,
-    manner: ReplicaConfig,
+    config: ReplicaConfig,
     suffixes: bytes,
     source: int,
     told: int,
@@ -154,16 +154,16 @@ def _walk_suffixes(
 
     Returns how many entries some log may then hold, or a negative number when malformed.
     """
-    ledger = manner.ledger
+    ledger = config.ledger
     origins = store.length.shape[0]
     at = 0
     entries = 0
     longest = 0
     while at < len(suffixes):
-        origin, at = take_uint(suffixes, at)
-        start, at = take_uint(suffixes, at)
-        span, at = take_uint(suffixes, at)
-        count, at = take_uint(suffixes, at)
+        origin, at = read_uint(suffixes, at)
+        start, at = read_uint(suffixes, at)
+        span, at = read_uint(suffixes, at)
+        count, at = read_uint(suffixes, at)
         if at < 0 or origin >= told or count > span or count > len(suffixes):
             return -1
         if start > LENGTH_MAX or span > LENGTH_MAX:
@@ -173,24 +173,24 @@ def _walk_suffixes(
         held = store.length[origin] if origin < origins else 0
         entries += count
         if not ledger:
-            longest = store.length[manner.me] + entries
+            longest = store.length[config.me] + entries
         elif start <= held + entries:  # it may follow on another suffix in this message
             longest = max(longest, start + span)
-        fresh = origin != manner.me and (not ledger or start <= held < start + count)
+        fresh = origin != config.me and (not ledger or start <= held < start + count)
         if apply and not fresh:
-            at = skip_numbers(suffixes, at, 2 * count if manner.value_max > 0 else count)
+            at = skip_numbers(suffixes, at, 2 * count if config.value_max > 0 else count)
             continue
         index = 0
         for i in range(count):
-            step, at = take_int(suffixes, at)
+            step, at = read_int(suffixes, at)
             value = 0
-            if manner.value_max > 0:
-                value, at = take_uint(suffixes, at)
+            if config.value_max > 0:
+                value, at = read_uint(suffixes, at)
             index += step
-            if at < 0 or index < 0 or index >= manner.bound or value > manner.value_max:
+            if at < 0 or index < 0 or index >= config.bound or value > config.value_max:
                 return -1
             if apply and (not ledger or start + i >= held):
-                _merge_entry(store, manner, origin, index, value)
+                _merge_entry(store, config, origin, index, value)
         if apply and not ledger and start <= held:
             store.length[origin] = max(held, start + span)
     return longest
@@ -198,17 +198,17 @@ def _walk_suffixes(
 
 @kernel
 def _walk_claims(
-    store: ReplicaArrays, manner: ReplicaConfig, claims: bytes, told: int, apply: bool
+    store: ReplicaArrays, config: ReplicaConfig, claims: bytes, told: int, apply: bool
 ) -> int:
     at = 0
     while at < len(claims):
-        origin, at = take_uint(claims, at)
-        stamp, at = take_uint(claims, at)
-        sample, at = take_uint(claims, at)
-        since, at = take_uint(claims, at)
+        origin, at = read_uint(claims, at)
+        stamp, at = read_uint(claims, at)
+        sample, at = read_uint(claims, at)
+        since, at = read_uint(claims, at)
         if at < 0 or origin >= told or sample > store.weights.shape[0]:
             return -1
-        if apply and origin != manner.me and stamp > store.claims[_STAMP, origin]:
+        if apply and origin != config.me and stamp > store.claims[_STAMP, origin]:
             store.claims[SAMPLE, origin] = sample - 1
             store.claims[_SINCE, origin] = since
             store.claims[_STAMP, origin] = stamp
@@ -217,29 +217,37 @@ def _walk_claims(
 
 
 @kernel
-def _apply_have(
-    store: ReplicaArrays, manner: ReplicaConfig, have: bytes, source: int, told: int
+def _apply_version_vector(
+    store: ReplicaArrays, config: ReplicaConfig, version_vector: bytes, source: int, told: int
 ) -> None:
     known = store.known[source]
     origins = store.length.shape[0]
-    parts = 2 if manner.claims else 1
-    if told == origins and len(have) == parts * told:
+    parts = 2 if config.claims else 1
+    if told == origins and len(version_vector) == parts * told:
         # A byte for each: the processor takes many at once.
         for slot in range(parts * told):
-            known[slot] = max(known[slot], np.int32(have[slot]))
+            known[slot] = max(known[slot], np.int32(version_vector[slot]))
         return
     at = 0
     for part in range(parts):
         for slot in range(part * origins, part * origins + told):
-            held, at = take_uint(have, at)
+            held, at = read_uint(version_vector, at)
             known[slot] = max(known[slot], min(held, KNOWN_MAX))
 
 
 @kernel
-def config_of(law: np.ndarray) -> ReplicaConfig:
+def config_of(settings: np.ndarray) -> ReplicaConfig:
     """Configuration of a replica from its row of integers, as kernels take it."""
     return ReplicaConfig(
-        law[0], law[1] != 0, law[2] != 0, law[3] != 0, law[4] != 0, law[5], law[6], law[7], law[8]
+        settings[0],
+        settings[1] != 0,
+        settings[2] != 0,
+        settings[3] != 0,
+        settings[4] != 0,
+        settings[5],
+        settings[6],
+        settings[7],
+        settings[8],
     )
 
 
@@ -254,8 +262,8 @@ def learn(
     lowered: np.ndarray,
     mark: np.ndarray,
     counters: np.ndarray,
-    law: np.ndarray,
-    have: bytes,
+    settings: np.ndarray,
+    version_vector: bytes,
     suffixes: bytes,
     registers: bytes,
     source: int,
@@ -277,28 +285,28 @@ def learn(
         mark,
         counters,
     )
-    manner = config_of(law)
-    told = count_slots(have, manner.roster, 2 if manner.claims else 1)
-    if not 0 <= source < told or source == manner.me:
+    config = config_of(settings)
+    told = count_slots(version_vector, config.roster, 2 if config.claims else 1)
+    if not 0 <= source < told or source == config.me:
         return MALFORMED
-    longest = _walk_suffixes(store, manner, suffixes, source, told, False)
-    if longest < 0 or _walk_claims(store, manner, registers, told, False) < 0:
+    longest = _walk_suffixes(store, config, suffixes, source, told, False)
+    if longest < 0 or _walk_claims(store, config, registers, told, False) < 0:
         return MALFORMED
     if told > length.shape[0]:
         return -told
     if longest > logs.shape[1]:
         return longest
-    _apply_have(store, manner, have, source, told)
-    _walk_suffixes(store, manner, suffixes, source, told, True)
-    if manner.claims:
-        _walk_claims(store, manner, registers, told, True)
+    _apply_version_vector(store, config, version_vector, source, told)
+    _walk_suffixes(store, config, suffixes, source, told, True)
+    if config.claims:
+        _walk_claims(store, config, registers, told, True)
     store.sending[2, source] = store.counters[_STEP]
     return LEARNT
 
 
 @kernel
 def _find_least(
-    store: ReplicaArrays, manner: ReplicaConfig, target: int, least: np.ndarray
+    store: ReplicaArrays, config: ReplicaConfig, target: int, least: np.ndarray
 ) -> None:
     """The least that any neighbour, or the target alone, is known to hold in each slot of `known`.
 
@@ -309,8 +317,8 @@ def _find_least(
     least[:] = KNOWN_MAX + 1
     for other in range(origins):
         heard = store.sending[2, other]
-        lately = heard >= 0 and heard + manner.patience + FRESH_STEPS >= store.counters[_STEP]
-        if lately and other != manner.me and target in (NOBODY, other):
+        lately = heard >= 0 and heard + config.patience + FRESH_STEPS >= store.counters[_STEP]
+        if lately and other != config.me and target in (NOBODY, other):
             log, claim = least[other], least[origins + other]
             for slot in range(least.shape[0]):  # row by row: so the processor takes many at once
                 least[slot] = min(least[slot], store.known[other, slot])
@@ -321,20 +329,20 @@ def _find_least(
 
 @kernel
 def _start_of_suffix(
-    store: ReplicaArrays, manner: ReplicaConfig, target: int, least: int, origin: int, aged: int
+    store: ReplicaArrays, config: ReplicaConfig, target: int, least: int, origin: int, aged: int
 ) -> int:
     """First entry to send of an origin's log; its length when nothing is to be sent.
 
     least: how much of it all neighbours hold.
     """
-    me, relay, patience = manner.me, manner.relay, manner.patience
+    me, relay, patience = config.me, config.relay, config.patience
     length = store.length[origin]
-    if least < 0 and target < 0 and manner.beacon:
+    if least < 0 and target < 0 and config.beacon:
         return 0
     if least < 0:
         return store.sending[0, origin] if target >= 0 and origin == me else length
     step = store.counters[_STEP]
-    if (origin == me or relay) and length - least <= (_REPEATED if manner.value_max > 0 else 0):
+    if (origin == me or relay) and length - least <= (_REPEATED if config.value_max > 0 else 0):
         return least
     if least < aged and step - store.sending[1, origin] >= patience:
         store.sending[1, origin] = step
@@ -347,7 +355,7 @@ def _start_of_suffix(
 @kernel
 def _put_suffix(
     store: ReplicaArrays,
-    manner: ReplicaConfig,
+    config: ReplicaConfig,
     out: np.ndarray,
     at: int,
     origin: int,
@@ -355,7 +363,7 @@ def _put_suffix(
     room: int,
 ) -> tuple[int, int]:
     """Write one suffix: (position after it, entries written)."""
-    ledger, valued = manner.ledger, manner.value_max > 0
+    ledger, valued = config.ledger, config.value_max > 0
     log = store.logs[origin if ledger else 0]
     count = 0
     end = start
@@ -382,9 +390,9 @@ def _put_suffix(
 
 @kernel
 def _put_claims(
-    store: ReplicaArrays, manner: ReplicaConfig, out: np.ndarray, at: int, least: np.ndarray
+    store: ReplicaArrays, config: ReplicaConfig, out: np.ndarray, at: int, least: np.ndarray
 ) -> int:
-    me, relay = manner.me, manner.relay
+    me, relay = config.me, config.relay
     origins = store.length.shape[0]
     step = store.counters[_STEP]
     for origin in range(origins):
@@ -416,7 +424,7 @@ def compose(
     lowered: np.ndarray,
     mark: np.ndarray,
     counters: np.ndarray,
-    law: np.ndarray,
+    settings: np.ndarray,
     out: np.ndarray,
     least: np.ndarray,
     target: int,
@@ -436,32 +444,32 @@ def compose(
         mark,
         counters,
     )
-    manner = config_of(law)
-    me, ledger = manner.me, manner.ledger
-    _find_least(store, manner, target, least)
+    config = config_of(settings)
+    me, ledger = config.me, config.ledger
+    _find_least(store, config, target, least)
     origins = store.length.shape[0]
     at = 0
     for origin in range(origins):
         at = put_uint(out, at, store.length[origin])
-    if manner.claims:
+    if config.claims:
         for origin in range(origins):
             at = put_uint(out, at, store.claims[_STAMP, origin])
     end_of_have = at
-    slot = 3 + store.counters[_STEP] % manner.patience
+    slot = 3 + store.counters[_STEP] % config.patience
     entries_left = ENTRIES_MAX
     for turn in range(origins):
         origin = (me + turn) % origins
         if ledger or origin == me:
             aged = store.sending[slot, origin]
-            start = _start_of_suffix(store, manner, target, least[origin], origin, aged)
+            start = _start_of_suffix(store, config, target, least[origin], origin, aged)
             if start < store.length[origin] and entries_left > 0:
-                at, written = _put_suffix(store, manner, out, at, origin, start, entries_left)
+                at, written = _put_suffix(store, config, out, at, origin, start, entries_left)
                 entries_left -= written
     for origin in range(origins):
         store.sending[slot, origin] = store.length[origin]
     end_of_logs = at
-    if manner.claims:
-        at = _put_claims(store, manner, out, at, least)
+    if config.claims:
+        at = _put_claims(store, config, out, at, least)
     return end_of_have, end_of_logs, at
 
 

@@ -80,7 +80,7 @@ class TokenBucket:
         """It has been asked something, which it may answer."""
         self._asked += 1
 
-    def take(self, size: int, now_s: float) -> bool:
+    def admit(self, size: int, now_s: float) -> bool:
         """Whether a message of so many bytes is within the quota. now_s does not run back."""
         self._fill(now_s)
         if self._messages < 1.0 or self._bytes < size:

@@ -157,7 +157,7 @@ class HubRouter(Router):
             return False
         with self._listening:  # messages and tokens come in different threads
             flooded = bucket.floods
-            taken = bucket.take(size, time.monotonic())
+            taken = bucket.admit(size, time.monotonic())
             if bucket.floods and not flooded:
                 self._events.put(Flooded(name))
             return taken

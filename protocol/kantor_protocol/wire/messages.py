@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.grid import Frame
-from kantor_protocol.base.incarnations import EPOCHS_MAX
+from kantor_protocol.base.incarnations import INCARNATIONS_MAX
 from kantor_protocol.base.machine import Body, Inputs, Observation, Outputs, ParticipantId, Pose
 from kantor_protocol.scenario.schema import Scenario
 
@@ -68,7 +68,7 @@ class GossipMessage(_Message, frozen=True, array_like=True, tag=1, gc=False):
     x_m: float
     y_m: float
     """Where the sender says it is, world frame."""
-    have: bytes
+    version_vector: bytes
     """Version vector: for every slot that the sender knows (`slots.py`), how many log entries it holds;
     then, with claims, the newest claim stamp it holds. LEB128."""
     logs: bytes
@@ -78,7 +78,7 @@ class GossipMessage(_Message, frozen=True, array_like=True, tag=1, gc=False):
     registers: bytes = b""
     """For every such slot the stamp of the register that the sender holds; then registers: origin, stamp,
     numbers. LEB128, the numbers zigzag-folded. Empty in a mission whose planner has none."""
-    epoch: int = 0
+    incarnation: int = 0
     """The sender's incarnation."""
 
 
@@ -148,7 +148,7 @@ class Ready(_Message, frozen=True, array_like=True, tag=7):
     """Participant to world-sim: mission received, prepared to step."""
 
     nonce: str
-    epoch: int = 0
+    incarnation: int = 0
     """Which incarnation it is."""
     step: int = 0
     """The step that it goes on from, by its own snapshot."""
@@ -211,7 +211,7 @@ _NO_EPOCH, _NO_REGISTERS = encode(0), encode(b"") + encode(0)
 def encode_gossip(news: GossipMessage) -> bytes:
     """The body of an envelope. What has a default and is at the end is left out."""
     body = encode(news)
-    if news.epoch:
+    if news.incarnation:
         return body
     if news.registers:
         return b"\x99" + body[1 : -len(_NO_EPOCH)]
@@ -230,8 +230,10 @@ def decode_gossip(body: bytes) -> GossipMessage:
         raise RefusedError(f"version {news.version}, this is {VERSION}")
     if not (math.isfinite(news.x_m) and math.isfinite(news.y_m)) or news.step < 0:
         raise RefusedError("news without a finite place")
-    if not 0 <= news.epoch <= EPOCHS_MAX:
-        raise RefusedError(f"news of incarnation {news.epoch}, the last is {EPOCHS_MAX}")
+    if not 0 <= news.incarnation <= INCARNATIONS_MAX:
+        raise RefusedError(
+            f"news of incarnation {news.incarnation}, the last is {INCARNATIONS_MAX}"
+        )
     return news
 
 

@@ -125,7 +125,7 @@ class WeightsSubscriber:
         self._pairs = Pairs()
         self._decoder = msgspec.msgpack.Decoder(WeightsMessage)
 
-    def take(self, payload: bytes) -> bool:
+    def apply(self, payload: bytes) -> bool:
         """Apply a message; False when it is malformed or does not follow what was received."""
         try:
             message = self._decoder.decode(payload)

@@ -86,48 +86,50 @@ class Agenda:
         return batch
 
 
-def simulate(stage: Simulation, exchange: Exchange, seed: int, stopped: Callable[[], bool]) -> str:
+def simulate(
+    simulation: Simulation, exchange: Exchange, seed: int, stopped: Callable[[], bool]
+) -> str:
     """Run until every robot rests, the limit is reached or `stopped()`; the reason, also recorded.
 
-    stage: new, or resumed. exchange: a Crew, where the scenario has faults of processes.
+    simulation: new, or resumed. exchange: a Crew, where the scenario has faults of processes.
     """
-    return _Mission(stage, exchange, seed, stopped).run()
+    return _Mission(simulation, exchange, seed, stopped).run()
 
 
 class _Mission:
     """A mission turn by turn. Beside the stage it knows nothing but functions of time."""
 
     def __init__(
-        self, stage: Simulation, exchange: Exchange, seed: int, stopped: Callable[[], bool]
+        self, simulation: Simulation, exchange: Exchange, seed: int, stopped: Callable[[], bool]
     ) -> None:
         self._exchange = exchange
         self._crew = cast("Crew", exchange)
-        self._clocks = step_clocks(stage.scenario, seed)
+        self._clocks = step_clocks(simulation.scenario, seed)
         self._stopped = stopped
-        self._go_on(stage)
+        self._go_on(simulation)
 
-    def _go_on(self, stage: Simulation) -> None:
-        self._stage = stage
-        self._agenda = Agenda(self._clocks, stage.done_ns)
-        self._outages = ProcessFaults(stage.scenario, done=stage.deeds)
+    def _go_on(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self._agenda = Agenda(self._clocks, simulation.done_ns)
+        self._outages = ProcessFaults(simulation.scenario, done=simulation.deeds)
 
     def run(self) -> str:
         while True:
             step_ns, deed_ns = self._agenda.next_ns, self._outages.next_ns
             if reason := self._reason(step_ns if deed_ns is None else min(step_ns, deed_ns)):
-                self._stage.end(reason)
+                self._simulation.end(reason)
                 return reason
             if deed_ns is None:
-                self._step(self._agenda.batch(self._stage.channel.lookahead_ns))
+                self._step(self._agenda.batch(self._simulation.channel.lookahead_ns))
             elif deed_ns > step_ns:
-                self._step(self._agenda.batch(self._stage.channel.lookahead_ns, deed_ns))
+                self._step(self._agenda.batch(self._simulation.channel.lookahead_ns, deed_ns))
             else:
                 self._do(self._outages.pop())
 
     def _reason(self, next_ns: int) -> str | None:
-        if over := self._stage.over:
+        if over := self._simulation.over:
             return over
-        if next_ns > self._stage.limit_ns:
+        if next_ns > self._simulation.limit_ns:
             return "limit"
         return "interrupted" if self._stopped() else None
 
@@ -136,11 +138,12 @@ class _Mission:
 
         There is no reason yet to end before its first moment.
         """
-        outages, stage = self._outages, self._stage
+        outages, simulation = self._outages, self._simulation
         quiet = outages.quiet(batch[0][0], batch[-1][0])
         due = batch if quiet else [event for event in batch if self._is_asked(*event)]
         turns = {
-            name: stage.turn(name, due_ns, outages.skew_ns(name, due_ns)) for due_ns, name in due
+            name: simulation.turn(name, due_ns, outages.skew_ns(name, due_ns))
+            for due_ns, name in due
         }
         outputs = self._exchange({name: turn.inputs for name, turn in turns.items()})
         if outages.some_die_mid_step and not quiet:
@@ -148,7 +151,9 @@ class _Mission:
         for moment_ns, acting in groupby(due, key=itemgetter(0)):
             if moment_ns > batch[0][0] and self._reason(moment_ns):
                 break  # what was looked ahead to does not happen
-            stage.settle(moment_ns, [turns[name].answered(outputs.get(name)) for _, name in acting])
+            simulation.settle(
+                moment_ns, [turns[name].answered(outputs.get(name)) for _, name in acting]
+            )
 
     def _is_asked(self, due_ns: int, name: ParticipantId) -> bool:
         return not self._outages.idle(name, due_ns) or self._dies(due_ns, name)
@@ -158,7 +163,7 @@ class _Mission:
         outages = self._outages
         if not outages.dies(name, due_ns) or outages.idle(WORLD_SIM, due_ns):
             return False
-        return self._stage.unanswered(name) is None
+        return self._simulation.unanswered(name) is None
 
     def _cut_short(
         self, due: list[tuple[int, ParticipantId]], outputs: Mapping[ParticipantId, Outputs]
@@ -186,20 +191,20 @@ class _Mission:
         self._note(deed, deed.what)
         if deed.who == WORLD_SIM:
             self._crew.kill(WORLD_SIM)
-            self._go_on(self._stage.rebuilt())
-        elif not deed.mid_step or self._stage.unanswered(deed.who):
+            self._go_on(self._simulation.rebuilt())
+        elif not deed.mid_step or self._simulation.unanswered(deed.who):
             self._crew.kill(deed.who)
 
     def _start(self, deed: ScheduledProcessFault) -> None:
         """Start a process, and have it answer what it was asked."""
-        stage, who = self._stage, deed.who
-        if deed.mid_step and not stage.unanswered(who):  # it had no step to die in
+        simulation, who = self._simulation, deed.who
+        if deed.mid_step and not simulation.unanswered(who):  # it had no step to die in
             self._crew.kill(who)
-        epoch, step = self._crew.start(who, stage.body(who), deed.disk)
-        stage.note(ProcessEvent(deed.at_ns, who, "start", deed.fault, step, epoch))
-        if asked := stage.unanswered(who):
+        incarnation, step = self._crew.start(who, simulation.body(who), deed.disk)
+        simulation.note(ProcessEvent(deed.at_ns, who, "start", deed.fault, step, incarnation))
+        if asked := simulation.unanswered(who):
             outputs = self._exchange({who: asked.inputs}).get(who)
-            stage.settle(deed.at_ns, [asked.answered(outputs)])
+            simulation.settle(deed.at_ns, [asked.answered(outputs)])
 
     def _note(self, deed: ScheduledProcessFault, what: str) -> None:
-        self._stage.note(ProcessEvent(deed.at_ns, deed.who, what, deed.fault))
+        self._simulation.note(ProcessEvent(deed.at_ns, deed.who, what, deed.fault))

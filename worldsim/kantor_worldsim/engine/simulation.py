@@ -60,7 +60,7 @@ class Simulation:
     """A mission under way."""
 
     def __init__(
-        self, scenario: Scenario, seed: int, site: WorldSetup, listeners: Iterable[Observer]
+        self, scenario: Scenario, seed: int, site: WorldSetup, observers: Iterable[Observer]
     ) -> None:
         self.scenario = scenario
         self.seed = seed
@@ -80,7 +80,7 @@ class Simulation:
         self._robots = frozenset(scenario.robot_ids)
         self._site = site
         self._world = World(scenario, seed, site)
-        self._listeners = tuple(listeners)
+        self._observers = tuple(observers)
         self._resting: set[ParticipantId] = set()
         self._acted: set[ParticipantId] = set()
         self._unanswered: dict[ParticipantId, Step] = {}
@@ -100,17 +100,17 @@ class Simulation:
         seed: int,
         site: WorldSetup,
         records: Iterable[Record],
-        listeners: Iterable[Observer],
+        observers: Iterable[Observer],
     ) -> "Simulation":
         """A stage as it was when it had told these records, all without an ending.
 
         What participants did happens once more, and no listener is told. Raises ForeignRecordError.
         """
         told: list[Record] = []
-        stage = cls(scenario, seed, site, [told.append])
+        simulation = cls(scenario, seed, site, [told.append])
         for number, record in enumerate(records):
             try:
-                stage._repeat(record)
+                simulation._repeat(record)
             except KeyError as error:
                 raise ForeignRecordError(f"record {number}: {error} is not under way") from None
             except IndexError:
@@ -118,13 +118,13 @@ class Simulation:
             if told != [record]:
                 raise ForeignRecordError(f"record {number}: does not follow from those before it")
             told.clear()
-        stage._listeners = tuple(listeners)
-        return stage
+        simulation._observers = tuple(observers)
+        return simulation
 
     def rebuilt(self) -> "Simulation":
         """The same stage from its records; only where the scenario has world-sim killed."""
         assert self._kept is not None
-        return Simulation.resumed(self.scenario, self.seed, self._site, self._kept, self._listeners)
+        return Simulation.resumed(self.scenario, self.seed, self._site, self._kept, self._observers)
 
     def forget(self) -> None:
         """Keep no records: a process that is killed is not rebuilt in memory."""
@@ -132,21 +132,27 @@ class Simulation:
 
     def _repeat(self, record: Record) -> None:
         if isinstance(record, Batch):
-            self.settle(record.now_ns, [self._recalled(act) for act in record.acts])
+            self.settle(
+                record.now_ns, [self._recalled(step_record) for step_record in record.step_records]
+            )
         elif isinstance(record, ProcessEvent):
             self.note(record)
 
-    def _recalled(self, act: StepRecord) -> Step:
+    def _recalled(self, step_record: StepRecord) -> Step:
         """The step that an act is the record of."""
-        if act.outputs is None or act.name in self._unanswered:
-            return self.turn(act.name, act.now_ns, act.skew_ns).answered(act.outputs)
-        inbox = self.channel.take_heard(act.name, act.heard)
-        inputs = Inputs(act.now_ns + act.skew_ns, self._world.observe(act.name), inbox)
-        return Step(act.name, inputs, act.outputs, act.skew_ns)
+        if step_record.outputs is None or step_record.name in self._unanswered:
+            return self.turn(step_record.name, step_record.now_ns, step_record.skew_ns).answered(
+                step_record.outputs
+            )
+        inbox = self.channel.collect_heard(step_record.name, step_record.heard)
+        inputs = Inputs(
+            step_record.now_ns + step_record.skew_ns, self._world.observe(step_record.name), inbox
+        )
+        return Step(step_record.name, inputs, step_record.outputs, step_record.skew_ns)
 
     def inputs(self, name: ParticipantId, now_ns: int) -> Inputs:
         """What has reached a participant by now. Its inbox is handed out once."""
-        return Inputs(now_ns, self._world.observe(name), self.channel.take(name, now_ns))
+        return Inputs(now_ns, self._world.observe(name), self.channel.collect(name, now_ns))
 
     def turn(self, name: ParticipantId, now_ns: int, skew_ns: int = 0) -> Step:
         """What to ask a participant now: the last turn again if it has not answered that."""
@@ -154,7 +160,7 @@ class Simulation:
         if asked is not None:
             return asked
         inputs = Inputs(
-            now_ns + skew_ns, self._world.observe(name), self.channel.take(name, now_ns)
+            now_ns + skew_ns, self._world.observe(name), self.channel.collect(name, now_ns)
         )
         return Step(name, inputs, None, skew_ns)
 
@@ -206,17 +212,23 @@ class Simulation:
         sound = [step if _is_sound(step) else step.answered(None) for step in steps]
         sent = [Sent(now_ns, e) for step in sound if step.outputs for e in step.outputs.outbox]
         ruled, out_of_range = self.channel.transmit(sent)
-        verdicts = tuple(ruled)
-        acts = tuple([self._act(step) for step in sound])
-        absent = [act.name for act in acts if act.outputs is None] if self._unanswered else ()
-        tolls = self._faults.take_tolls() if self._faults else ()
-        forged = self._faults.take_forged() if self._faults else ()
-        self._tell(Batch(now_ns, acts, verdicts, out_of_range, tuple(absent), tolls, forged))
-        return verdicts
+        decisions = tuple(ruled)
+        step_records = tuple([self._act(step) for step in sound])
+        absent = (
+            [step_record.name for step_record in step_records if step_record.outputs is None]
+            if self._unanswered
+            else ()
+        )
+        fault_stats = self._faults.pop_stats() if self._faults else ()
+        forged = self._faults.pop_forged() if self._faults else ()
+        self._tell(
+            Batch(now_ns, step_records, decisions, out_of_range, tuple(absent), fault_stats, forged)
+        )
+        return decisions
 
     def note(self, incident: ProcessEvent) -> None:
         """Put on record what befell a process, and let it have its effect on who is left, and where."""
-        now_ns, who, what, index, _, epoch = msgspec.structs.astuple(incident)
+        now_ns, who, what, index, _, incarnation = msgspec.structs.astuple(incident)
         self.now_ns, self.done_ns = max(self.now_ns, now_ns), now_ns
         if what == "kill":
             self._died_ns[who] = now_ns
@@ -227,7 +239,7 @@ class Simulation:
         if what in {"start", "join"} and who != WORLD_SIM:
             if isinstance(fault, OnProcesses):  # what reached nobody
                 self.channel.lose(who, self._died_ns.get(who, fault.from_ns), now_ns)
-            if self._world.begin(who, epoch):
+            if self._world.begin(who, incarnation):
                 self._resting.discard(who)
         self._tell(incident)
 
@@ -244,17 +256,17 @@ class Simulation:
         if self._unanswered:
             self._unanswered.pop(name, None)
         heard = tuple([(envelope.source, envelope.sequence) for envelope in inputs.inbox])
-        ruling = self._world.accept(name, now_ns, outputs)
-        self.channel.place(name, ruling.pose)
+        verdict = self._world.accept(name, now_ns, outputs)
+        self.channel.place(name, verdict.pose)
         self._acted.add(name)
         if outputs.state is not State.EXPLORING and name in self._robots:
             self._resting.add(name)
-        return StepRecord(name, now_ns, inputs.observation, heard, outputs, ruling, skew_ns)
+        return StepRecord(name, now_ns, inputs.observation, heard, outputs, verdict, skew_ns)
 
     def _tell(self, record: Record) -> None:
         if self._kept is not None:
             self._kept.append(record)
-        for listener in self._listeners:
+        for listener in self._observers:
             listener(record)
 
 

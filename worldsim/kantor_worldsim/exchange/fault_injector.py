@@ -26,12 +26,12 @@ _ORDERS: dict[str, Literal["freeze", "thaw", "fill", "free", "pretend"]] = {
 class FaultInjector:
     """The faults of processes on the wall: one deed after the other, and on record when it is done."""
 
-    def __init__(self, doorway: Lobby, stage: Simulation, plan: MissionConfig) -> None:
-        self._doorway = doorway
-        self._stage = stage
+    def __init__(self, lobby: Lobby, simulation: Simulation, plan: MissionConfig) -> None:
+        self._lobby = lobby
+        self._simulation = simulation
         self._scenario = plan.scenario
         self._speed = plan.speed
-        self._outages = ProcessFaults(plan.scenario, done=stage.deeds)
+        self._outages = ProcessFaults(plan.scenario, done=simulation.deeds)
         self._deed: ScheduledProcessFault | None = None
         """What has been begun and is not done."""
         self._since_s = 0.0
@@ -43,13 +43,13 @@ class FaultInjector:
         self._held: set[ParticipantId] = set()
         """Those of the slow that are stopped now."""
         deeds = schedule_of(plan.scenario)
-        for deed in deeds[: stage.deeds]:
+        for deed in deeds[: simulation.deeds]:
             self._keep_count(deed)
         for name in sorted(self._slow):
             self._order(
                 ProcessCommand("thaw", name)
             )  # the process before this one may have held it
-        self.world_starts_ns = world_starts_ns(deeds, stage.deeds)
+        self.world_starts_ns = world_starts_ns(deeds, simulation.deeds)
         """When world-sim is to start again, if a fault has killed it."""
 
     @property
@@ -74,7 +74,7 @@ class FaultInjector:
         """Whether a participant is stopped, or is back from that in a moment."""
         if name in self._paused or name in self._held:
             return True
-        return name in self._slow and name not in self._doorway.ready
+        return name in self._slow and name not in self._lobby.ready
 
     def dies(self, name: ParticipantId) -> bool:
         """Kill a participant that was to die in this step, of which nobody hears."""
@@ -88,7 +88,7 @@ class FaultInjector:
         """Whoever is there again is excused no more, unless it is about to go."""
         going = self._deed is not None and (self._deed.what, self._deed.who) == ("kill", name)
         if not going and name not in self._paused | self._slow:
-            self._doorway.excused.discard(name)
+            self._lobby.excused.discard(name)
 
     def do(self, now_ns: int) -> None:
         """Do what is due."""
@@ -104,23 +104,23 @@ class FaultInjector:
 
     def _begin(self, deed: ScheduledProcessFault, now_ns: int) -> None:
         self._since_s = time.monotonic()
-        who, doorway = deed.who, self._doorway
+        who, lobby = deed.who, self._lobby
         self._keep_count(deed)
         if who == WORLD_SIM:
             self._begin_on_world_sim(deed, now_ns)
         elif deed.what == "kill":
-            doorway.excused.add(who)
+            lobby.excused.add(who)
             if not deed.mid_step:
                 self._order(ProcessCommand("kill", who))
         elif deed.what == "start":
-            self._visit = doorway.visits[who]
-            self._order(ProcessCommand("start", who, deed.disk, self._stage.body(who).step))
+            self._visit = lobby.visits[who]
+            self._order(ProcessCommand("start", who, deed.disk, self._simulation.body(who).step))
         elif deed.what in {"slow", "quicken"}:
-            doorway.excused.add(who)
+            lobby.excused.add(who)
             self._hold(who, held=False)
         elif deed.what in _ORDERS:
             if deed.what == "pause":
-                doorway.excused.add(who)
+                lobby.excused.add(who)
             self._order(ProcessCommand(_ORDERS[deed.what], who))
 
     def _begin_on_world_sim(self, deed: ScheduledProcessFault, now_ns: int) -> None:
@@ -134,27 +134,27 @@ class FaultInjector:
 
     def _is_done(self, deed: ScheduledProcessFault, now_ns: int) -> bool:
         """Whether a deed is done; then it is on record."""
-        doorway, who = self._doorway, deed.who
+        lobby, who = self._lobby, deed.who
         waited_s = time.monotonic() - self._since_s
         what: str = deed.what
-        epoch = step = 0
+        incarnation = step = 0
         if who == WORLD_SIM:
             done = True
         elif deed.what == "kill":
-            done = not doorway.is_there(who)
+            done = not lobby.is_there(who)
             if deed.mid_step and waited_s > _STEPS_TO_DIE * self._period_s:
                 self._order(ProcessCommand("kill", who))  # it makes no more steps
         elif deed.what == "start":
-            done = doorway.visits[who] > self._visit
+            done = lobby.visits[who] > self._visit
             if done:
-                epoch, step = doorway.told[who].epoch, doorway.told[who].step
+                incarnation, step = lobby.told[who].incarnation, lobby.told[who].step
         elif deed.what == "pretend":
             refused = self._order(ProcessCommand("refused", who))
             done, what = refused is not None, "pretend" if refused else "let in"
         else:
             done = True
         if done:
-            self._note(deed, what, now_ns, epoch, step)
+            self._note(deed, what, now_ns, incarnation, step)
         elif waited_s > RETURN_S + _STEPS_TO_DIE * self._period_s:
             raise BusError(f"{who}: {deed.what} does not come to an end; see the logs")
         return done
@@ -164,10 +164,15 @@ class FaultInjector:
         return self._scenario.period_ns * 1e-9 / self._speed
 
     def _note(
-        self, deed: ScheduledProcessFault, what: str, now_ns: int, epoch: int = 0, step: int = 0
+        self,
+        deed: ScheduledProcessFault,
+        what: str,
+        now_ns: int,
+        incarnation: int = 0,
+        step: int = 0,
     ) -> None:
-        now_ns = max(now_ns, self._stage.now_ns)
-        self._stage.note(ProcessEvent(now_ns, deed.who, what, deed.fault, step, epoch))
+        now_ns = max(now_ns, self._simulation.now_ns)
+        self._simulation.note(ProcessEvent(now_ns, deed.who, what, deed.fault, step, incarnation))
 
     def _keep_count(self, deed: ScheduledProcessFault) -> None:
         """Know who is stopped by what."""
@@ -188,8 +193,8 @@ class FaultInjector:
             (self._held.add if held else self._held.discard)(name)
 
     def _order(self, order: ProcessCommand) -> bool | None:
-        assert self._doorway.hands is not None, "faults of processes need hands"
-        return self._doorway.hands(order)
+        assert self._lobby.hands is not None, "faults of processes need hands"
+        return self._lobby.hands(order)
 
 
 def world_starts_ns(deeds: list[ScheduledProcessFault], done: int) -> int | None:

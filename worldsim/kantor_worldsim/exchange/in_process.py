@@ -40,11 +40,11 @@ class InProcessExchange:
         machines = self._machines
         made = {}
         for name, given in inputs.items():
-            machine, page = machines[name], encode(given)
+            machine, entry = machines[name], encode(given)
             outputs = (
-                machine.take(page)
+                machine.step_encoded(entry)
                 if type(machine) is KillableNode
-                else machine.step(decode_inputs(page))
+                else machine.step(decode_inputs(entry))
             )
             made[name] = decode_outputs(encode(outputs))
         return made
@@ -61,7 +61,7 @@ class InProcessExchange:
         if not isinstance(
             machine, KillableNode
         ):  # it has been there all the time, and was not asked
-            return body.epoch, body.step
+            return body.incarnation, body.step
         self._lives[name] += 1
         self._admission.join(name, self._nonce(name))
         return machine.start(body, disk)

@@ -49,7 +49,7 @@ POLL_S = 0.02
 class Lobby:
     """Who is on the bus: lets each participant in, one process at a time, and hands its messages on."""
 
-    stage: Simulation
+    simulation: Simulation
 
     def __init__(
         self,
@@ -137,13 +137,13 @@ class Lobby:
         self._clock = clock
         for name in self._plan.scenario.roster:
             absent = name not in self.ready and name not in self.excused
-            if absent and name not in self._away and self.stage.acted(name):
+            if absent and name not in self._away and self.simulation.acted(name):
                 self._note(name, "leave")
             if absent:
                 self._away.add(name)
             elif name in self._away:
                 self._come(name)
-        self.stage.gone = self.stage.gone | self._away
+        self.simulation.gone = self.simulation.gone | self._away
 
     def next(self, timeout_s: float) -> tuple[ParticipantId, Report] | None:
         """The next report, or None when something else came or the timeout passed."""
@@ -236,7 +236,7 @@ class Lobby:
             plan.exchange,
             plan.site.ground and plan.site.ground.frame,
             self._run,
-            self.stage.body(event.name),
+            self.simulation.body(event.name),
         )
         self.host.send(event.name, encode(mission), patiently=True)
 
@@ -253,7 +253,7 @@ class Lobby:
 
     def _lose(self, name: ParticipantId) -> None:
         self._away.add(name)
-        self.stage.gone = self.stage.gone | {name}
+        self.simulation.gone = self.simulation.gone | {name}
         self._note(name, "leave")
 
     def _hear(self, event: Heard) -> tuple[ParticipantId, Report] | None:
@@ -271,7 +271,7 @@ class Lobby:
         return (event.name, message) if event.name in self.ready else None
 
     def _get_ready(self, name: ParticipantId, message: Ready) -> None:
-        if not _follows(message, self.stage.body(name)):
+        if not _follows(message, self.simulation.body(name)):
             self._refuse(
                 Joined(name, message.nonce),
                 "has another past than this run; delete its diary and start it again",
@@ -292,21 +292,21 @@ class Lobby:
 
     def _come(self, name: ParticipantId) -> None:
         self._away.discard(name)
-        self.stage.gone = self.stage.gone - {name}
+        self.simulation.gone = self.simulation.gone - {name}
         self._note(name, "join")
 
     def _note(self, name: ParticipantId, what: str) -> None:
         """Put on record what nobody ordered."""
         assert self._clock is not None
-        now_ns, told = max(self._clock(), self.stage.now_ns), self.told.get(name)
-        step = epoch = 0
+        now_ns, told = max(self._clock(), self.simulation.now_ns), self.told.get(name)
+        step = incarnation = 0
         if what == "join" and told is not None:  # one that was only frozen has told it long ago
-            step, epoch = max(told.step, self.stage.body(name).step), told.epoch
-        self.stage.note(ProcessEvent(now_ns, name, what, -1, step, epoch))
+            step, incarnation = max(told.step, self.simulation.body(name).step), told.incarnation
+        self.simulation.note(ProcessEvent(now_ns, name, what, -1, step, incarnation))
 
     def go(self, name: ParticipantId, now_ns: int, speed: float, skew_ns: int) -> None:
         """Wall: start a participant's clock, or set the one that its machine reads."""
-        look = self.stage.look(name)
+        look = self.simulation.look(name)
         message = StartClock(VERSION, self.ready[name], now_ns, speed, look, skew_ns)
         self.host.send(name, encode(message), patiently=True)
 
@@ -331,14 +331,14 @@ class Lobby:
 
 def _follows(ready: Ready, body: Body) -> bool:
     """Whether a process goes on from where the world is: at most a step ahead, or one incarnation."""
-    reborn = ready.epoch == body.epoch + 1
-    return (ready.epoch == body.epoch or reborn) and ready.step - body.step in {0, 1}
+    reborn = ready.incarnation == body.incarnation + 1
+    return (ready.incarnation == body.incarnation or reborn) and ready.step - body.step in {0, 1}
 
 
-def wait_for(doorway: Lobby, done: Callable[[], bool], complaint: str) -> None:
+def wait_for(lobby: Lobby, done: Callable[[], bool], complaint: str) -> None:
     """Serve the doorway until something has happened. Raises BusError."""
     give_up = time.monotonic() + RETURN_S
     while not done():
         if time.monotonic() >= give_up:
             raise BusError(f"{complaint}; see the logs")
-        doorway.next(POLL_S)
+        lobby.next(POLL_S)

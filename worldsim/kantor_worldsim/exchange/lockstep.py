@@ -16,61 +16,57 @@ BARRIER_S = 10.0
 class LockstepExchange:
     """The crew over the bus, with a barrier: everybody due steps, then all go on together."""
 
-    def __init__(self, doorway: Lobby) -> None:
-        self._doorway = doorway
+    def __init__(self, lobby: Lobby) -> None:
+        self._lobby = lobby
 
     def __call__(
         self, inputs: Mapping[ParticipantId, Inputs], /
     ) -> Mapping[ParticipantId, Outputs]:
         """Step all of a batch. Whoever comes back meanwhile, or is silent, is asked again."""
-        doorway = self._doorway
+        lobby = self._lobby
         outputs: dict[ParticipantId, Outputs] = {}
         asked: dict[ParticipantId, tuple[int, float]] = {}
         give_up = time.monotonic() + BARRIER_S
         while time.monotonic() < give_up:
             now_s = time.monotonic()
             for name in inputs:
-                visit = doorway.visits[name]
+                visit = lobby.visits[name]
                 before, asked_s = asked.get(name, (-1, 0.0))
                 due = before != visit or now_s - asked_s > AGAIN_S
-                if name in doorway.ready and name not in outputs and due:
+                if name in lobby.ready and name not in outputs and due:
                     asked[name] = visit, now_s
-                    doorway.host.send(
+                    lobby.host.send(
                         name, encode(StepRequest(VERSION, inputs[name])), patiently=True
                     )
-            if all(name in outputs or not doorway.is_expected(name) for name in inputs):
+            if all(name in outputs or not lobby.is_expected(name) for name in inputs):
                 break
-            report = doorway.next(0.05)
+            report = lobby.next(0.05)
             while report is not None:
                 name, step = report[0], report[1].outputs.step
                 if name in inputs and step == inputs[name].observation.step + 1:
                     outputs[name] = report[1].outputs
-                report = doorway.next(0.0)
-        doorway.newcomers.clear()  # they start no clock
+                report = lobby.next(0.0)
+        lobby.newcomers.clear()  # they start no clock
         return outputs
 
     def kill(self, name: ParticipantId) -> None:
         """End a process; world-sim's own does not return from here."""
-        doorway = self._doorway
+        lobby = self._lobby
         if name == WORLD_SIM:
             self._order(ProcessCommand("restart", WORLD_SIM))
             return
-        doorway.excused.add(name)
+        lobby.excused.add(name)
         self._order(ProcessCommand("kill", name))
-        wait_for(
-            doorway, lambda: not doorway.is_there(name), f"{name} was killed and is still there"
-        )
+        wait_for(lobby, lambda: not lobby.is_there(name), f"{name} was killed and is still there")
 
     def start(self, name: ParticipantId, body: Body, disk: Disk) -> tuple[int, int]:
         """Start a process, and wait until it is ready."""
-        doorway, visit = self._doorway, self._doorway.visits[name]
+        lobby, visit = self._lobby, self._lobby.visits[name]
         self._order(ProcessCommand("start", name, disk, body.step))
-        wait_for(
-            doorway, lambda: doorway.visits[name] > visit, f"{name} was started and did not come"
-        )
-        doorway.excused.discard(name)
-        told = doorway.told[name]
-        return told.epoch, told.step
+        wait_for(lobby, lambda: lobby.visits[name] > visit, f"{name} was started and did not come")
+        lobby.excused.discard(name)
+        told = lobby.told[name]
+        return told.incarnation, told.step
 
     def pretend(self, name: ParticipantId) -> bool:
         """Start a second process under an id, and see whether it is sent away."""
@@ -82,10 +78,10 @@ class LockstepExchange:
             refused = self._order(ProcessCommand("refused", name))
             return refused is not None
 
-        wait_for(self._doorway, ended, f"{name}: what became of the impostor?")
+        wait_for(self._lobby, ended, f"{name}: what became of the impostor?")
         return not refused
 
     def _order(self, order: ProcessCommand) -> bool | None:
-        hands = self._doorway.hands
+        hands = self._lobby.hands
         assert hands is not None, "faults of processes need hands"
         return hands(order)

@@ -48,24 +48,26 @@ def run(
     say: takes one line of news for a person.
     """
     host.limit(rate_limits(step_clocks(plan.scenario, plan.seed), plan.exchange, plan.speed))
-    doorway = Lobby(host, plan, recording, stopped, show, hands, say)
-    listeners = [recording.take, doorway.tell]
+    lobby = Lobby(host, plan, recording, stopped, show, hands, say)
+    observers = [recording.observe, lobby.tell]
     if past is None:
-        stage = Simulation(plan.scenario, plan.seed, plan.site, listeners)
+        simulation = Simulation(plan.scenario, plan.seed, plan.site, observers)
     else:
-        stage = Simulation.resumed(plan.scenario, plan.seed, plan.site, past.records, listeners)
-        doorway.recall(past.records)
-    doorway.stage = stage
-    stage.forget()
-    doorway.gather(plan.patience_s if past is None else RETURN_S)
+        simulation = Simulation.resumed(
+            plan.scenario, plan.seed, plan.site, past.records, observers
+        )
+        lobby.recall(past.records)
+    lobby.simulation = simulation
+    simulation.forget()
+    lobby.gather(plan.patience_s if past is None else RETURN_S)
     if plan.exchange == "wall":
-        reason = RealtimeExchange(doorway, stage, plan, resumed=past is not None).run()
+        reason = RealtimeExchange(lobby, simulation, plan, resumed=past is not None).run()
     else:
-        doorway.open(lambda: stage.done_ns)
-        reason = simulate(stage, LockstepExchange(doorway), plan.seed, stopped)
-    doorway.dismiss(reason, 0.0 if past is None else COME_BACK_S)
-    recording.refused_at_door = doorway.refused
+        lobby.open(lambda: simulation.done_ns)
+        reason = simulate(simulation, LockstepExchange(lobby), plan.seed, stopped)
+    lobby.dismiss(reason, 0.0 if past is None else COME_BACK_S)
+    recording.refused_at_door = lobby.refused
     recording.excess = host.excess
     result = recording.finish()
-    doorway.tell_progress("over", reason)
+    lobby.tell_progress("over", reason)
     return result

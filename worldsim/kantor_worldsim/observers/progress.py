@@ -7,22 +7,22 @@ from kantor_worldsim.observers.metrics.base import RunMetrics
 
 def progress(metrics: RunMetrics, scenario: Scenario, phase: str, detail: str) -> Progress:
     """How a mission goes, for observers."""
-    glance = metrics.glance()
+    snapshot = metrics.snapshot()
     energy_total = 0 if scenario.mapping else scenario.steps_per_robot * scenario.robots.count
     return Progress(
         VERSION,
-        now_ns=glance.now_ns,
+        now_ns=snapshot.now_ns,
         phase=phase,
         detail=detail,
-        energy_spent=glance.energy_spent,
+        energy_spent=snapshot.energy_spent,
         energy_total=energy_total,
-        detected=glance.detected,
-        targets=glance.targets,
-        w_ub=glance.w_ub,
-        links=glance.links,
-        messages_per_s=glance.messages_per_s,
-        robots_done=glance.robots_done,
+        detected=snapshot.detected,
+        targets=snapshot.targets,
+        w_ub=snapshot.w_ub,
+        links=snapshot.links,
+        messages_per_s=snapshot.messages_per_s,
+        robots_done=snapshot.robots_done,
         robots=scenario.robots.count,
-        mass_left=glance.mass_left,
-        distance_m=glance.distance_m,
+        mass_left=snapshot.mass_left,
+        distance_m=snapshot.distance_m,
     )

@@ -37,16 +37,16 @@ from kantor_worldsim.record.run_folder import (
 def metrics_of(
     scenario: Scenario,
     exact_every: int | None = None,
-    reader: ColumnarDecoder | None = None,
-    survey: MapTracker | None = None,
+    decoder: ColumnarDecoder | None = None,
+    map_tracker: MapTracker | None = None,
 ) -> RunMetrics:
     """What follows a run of a scenario: what a density needs, or a map. exact_every: see Metrics.
 
-    reader, survey: those that other referees of the same run follow it by.
+    decoder, map_tracker: those that other referees of the same run follow it by.
     """
     if scenario.mapping:
-        return MapMetrics(reader, survey)
-    return DensityMetrics(exact_every, reader)
+        return MapMetrics(decoder, map_tracker)
+    return DensityMetrics(exact_every, decoder)
 
 
 class Recording:
@@ -67,10 +67,10 @@ class Recording:
 
         speed: wall, simulated seconds in a real one. past: what the folder has of this run already.
         """
-        self._reader = ColumnarDecoder()
-        survey = MapTracker(self._reader) if scenario.mapping else None
-        self.metrics = metrics_of(scenario, exact_every, self._reader, survey)
-        self.checker = Checker(self._reader, survey, virtual=exchange != "wall")
+        self._decoder = ColumnarDecoder()
+        map_tracker = MapTracker(self._decoder) if scenario.mapping else None
+        self.metrics = metrics_of(scenario, exact_every, self._decoder, map_tracker)
+        self.checker = Checker(self._decoder, map_tracker, virtual=exchange != "wall")
         self.payload = b""
         """The last record, encoded."""
         self.refused_at_door = 0
@@ -104,22 +104,22 @@ class Recording:
     def _follow(self, records: Iterable[Record]) -> None:
         """Catch up. The old journal is there until all of it is in the new one."""
         for record in records:
-            self.take(record)
+            self.observe(record)
         self.journal.replace()
 
-    def take(self, record: Record) -> None:
+    def observe(self, record: Record) -> None:
         """Follow one record."""
-        self.payload = self._reader.read(record)[0]
-        self.journal.take(record, self.payload)
-        self.metrics.take(record)
-        self.checker.take(record)
+        self.payload = self._decoder.read(record)[0]
+        self.journal.append(record, self.payload)
+        self.metrics.observe(record)
+        self.checker.observe(record)
         if len(self.metrics.rows) > self._rows:
             self._write_rows()
 
     def _write_rows(self) -> None:
         for row in self.metrics.rows[self._rows :]:
-            self.journal.take_row(row)
-            self.checker.take_row(row)
+            self.journal.append_row(row)
+            self.checker.observe_row(row)
             if self._table is not None:
                 self._table.add(row)
         self._rows = len(self.metrics.rows)

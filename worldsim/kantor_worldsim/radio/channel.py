@@ -189,15 +189,15 @@ def link_of(source: int, target: int, supervisor: int) -> int:
 
 
 @kernel
-def _delay(law: _ChannelConfig, link: int, sequence: int, copy: int) -> int:
-    delay = law.delay_ns
-    if law.jitter_ns > 0:
-        draw = uniform(law.seed, Purpose.DELAY.value, link, sequence, copy)
-        delay += int(draw * law.jitter_ns)
-    if law.reorder > 0.0:
-        draw = uniform(law.seed, Purpose.REORDER.value, link, sequence, copy)
-        if draw < law.reorder:
-            delay += int(draw / law.reorder * law.reorder_ns)
+def _delay(config: _ChannelConfig, link: int, sequence: int, copy: int) -> int:
+    delay = config.delay_ns
+    if config.jitter_ns > 0:
+        draw = uniform(config.seed, Purpose.DELAY.value, link, sequence, copy)
+        delay += int(draw * config.jitter_ns)
+    if config.reorder > 0.0:
+        draw = uniform(config.seed, Purpose.REORDER.value, link, sequence, copy)
+        if draw < config.reorder:
+            delay += int(draw / config.reorder * config.reorder_ns)
     return delay
 
 
@@ -230,7 +230,7 @@ def _transmit(
     sent: (m, 4) now_ns, source, sequence, target or -1. Returns how many verdicts there are, in the
     rows of ruled (rows, 3): receiver, which (row of sent) and due_ns; and how many receivers were out of range.
     """
-    law = _ChannelConfig(
+    config = _ChannelConfig(
         seed,
         robot_range_m,
         supervisor_range_m,
@@ -261,25 +261,25 @@ def _transmit(
             if other == source or (target >= 0 and other != target):
                 continue
             by_supervisor = supervisor in (other, source)
-            range_m = law.supervisor_range_m if by_supervisor else law.range_m
+            range_m = config.supervisor_range_m if by_supervisor else config.range_m
             if not hears(field, source, other, range_m):
                 out_of_range += 1
                 continue
             link = link_of(source, other, supervisor)
             copies = 1
-            if law.duplicate > 0.0:
-                draw = uniform(law.seed, Purpose.DUPLICATE.value, link, sequence, 0)
-                copies += draw < law.duplicate
+            if config.duplicate > 0.0:
+                draw = uniform(config.seed, Purpose.DUPLICATE.value, link, sequence, 0)
+                copies += draw < config.duplicate
             for copy in range(copies):
                 receiver[count] = other
                 which[count] = i
                 draw = 1.0
-                if law.drop > 0.0:
-                    draw = uniform(law.seed, Purpose.DROP.value, link, sequence, copy)
-                if draw < law.drop:
+                if config.drop > 0.0:
+                    draw = uniform(config.seed, Purpose.DROP.value, link, sequence, copy)
+                if draw < config.drop:
                     due_ns[count] = DROPPED
                 else:
-                    due_ns[count] = sent[i, 0] + _delay(law, link, sequence, copy)
+                    due_ns[count] = sent[i, 0] + _delay(config, link, sequence, copy)
                 count += 1
     return count, out_of_range
 
@@ -299,7 +299,7 @@ class Channel:
         self._roster = scenario.roster
         self._places = {name: i for i, name in enumerate(scenario.roster)}
         self._targets = {**self._places, EVERYBODY: -1}
-        self._law = _ChannelConfig(
+        self._config = _ChannelConfig(
             seed,
             radio.range_m,
             scenario.supervisor.range_m,
@@ -317,7 +317,7 @@ class Channel:
             self._places.get(SUPERVISOR, -1),
             scenario.supervisor.pose_m is not None,
         )
-        self._arguments: tuple[Any, ...] = (*self._law, *self._field)
+        self._arguments: tuple[Any, ...] = (*self._config, *self._field)
         self._under_way: dict[ParticipantId, list[_Flight]] = {name: [] for name in scenario.roster}
         self._boxes = list(self._under_way.items())
         self._flights = 0
@@ -327,7 +327,7 @@ class Channel:
     @property
     def lookahead_ns(self) -> int:
         """Nothing sent arrives sooner."""
-        return self._law.delay_ns
+        return self._config.delay_ns
 
     def place(self, name: ParticipantId, pose: Pose) -> None:
         """Note where a participant truly is."""
@@ -363,21 +363,21 @@ class Channel:
             self._flights,
             len(self._roster),
         )
-        verdicts = []
+        decisions = []
         told = ruled.rows.data.cast("B")[: _RULED.size * ruled.size]
         for to, row, due_ns in _RULED.iter_unpack(told):
             envelope = on_air[row][1]
             speaker, sequence = envelope.source, envelope.sequence
             receiver, box = boxes[to]
-            verdicts.append(DeliveryDecision(speaker, sequence, receiver, due_ns))
+            decisions.append(DeliveryDecision(speaker, sequence, receiver, due_ns))
             if due_ns != DROPPED:
                 flights += 1
                 place = places.get(speaker, nowhere)
                 heappush(box, (due_ns, place, sequence, flights, envelope))
         self._flights = flights
-        return verdicts
+        return decisions
 
-    def take(self, name: ParticipantId, now_ns: int) -> tuple[Envelope, ...]:
+    def collect(self, name: ParticipantId, now_ns: int) -> tuple[Envelope, ...]:
         """What has arrived at a participant by now, in order of (arrival, source, sequence)."""
         waiting = self._under_way[name]
         if not waiting or waiting[0][0] > now_ns:
@@ -387,7 +387,7 @@ class Channel:
             arrived.append(heappop(waiting)[4])
         return tuple(arrived)
 
-    def take_heard(
+    def collect_heard(
         self, name: ParticipantId, heard: Iterable[tuple[ParticipantId, int]]
     ) -> tuple[Envelope, ...]:
         """What a participant is known to have taken, by source and sequence, of several copies the first.

@@ -436,7 +436,7 @@ def rule_on(
     beside: np.ndarray,
     besides: int,
     struck: np.ndarray,
-    tolls: np.ndarray,
+    fault_stats: np.ndarray,
     out: np.ndarray,
 ) -> tuple[int, int]:
     """Rule on what the radio has ruled. How many verdicts there are, and how many receivers are lost.
@@ -490,7 +490,7 @@ def rule_on(
     if made <= out.shape[0]:
         for rule in range(rules.shape[0]):
             for deed in range(struck.shape[1]):
-                tolls[rule, deed] += struck[rule, deed]
+                fault_stats[rule, deed] += struck[rule, deed]
     return made, lost
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from kantor_protocol.base.counter_rng import Purpose, uniform
-from kantor_protocol.base.incarnations import EPOCHS_MAX
+from kantor_protocol.base.incarnations import INCARNATIONS_MAX
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, WORLD_SIM, Envelope, ParticipantId
 from kantor_protocol.wire.messages import (
     BODY_BYTES_MAX,
@@ -98,7 +98,9 @@ def _before_the_start(_dice: ForgeryDraws, _body: bytes, news: GossipMessage) ->
 
 
 def _of_no_incarnation(dice: ForgeryDraws, _body: bytes, news: GossipMessage) -> bytes:
-    return encode_gossip(replace(news, epoch=(EPOCHS_MAX + 1, -1, 2**40)[dice.below(3)]))
+    return encode_gossip(
+        replace(news, incarnation=(INCARNATIONS_MAX + 1, -1, 2**40)[dice.below(3)])
+    )
 
 
 def _another_kind(_dice: ForgeryDraws, body: bytes, _news: GossipMessage) -> bytes:
@@ -107,11 +109,11 @@ def _another_kind(_dice: ForgeryDraws, body: bytes, _news: GossipMessage) -> byt
 
 def _vector_of_wrong_length(_dice: ForgeryDraws, _body: bytes, news: GossipMessage) -> bytes:
     """Incarnations make it longer by the whole roster; who has a peer is not alone in one."""
-    return encode_gossip(replace(news, have=news.have + b"\0"))
+    return encode_gossip(replace(news, version_vector=news.version_vector + b"\0"))
 
 
 def _huge_number_in_vector(_dice: ForgeryDraws, _body: bytes, news: GossipMessage) -> bytes:
-    return encode_gossip(replace(news, have=_OF_70_BITS + news.have[1:]))
+    return encode_gossip(replace(news, version_vector=_OF_70_BITS + news.version_vector[1:]))
 
 
 def _log_of_nobody(_dice: ForgeryDraws, _body: bytes, news: GossipMessage) -> bytes:
@@ -144,7 +146,7 @@ def _register_cut_in_a_number(dice: ForgeryDraws, _body: bytes, news: GossipMess
 
 def _nested(_dice: ForgeryDraws, _body: bytes, news: GossipMessage) -> bytes:
     """Beyond the fields that are known, arrays within arrays that do not end."""
-    fields = encode(replace(news, epoch=0))[1:]
+    fields = encode(replace(news, incarnation=0))[1:]
     return bytes([0x90 + _FIELDS]) + fields + b"\x91" * _NESTED
 
 

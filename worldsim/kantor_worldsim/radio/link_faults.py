@@ -160,20 +160,20 @@ class LinkFaults:
             made, lost = self._judge(law, besides)
         return on_air, Ruled(self._out, made), lost
 
-    def take_tolls(self) -> tuple[FaultStats, ...]:
+    def pop_stats(self) -> tuple[FaultStats, ...]:
         """What each fault has done since the last call; those that did nothing are left out."""
         told = self._tolls.tobytes()
         if told.count(0) == len(told):
             return ()
-        tolls = [
+        fault_stats = [
             FaultStats(fault, *deeds)
             for fault, deeds in zip(self._order, self._tolls.tolist(), strict=True)
             if any(deeds)
         ]
         self._tolls[:] = 0
-        return tuple(tolls)
+        return tuple(fault_stats)
 
-    def take_forged(self) -> tuple[Envelope, ...]:
+    def pop_forged(self) -> tuple[Envelope, ...]:
         """What was forged since the last call."""
         forged, self._forged = self._forged, []
         return tuple(forged)

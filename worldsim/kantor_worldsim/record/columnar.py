@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.incarnations import EPOCHS_MAX
+from kantor_protocol.base.incarnations import INCARNATIONS_MAX
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.machine import SUPERVISOR
-from kantor_protocol.base.varint import take_int, take_uint
+from kantor_protocol.base.varint import read_int, read_uint
 from kantor_protocol.wire.messages import BODY_BYTES_MAX, VERSION, GossipMessage
 from kantor_protocol.wire.weights import WeightsMessage
 from kantor_worldsim.record.records import Batch, Opening, Record, encode_record
@@ -59,7 +59,7 @@ class ColumnarBatch(NamedTuple):
     """The encoded record."""
     sizes: npt.NDArray[np.int64]
     """(6,): how many rows of each table count."""
-    acts: npt.NDArray[np.int64]
+    step_records: npt.NDArray[np.int64]
     """(rows, 25)"""
     poses_m: npt.NDArray[np.float64]
     """(rows, 4): x and y of each ruling and of each goal, world frame."""
@@ -67,7 +67,7 @@ class ColumnarBatch(NamedTuple):
     """(rows, 2): source, sequence."""
     sent: npt.NDArray[np.int64]
     """(rows, 5): source, sequence, target, where the body begins and ends in the payload."""
-    verdicts: npt.NDArray[np.int64]
+    decisions: npt.NDArray[np.int64]
     """(rows, 4): source, sequence, target, due_ns."""
     pairs: npt.NDArray[np.int64]
     """(rows, 2): sample, units."""
@@ -184,11 +184,11 @@ class BatchColumns(NamedTuple):
 
     payload: bytes
     sizes: npt.NDArray[np.int64]
-    acts: npt.NDArray[np.int64]
+    step_records: npt.NDArray[np.int64]
     poses_m: npt.NDArray[np.float64]
     heard: npt.NDArray[np.int64]
     sent: npt.NDArray[np.int64]
-    verdicts: npt.NDArray[np.int64]
+    decisions: npt.NDArray[np.int64]
     pairs: npt.NDArray[np.int64]
     injected: npt.NDArray[np.int64]
     pose_bits: npt.NDArray[np.int64]
@@ -255,8 +255,8 @@ def _read_pairs(tables: BatchColumns, at: int, bound: int) -> tuple[int, int]:
     end = at + size
     row, sample = tables.sizes[PAIRS], 0
     while at < end:
-        step, at = take_int(tables.payload, at)
-        units, at = take_uint(tables.payload, at)
+        step, at = read_int(tables.payload, at)
+        units, at = read_uint(tables.payload, at)
         sample += step
         if at < 0 or at > end or sample < 0 or sample >= bound:
             return NOT_DECODED, end
@@ -270,14 +270,16 @@ def _read_pairs(tables: BatchColumns, at: int, bound: int) -> tuple[int, int]:
 
 
 @kernel
-def _read_heard(tables: BatchColumns, act: np.ndarray, at: int) -> int:
-    act[HEARD] = tables.sizes[ALL_HEARD]
-    act[HEARD_COUNT], at = _array(tables.payload, at, tables.heard.shape[0] - act[HEARD])
-    for row in range(act[HEARD], act[HEARD] + act[HEARD_COUNT]):
+def _read_heard(tables: BatchColumns, step_record: np.ndarray, at: int) -> int:
+    step_record[HEARD] = tables.sizes[ALL_HEARD]
+    step_record[HEARD_COUNT], at = _array(
+        tables.payload, at, tables.heard.shape[0] - step_record[HEARD]
+    )
+    for row in range(step_record[HEARD], step_record[HEARD] + step_record[HEARD_COUNT]):
         _, at = _array(tables.payload, at, _ANY)
         tables.heard[row, SOURCE], at = _place(tables, at)
         tables.heard[row, SEQUENCE], at = _number(tables.payload, at)
-    tables.sizes[ALL_HEARD] += act[HEARD_COUNT]
+    tables.sizes[ALL_HEARD] += step_record[HEARD_COUNT]
     return at
 
 
@@ -295,21 +297,23 @@ def _read_envelope(tables: BatchColumns, row: np.ndarray, at: int) -> int:
 
 
 @kernel
-def _read_outbox(tables: BatchColumns, act: np.ndarray, at: int) -> int:
-    act[SENT] = tables.sizes[ALL_SENT]
-    act[BODY_BYTES] = 0
-    act[SENT_COUNT], at = _array(tables.payload, at, tables.sent.shape[0] - act[SENT])
-    for row in range(act[SENT], act[SENT] + act[SENT_COUNT]):
+def _read_outbox(tables: BatchColumns, step_record: np.ndarray, at: int) -> int:
+    step_record[SENT] = tables.sizes[ALL_SENT]
+    step_record[BODY_BYTES] = 0
+    step_record[SENT_COUNT], at = _array(
+        tables.payload, at, tables.sent.shape[0] - step_record[SENT]
+    )
+    for row in range(step_record[SENT], step_record[SENT] + step_record[SENT_COUNT]):
         at = _read_envelope(tables, tables.sent[row], at)
-        act[BODY_BYTES] += tables.sent[row, BODY_END] - tables.sent[row, BODY]
-    tables.sizes[ALL_SENT] += act[SENT_COUNT]
+        step_record[BODY_BYTES] += tables.sent[row, BODY_END] - tables.sent[row, BODY]
+    tables.sizes[ALL_SENT] += step_record[SENT_COUNT]
     return at
 
 
 @kernel
-def _read_goal(tables: BatchColumns, act: np.ndarray, row: int, at: int) -> int:
+def _read_goal(tables: BatchColumns, step_record: np.ndarray, row: int, at: int) -> int:
     kind, numbers, after = head_of(tables.payload, at)
-    act[HEADS] = kind == ARRAY
+    step_record[HEADS] = kind == ARRAY
     if kind != ARRAY:
         return after
     if numbers != 2:
@@ -319,49 +323,51 @@ def _read_goal(tables: BatchColumns, act: np.ndarray, row: int, at: int) -> int:
 
 
 @kernel
-def _read_outputs(tables: BatchColumns, act: np.ndarray, row: int, at: int, samples: int) -> int:
+def _read_outputs(
+    tables: BatchColumns, step_record: np.ndarray, row: int, at: int, samples: int
+) -> int:
     kind, fields, at = head_of(tables.payload, at)
-    act[PRESENT] = kind == ARRAY
-    act[SENT_COUNT] = 0
+    step_record[PRESENT] = kind == ARRAY
+    step_record[SENT_COUNT] = 0
     if kind != ARRAY:
         return at
-    act[STEP], at = _number(tables.payload, at)
+    step_record[STEP], at = _number(tables.payload, at)
     at = skip(tables.payload, at, 1)  # pose
-    at = _read_goal(tables, act, row, at)
-    act[SPENT] = tables.sizes[PAIRS]
-    act[SPENT_COUNT], at = _read_pairs(tables, at, samples)
-    act[LOWERED] = tables.sizes[PAIRS]
-    act[LOWERED_COUNT], at = _read_pairs(tables, at, samples)
-    _, act[WEIGHTS_BYTES], act[WEIGHTS] = head_of(tables.payload, at)
-    at = _read_outbox(tables, act, act[WEIGHTS] + act[WEIGHTS_BYTES])
-    act[ENERGY], at = _number(tables.payload, at)
-    act[STATE], at = _number(tables.payload, at)
-    act[REFUSED], at = _number(tables.payload, at)
+    at = _read_goal(tables, step_record, row, at)
+    step_record[SPENT] = tables.sizes[PAIRS]
+    step_record[SPENT_COUNT], at = _read_pairs(tables, at, samples)
+    step_record[LOWERED] = tables.sizes[PAIRS]
+    step_record[LOWERED_COUNT], at = _read_pairs(tables, at, samples)
+    _, step_record[WEIGHTS_BYTES], step_record[WEIGHTS] = head_of(tables.payload, at)
+    at = _read_outbox(tables, step_record, step_record[WEIGHTS] + step_record[WEIGHTS_BYTES])
+    step_record[ENERGY], at = _number(tables.payload, at)
+    step_record[STATE], at = _number(tables.payload, at)
+    step_record[REFUSED], at = _number(tables.payload, at)
     return skip(tables.payload, at, fields - 10)
 
 
 @kernel
-def _read_ruling(tables: BatchColumns, act: np.ndarray, row: int, at: int) -> int:
+def _read_ruling(tables: BatchColumns, step_record: np.ndarray, row: int, at: int) -> int:
     kind, fields, at = head_of(tables.payload, at)
-    act[PRESENT] &= kind == ARRAY
+    step_record[PRESENT] &= kind == ARRAY
     if kind != ARRAY:
         return at
     numbers, at = _array(tables.payload, at, _ANY)
     at = _read_metres(tables, row, 0, at)
     at = _read_metres(tables, row, 1, at)
     at = skip(tables.payload, at, numbers - 2)
-    act[FINDS], at = _array(tables.payload, at, _ANY)
-    at = skip(tables.payload, at, act[FINDS])
-    act[VIOLATIONS], at = _array(tables.payload, at, _ANY)
-    act[VOID] = act[TOO_FAST] = 0
-    for item in range(act[VIOLATIONS]):
+    step_record[FINDS], at = _array(tables.payload, at, _ANY)
+    at = skip(tables.payload, at, step_record[FINDS])
+    step_record[VIOLATIONS], at = _array(tables.payload, at, _ANY)
+    step_record[VOID] = step_record[TOO_FAST] = 0
+    for item in range(step_record[VIOLATIONS]):
         kind, size, at = head_of(tables.payload, at)
         if kind != TEXT:
             return _MALFORMED
         for text in _REFUSALS:
-            act[VOID] |= _reads(tables.payload, at, size, text)
+            step_record[VOID] |= _reads(tables.payload, at, size, text)
         if _reads(tables.payload, at, size, _SPEED):
-            act[TOO_FAST] = item + 1
+            step_record[TOO_FAST] = item + 1
         at += size
     return skip(tables.payload, at, fields - 3)
 
@@ -370,11 +376,11 @@ def _read_ruling(tables: BatchColumns, act: np.ndarray, row: int, at: int) -> in
 def _read_batch(
     payload: bytes,
     sizes: np.ndarray,
-    acts: np.ndarray,
+    step_records: np.ndarray,
     poses_m: np.ndarray,
     heard: np.ndarray,
     sent: np.ndarray,
-    verdicts: np.ndarray,
+    decisions: np.ndarray,
     pairs: np.ndarray,
     injected: np.ndarray,
     pose_bits: np.ndarray,
@@ -389,11 +395,11 @@ def _read_batch(
     tables = BatchColumns(
         payload,
         sizes,
-        acts,
+        step_records,
         poses_m,
         heard,
         sent,
-        verdicts,
+        decisions,
         pairs,
         injected,
         pose_bits,
@@ -403,31 +409,31 @@ def _read_batch(
     sizes[:] = 0
     parts, at = _array(payload, 0, _ANY)
     at = skip(payload, at, 2)  # tag, now_ns
-    sizes[ACTS], at = _array(payload, at, acts.shape[0])
+    sizes[ACTS], at = _array(payload, at, step_records.shape[0])
     for i in range(sizes[ACTS]):
-        act = acts[i]
+        step_record = step_records[i]
         fields, at = _array(payload, at, _ANY)
-        act[PLACE], at = _place(tables, at)
-        act[NOW_NS], at = _number(payload, at)
+        step_record[PLACE], at = _place(tables, at)
+        step_record[NOW_NS], at = _number(payload, at)
         items, at = _array(payload, at, _ANY)  # the observation
-        act[OBSERVED], at = _number(payload, at)
+        step_record[OBSERVED], at = _number(payload, at)
         at = skip(payload, at, items - 1)
-        at = _read_heard(tables, act, at)
-        at = _read_outputs(tables, act, i, at, samples)
-        at = _read_ruling(tables, act, i, at)
-        act[SKEW_NS] = 0
+        at = _read_heard(tables, step_record, at)
+        at = _read_outputs(tables, step_record, i, at, samples)
+        at = _read_ruling(tables, step_record, i, at)
+        step_record[SKEW_NS] = 0
         if fields > 6:
-            act[SKEW_NS], at = _number(payload, at)
+            step_record[SKEW_NS], at = _number(payload, at)
         at = skip(payload, at, fields - 7)
         if at < 0:
             return _MALFORMED
-    sizes[VERDICTS], at = _array(payload, at, verdicts.shape[0])
+    sizes[VERDICTS], at = _array(payload, at, decisions.shape[0])
     for i in range(sizes[VERDICTS]):
         fields, at = _array(payload, at, _ANY)
-        verdicts[i, SOURCE], at = _place(tables, at)
-        verdicts[i, SEQUENCE], at = _number(payload, at)
-        verdicts[i, TARGET], at = _place(tables, at)
-        verdicts[i, DUE_NS], at = _number(payload, at)
+        decisions[i, SOURCE], at = _place(tables, at)
+        decisions[i, SEQUENCE], at = _number(payload, at)
+        decisions[i, TARGET], at = _place(tables, at)
+        decisions[i, DUE_NS], at = _number(payload, at)
         at = skip(payload, at, fields - 4)
     if parts < 8:
         return at
@@ -446,8 +452,8 @@ def _is_finite(kind: int, value: int) -> bool:
 
 
 @kernel
-def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int, int]:
-    """Epoch of the News in payload[at:end], and where its `have` and `logs` begin and end.
+def parts_of_gossip(payload: bytes, at: int, end: int) -> tuple[int, int, int, int, int]:
+    """Epoch of the News in payload[at:end], and where its `version_vector` and `logs` begin and end.
 
     The last is negative for what `decode_news` would refuse.
     """
@@ -464,9 +470,9 @@ def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int
         return refused
     if not (_is_finite(kind_x, x) and _is_finite(kind_y, y)):
         return refused
-    have_kind, size, have = head_of(payload, at)
-    have_end = have + size
-    logs_kind, size, logs = head_of(payload, have_end if have > 0 else have)
+    have_kind, size, version_vector = head_of(payload, at)
+    have_end = version_vector + size
+    logs_kind, size, logs = head_of(payload, have_end if version_vector > 0 else version_vector)
     logs_end = logs + size
     claims_kind, size, claims = head_of(payload, logs_end if logs > 0 else logs)
     if claims < 0 or not have_kind == logs_kind == claims_kind == BYTES:
@@ -477,12 +483,12 @@ def parts_of_news(payload: bytes, at: int, end: int) -> tuple[int, int, int, int
         if kind != BYTES or at < 0:  # the registers
             return refused
         at += size
-    epoch = 0
+    incarnation = 0
     if fields > 9:
-        epoch, at = _number(payload, at)
-    if not 0 <= epoch <= EPOCHS_MAX or skip(payload, at, fields - 10) != end:
+        incarnation, at = _number(payload, at)
+    if not 0 <= incarnation <= INCARNATIONS_MAX or skip(payload, at, fields - 10) != end:
         return refused
-    return epoch, have, have_end, logs, logs_end
+    return incarnation, version_vector, have_end, logs, logs_end
 
 
 @kernel

@@ -85,7 +85,7 @@ class Journal:
         except OSError as error:
             self._give_up(error)
 
-    def take(self, record: Record, payload: bytes = b"") -> None:
+    def append(self, record: Record, payload: bytes = b"") -> None:
         """Write one record. payload: the record encoded, if somebody has done so already."""
         payload = payload or encode_record(record)
         self.digest.add(payload)
@@ -94,7 +94,7 @@ class Journal:
         if self._file is not None:
             self._write(RECORD_TOPIC, payload)
 
-    def take_row(self, row: Any) -> None:
+    def append_row(self, row: Any) -> None:
         """Write one row of metrics, for viewers; it is not part of the digest."""
         if self._file is not None:
             self._write(METRICS_TOPIC, json.dumps(row._asdict()).encode())

@@ -72,7 +72,7 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
     outputs: Outputs | None
     """None: late, crashed or cut off. Turn by turn it is asked again until it answers, with the same
     inputs; now_ns stays when they were first given."""
-    ruling: StepVerdict | None
+    verdict: StepVerdict | None
     skew_ns: int = 0
     """How far the clock that it read was ahead of now_ns."""
 
@@ -81,13 +81,13 @@ class Batch(msgspec.Struct, frozen=True, array_like=True, tag="batch"):
     """Everybody who acted at one moment, and what became of what they sent."""
 
     now_ns: int
-    acts: tuple[StepRecord, ...]
-    verdicts: tuple[DeliveryDecision, ...]
+    step_records: tuple[StepRecord, ...]
+    decisions: tuple[DeliveryDecision, ...]
     out_of_range: int
     """Receivers that an envelope did not reach for range."""
     absent: tuple[ParticipantId, ...] = ()
     """Participants that were asked and gave no outputs."""
-    tolls: tuple[FaultStats, ...] = ()
+    fault_stats: tuple[FaultStats, ...] = ()
     """What the scenario's faults had to do with the verdicts."""
     injected: tuple[Envelope, ...] = ()
     """What a fault put on the air and nobody sent; verdicts may be about it."""
@@ -105,7 +105,7 @@ class ProcessEvent(msgspec.Struct, frozen=True, array_like=True, tag="incident",
     """Its place in the scenario's list; -1: nobody ordered it."""
     step: int = 0
     """start, join: the step that it goes on from."""
-    epoch: int = 0
+    incarnation: int = 0
     """start, join: its incarnation."""
 
 
@@ -158,15 +158,15 @@ class EnvelopeIndex:
     def __init__(self) -> None:
         self._envelopes: dict[tuple[ParticipantId, int], Envelope] = {}
 
-    def inputs(self, act: StepRecord) -> Inputs:
+    def inputs(self, step_record: StepRecord) -> Inputs:
         """What the participant was given. Raises KeyError for an envelope that was never sent."""
-        inbox = tuple(self._envelopes[reference] for reference in act.heard)
-        return Inputs(act.now_ns + act.skew_ns, act.observation, inbox)
+        inbox = tuple(self._envelopes[reference] for reference in step_record.heard)
+        return Inputs(step_record.now_ns + step_record.skew_ns, step_record.observation, inbox)
 
     def post(self, batch: Batch) -> None:
         """Note what was sent in a batch, and what nobody sent."""
         for envelope in batch.injected:
             self._envelopes[envelope.source, envelope.sequence] = envelope
-        for act in batch.acts:
-            for envelope in act.outputs.outbox if act.outputs else ():
+        for step_record in batch.step_records:
+            for envelope in step_record.outputs.outbox if step_record.outputs else ():
                 self._envelopes[envelope.source, envelope.sequence] = envelope

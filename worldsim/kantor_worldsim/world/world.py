@@ -118,7 +118,7 @@ class _Body:
     def __init__(self, pose: Pose) -> None:
         self.pose = pose
         self.step = 0
-        self.epoch = 0
+        self.incarnation = 0
         self.moved_ns = 0
         self.energy_spent = 0
         self.found: tuple[int, ...] = ()
@@ -168,12 +168,12 @@ class World:
     def body(self, name: ParticipantId) -> Body:
         """What whoever takes a participant over has to know."""
         body = self._bodies[name]
-        return Body(body.pose, body.step, body.energy_spent, body.epoch)
+        return Body(body.pose, body.step, body.energy_spent, body.incarnation)
 
-    def begin(self, name: ParticipantId, epoch: int) -> bool:
+    def begin(self, name: ParticipantId, incarnation: int) -> bool:
         """Note which incarnation drives a body from now on; whether it is another."""
         body = self._bodies[name]
-        other, body.epoch = epoch != body.epoch, epoch
+        other, body.incarnation = incarnation != body.incarnation, incarnation
         return other
 
     def accept(self, name: ParticipantId, now_ns: int, outputs: Outputs) -> StepVerdict:

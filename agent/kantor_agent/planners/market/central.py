@@ -19,11 +19,11 @@ class CentralMarket:
     def assign(self, situation: Situation) -> list[Task]:
         """Give up goals, propose goals, sell goals, then a target for each member."""
         team = sorted(situation.members + situation.others)
-        fields = [situation.terrain.optimistic(member.cell) for member in team]
+        fields = [situation.cost_map.optimistic(member.cell) for member in team]
         self._tours = {member.robot: self._tours.get(member.robot, []) for member in team}
-        self._give_up(situation.terrain, team, fields)
+        self._give_up(situation.cost_map, team, fields)
         self._propose(situation, team, fields)
-        self._sell(Costs(situation.terrain, fields, self._held), [m.robot for m in team])
+        self._sell(Costs(situation.cost_map, fields, self._held), [m.robot for m in team])
         heading = self._rules.heading
         return [
             Task(heading(situation, m, next(iter(self._tours[m.robot]), NOWHERE)))
@@ -35,13 +35,13 @@ class CentralMarket:
         return [goal for tour in self._tours.values() for goal in tour]
 
     def _give_up(
-        self, terrain: CostMap, team: Sequence[Member], fields: Sequence[DistanceField]
+        self, cost_map: CostMap, team: Sequence[Member], fields: Sequence[DistanceField]
     ) -> None:
         for member, field in zip(team, fields, strict=True):
             self._tours[member.robot] = [
                 goal
                 for goal in self._tours[member.robot]
-                if is_open(terrain, goal) and is_reachable(field, goal)
+                if is_open(cost_map, goal) and is_reachable(field, goal)
             ]
 
     def _propose(
@@ -52,9 +52,9 @@ class CentralMarket:
             if tour:
                 continue
             goals = self._rules.propose(
-                situation.terrain, field, member.robot, situation.tick, self._held
+                situation.cost_map, field, member.robot, situation.tick, self._held
             )
-            costs = Costs(situation.terrain, [field], goals)
+            costs = Costs(situation.cost_map, [field], goals)
             for goal in goals:
                 tour.insert(costs.insertion(0, tour, goal)[1], goal)
 

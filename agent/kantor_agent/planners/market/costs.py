@@ -36,13 +36,13 @@ class Costs:
     """
 
     def __init__(
-        self, terrain: CostMap, fields: Sequence[DistanceField], goals: Iterable[int]
+        self, cost_map: CostMap, fields: Sequence[DistanceField], goals: Iterable[int]
     ) -> None:
         cells = np.array(sorted(set(goals)), dtype=np.int64)
         self._index = {cell: i for i, cell in enumerate(cells.tolist())}
         from_places = np.array([field[cells] for field in fields]).reshape(len(fields), cells.size)
         between = np.zeros((cells.size, cells.size))
-        separate(from_places, cells, terrain.frame.columns, between)
+        separate(from_places, cells, cost_map.frame.columns, between)
         self._from_places: list[list[float]] = from_places.tolist()
         self._between: list[list[float]] = between.tolist()
 
@@ -100,7 +100,7 @@ def price_of(cost: float) -> int:
     return round(min(cost * PER_CELL, _PRICE_MAX))
 
 
-def near(terrain: CostMap, goal: int, others: Iterable[int]) -> bool:
+def near(cost_map: CostMap, goal: int, others: Iterable[int]) -> bool:
     """Whether one of others is as good as a goal: it lies within half a sensor range."""
-    half = 0.5 * terrain.sensor_cells
-    return any(terrain.cells_between(goal, other) <= half for other in others)
+    half = 0.5 * cost_map.sensor_cells
+    return any(cost_map.cells_between(goal, other) <= half for other in others)

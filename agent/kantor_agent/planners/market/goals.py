@@ -19,13 +19,13 @@ _LEAF_RANGES = 2.0
 """quadtree: a part that is no longer than this is not split."""
 
 
-def random_goals(terrain: CostMap, seed: int, robot: int, tick: int, count: int) -> list[int]:
+def random_goals(cost_map: CostMap, seed: int, robot: int, tick: int, count: int) -> list[int]:
     """So many cells anywhere, drawn anew in every tick; those that are known are left out."""
-    cells = terrain.frame.cells
+    cells = cost_map.frame.cells
     drawn = [
         int(uniform(seed, Purpose.MARKET, robot, tick, index) * cells) for index in range(count)
     ]
-    return [cell for cell in dict.fromkeys(drawn) if terrain.chart.cells[cell] == UNKNOWN]
+    return [cell for cell in dict.fromkeys(drawn) if cost_map.fused_map.cells[cell] == UNKNOWN]
 
 
 @kernel
@@ -40,14 +40,14 @@ def clear_disc(values: np.ndarray, columns: int, cell: int, radius_cells: float)
 
 
 def greedy_goals(
-    terrain: CostMap, field: DistanceField, held: Iterable[int], count: int
+    cost_map: CostMap, field: DistanceField, held: Iterable[int], count: int
 ) -> list[int]:
     """The unknown cells that are cheapest to get to, a sensor range from one another.
 
     Those within half a range of a held goal are left out; of equal ones the lowest is taken.
     """
-    columns, range_cells = terrain.frame.columns, terrain.sensor_cells
-    values = np.where(terrain.chart.cells == UNKNOWN, field, np.inf)
+    columns, range_cells = cost_map.frame.columns, cost_map.sensor_cells
+    values = np.where(cost_map.fused_map.cells == UNKNOWN, field, np.inf)
     for cell in held:
         clear_disc(values, columns, cell, math.nextafter(0.5 * range_cells, math.inf))
     goals: list[int] = []
@@ -60,17 +60,17 @@ def greedy_goals(
     return goals
 
 
-def quadtree_goals(terrain: CostMap) -> list[int]:
+def quadtree_goals(cost_map: CostMap) -> list[int]:
     """Centres of the leaves of a quadtree over the map, where they are unknown; rising.
 
     A part of the map is of no interest if a quarter of it or less is unknown. Otherwise it is halved along
     both sides if one is longer than two sensor ranges, and a leaf if not.
     """
-    rows, columns = terrain.frame.rows, terrain.frame.columns
-    unknown = (terrain.chart.cells == UNKNOWN).reshape(rows, columns)
+    rows, columns = cost_map.frame.rows, cost_map.frame.columns
+    unknown = (cost_map.fused_map.cells == UNKNOWN).reshape(rows, columns)
     sums = np.zeros((rows + 1, columns + 1), dtype=np.int64)
     sums[1:, 1:] = unknown.cumsum(axis=0).cumsum(axis=1)
-    longest = max(1.0, _LEAF_RANGES * terrain.sensor_cells)
+    longest = max(1.0, _LEAF_RANGES * cost_map.sensor_cells)
     parts, goals = [(0, rows, 0, columns)], []
     while parts:
         low, high, left, right = parts.pop()

@@ -25,41 +25,41 @@ class MarketRules:
         """Goals of a tour that a memo has room for."""
 
     def propose(
-        self, terrain: CostMap, field: DistanceField, robot: int, tick: int, held: Cells
+        self, cost_map: CostMap, field: DistanceField, robot: int, tick: int, held: Cells
     ) -> list[int]:
         """New goals of a robot, the cheapest first, none within half a range of another or a held one."""
         count = min(self._count, self.capacity)
         if self._rule == "greedy":
-            return greedy_goals(terrain, field, held, count)
+            return greedy_goals(cost_map, field, held, count)
         if self._rule == "random":
-            cells = random_goals(terrain, self._seed, robot, tick, count)
+            cells = random_goals(cost_map, self._seed, robot, tick, count)
         else:
-            cells = quadtree_goals(terrain)
+            cells = quadtree_goals(cost_map)
         goals: list[int] = []
         for cell in sorted(cells, key=lambda cell: (field[cell], cell)):
             if (
                 len(goals) < count
                 and field[cell] < math.inf
-                and not near(terrain, cell, (*held, *goals))
+                and not near(cost_map, cell, (*held, *goals))
             ):
                 goals.append(cell)
         return goals
 
     def heading(self, situation: Situation, member: Member, goal: int) -> int:
         """The reachable frontier on the best way to a goal, or the nearest (NOWHERE); the lowest of equals."""
-        terrain, frontiers = situation.terrain, situation.frontiers
-        totals = terrain.travel(member.cell)[frontiers]
+        cost_map, frontiers = situation.cost_map, situation.frontiers
+        totals = cost_map.travel(member.cell)[frontiers]
         if goal != NOWHERE:
-            towards = totals + terrain.optimistic(goal, until=member.cell)[frontiers]
+            towards = totals + cost_map.optimistic(goal, until=member.cell)[frontiers]
             totals = towards if np.isfinite(towards).any() else totals
         best = int(totals.argmin()) if totals.size else 0
         reached = totals.size and math.isfinite(totals[best])
         return int(frontiers[best]) if reached else NOWHERE
 
 
-def is_open(terrain: CostMap, goal: int) -> bool:
+def is_open(cost_map: CostMap, goal: int) -> bool:
     """Whether there is still something to explore at a goal."""
-    return bool(terrain.chart.cells[goal] == UNKNOWN)
+    return bool(cost_map.fused_map.cells[goal] == UNKNOWN)
 
 
 def is_reachable(field: DistanceField, goal: int) -> bool:

@@ -54,11 +54,11 @@ class Trader:
     def assign(self, situation: Situation) -> list[Task]:
         """One step of all that goes on at once: holding, selling, buying, driving."""
         [self._member] = situation.members
-        self._terrain, self._tick = situation.terrain, situation.tick
+        self._cost_map, self._tick = situation.cost_map, situation.tick
         self._clock = max(self._clock + 1, self._tick)
         self._field_now: DistanceField | None = None
         self._mates = self._heard(situation.others)
-        self._tour = [held for held in self._tour if is_open(self._terrain, held.goal)]
+        self._tour = [held for held in self._tour if is_open(self._cost_map, held.goal)]
         self._let_go()
         self._take_up()
         self._name_heirs()
@@ -75,14 +75,14 @@ class Trader:
 
     def _heard(self, others: Sequence[Member]) -> dict[int, Memo]:
         """The memos of those in contact, by place."""
-        cells = self._terrain.frame.cells
+        cells = self._cost_map.frame.cells
         memos = {m.robot: unpacked(m.task.memo, self._robots, cells) for m in others}
         return {robot: memo for robot, memo in sorted(memos.items()) if memo.clock > 0}
 
     @property
     def _field(self) -> DistanceField:
         if self._field_now is None:
-            self._field_now = self._terrain.optimistic(self._member.cell)
+            self._field_now = self._cost_map.optimistic(self._member.cell)
         return self._field_now
 
     @property
@@ -94,7 +94,7 @@ class Trader:
         return [held.goal for held in self._tour if held.heir == NOBODY]
 
     def _near(self, goal: int, others: Iterable[int]) -> bool:
-        return near(self._terrain, goal, others)
+        return near(self._cost_map, goal, others)
 
     def _held_by_mates(self) -> list[int]:
         return [goal for memo in self._mates.values() for goal, _heir in memo.tour]
@@ -126,7 +126,7 @@ class Trader:
     def _can_take(self, goal: int) -> bool:
         return (
             len(self._tour) < self._rules.capacity
-            and is_open(self._terrain, goal)
+            and is_open(self._cost_map, goal)
             and is_reachable(self._field, goal)
         )
 
@@ -136,7 +136,7 @@ class Trader:
         self._tour.insert(slot, _Holding(goal))
 
     def _costs(self, goals: Iterable[int]) -> Costs:
-        return Costs(self._terrain, [self._field], goals)
+        return Costs(self._cost_map, [self._field], goals)
 
     def _name_heirs(self) -> None:
         """Name the lowest robot of a lower place that holds something near, as the heir."""
@@ -228,7 +228,7 @@ class Trader:
         self._tour = [held for held in self._tour if is_reachable(self._field, held.goal)]
         if not self._tour:
             held, rules = self._held_by_mates(), self._rules
-            for goal in rules.propose(self._terrain, self._field, self._me, self._tick, held):
+            for goal in rules.propose(self._cost_map, self._field, self._me, self._tick, held):
                 self._insert(goal)
         self._towards = next(iter(self._goals), NOWHERE)
         return self._rules.heading(situation, self._member, self._towards)

@@ -101,11 +101,11 @@ from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent,
 def _check(
     payload: bytes,
     sizes: np.ndarray,
-    acts: np.ndarray,
+    step_records: np.ndarray,
     ruled_m: np.ndarray,
     heard: np.ndarray,
     sent: np.ndarray,
-    verdicts: np.ndarray,
+    decisions: np.ndarray,
     pairs: np.ndarray,
     injected: np.ndarray,
     book: np.ndarray,
@@ -118,7 +118,7 @@ def _check(
     posted: np.ndarray,
     flights: np.ndarray,
     forged: np.ndarray,
-    have: np.ndarray,
+    version_vector: np.ndarray,
     faults: np.ndarray,
     lengths_m: np.ndarray,
     found: np.ndarray,
@@ -148,7 +148,9 @@ def _check(
 
     Negative if an array has no room, and nothing has changed.
     """
-    reading = ColumnarBatch(payload, sizes, acts, ruled_m, heard, sent, verdicts, pairs, injected)
+    columns = ColumnarBatch(
+        payload, sizes, step_records, ruled_m, heard, sent, decisions, pairs, injected
+    )
     state = CheckerState(
         book,
         poses_m,
@@ -160,14 +162,14 @@ def _check(
         posted,
         flights,
         forged,
-        have,
+        version_vector,
         faults,
         lengths_m,
         found,
         samples_m,
         by_x,
     )
-    law = Limits(
+    limits = Limits(
         sample_units,
         point_units,
         budget,
@@ -183,37 +185,37 @@ def _check(
         patience_ns,
     )
     links = FaultTable(seed, link_rules, link_numbers, link_names, severed)
-    lacking = missing_capacity(state, reading)
+    lacking = missing_capacity(state, columns)
     if lacking < 0:
         return lacking
     found[FAULTS], found[KEYFRAMES] = 0, 0
     for row in range(sizes[of.ACTS]):
-        if acts[row, of.PLACE] >= 0:
-            check_inbox(state, law, reading, row, now_ns)
-            post(state, reading, row)
-    post_forged(state, reading)
+        if step_records[row, of.PLACE] >= 0:
+            check_inbox(state, limits, columns, row, now_ns)
+            post(state, columns, row)
+    post_forged(state, columns)
     for row in range(sizes[of.VERDICTS]):
-        check_decision(state, law, links, reading, row, now_ns)
+        check_decision(state, limits, links, columns, row, now_ns)
     for row in range(sizes[of.ACTS]):
-        who = acts[row, of.PLACE]
+        who = step_records[row, of.PLACE]
         if who < 0:
             note_violation(state, STRANGER, row, 0, 0, 0, 0.0, 0.0)
             continue
-        if not acts[row, of.PRESENT]:
+        if not step_records[row, of.PRESENT]:
             continue
-        check_incarnation(state, law, reading, row)
-        check_order(state, reading, row)
-        check_refusals(state, reading, row)
-        check_speed(state, law, reading, row)
-        check_energy(state, law, reading, row)
-        check_weights(state, law, reading, row)
-        for item in range(acts[row, of.SENT_COUNT]):
-            check_gossip(state, law, reading, row, item)
-        check_verdict(state, law, reading, row)
-        if acts[row, of.WEIGHTS_BYTES]:
-            check_published(state, reading, row)
-        if transport and acts[row, of.HEADS]:
-            check_goal(state, reading, row)
+        check_incarnation(state, limits, columns, row)
+        check_order(state, columns, row)
+        check_refusals(state, columns, row)
+        check_speed(state, limits, columns, row)
+        check_energy(state, limits, columns, row)
+        check_weights(state, limits, columns, row)
+        for item in range(step_records[row, of.SENT_COUNT]):
+            check_gossip(state, limits, columns, row, item)
+        check_verdict(state, limits, columns, row)
+        if step_records[row, of.WEIGHTS_BYTES]:
+            check_published(state, columns, row)
+        if transport and step_records[row, of.HEADS]:
+            check_goal(state, columns, row)
     return found[FAULTS] + found[KEYFRAMES]
 
 
@@ -262,8 +264,8 @@ class Checker:
 
     def __init__(
         self,
-        reader: ColumnarDecoder | None = None,
-        survey: MapTracker | None = None,
+        decoder: ColumnarDecoder | None = None,
+        map_tracker: MapTracker | None = None,
         *,
         virtual: bool = True,
     ) -> None:
@@ -274,15 +276,15 @@ class Checker:
         self.complaints: list[str] = []
         self.count = 0
         """All complaints, also those beyond the ones that are kept."""
-        self._reader = reader or ColumnarDecoder()
-        self._survey = survey
+        self._decoder = decoder or ColumnarDecoder()
+        self._map_tracker = map_tracker
         self._virtual = virtual
         self._map_rules: MapChecker | None = None
         self._opening: Opening | None = None
         self._ended = False
         self._now_ns = 0
 
-    def take(self, record: Record) -> None:
+    def observe(self, record: Record) -> None:
         """Check one record."""
         if self._ended:
             self._complain("order", "record", "something follows the ending")
@@ -300,7 +302,7 @@ class Checker:
             self._ended = True
             self._end(record)
 
-    def take_row(self, row: tuple[Any, ...]) -> None:
+    def observe_row(self, row: tuple[Any, ...]) -> None:
         """Hold a row's bounds against its exact distance, if they claim to be bounds."""
         if not isinstance(row, DensityRow) or row.w1_exact is None or row.w_ub_tight is None:
             return
@@ -317,7 +319,7 @@ class Checker:
             self.complaints.append(f"{rule}: t={self._now_ns * 1e-9:.3f} s: {who}: {what}")
 
     def _open(self, opening: Opening) -> None:
-        self._reader.read(opening)
+        self._decoder.read(opening)
         scenario, site = opening.scenario, opening.site
         self._opening, self._scenario, self._units = opening, scenario, opening.units
         self._samples = site.samples_m.shape[0]
@@ -337,7 +339,7 @@ class Checker:
         self._stopped: dict[ParticipantId, dict[str, int]] = {name: {} for name in names}
         self._stopped[WORLD_SIM] = {}
         """Who is stopped by what, and since when."""
-        self._law = Limits(
+        self._limits = Limits(
             sample_units=self._units.sample,
             point_units=self._units.point,
             budget=scenario.steps_per_robot,
@@ -366,7 +368,7 @@ class Checker:
             posted=np.zeros((len(names), 256, 2), dtype=np.int64),
             flights=np.zeros((len(names), 64, 4), dtype=np.int64),
             forged=np.zeros((1, 64, 3), dtype=np.int64),
-            have=np.zeros((len(names), len(names)), dtype=np.int64),
+            version_vector=np.zeros((len(names), len(names)), dtype=np.int64),
             faults=np.zeros((VIOLATIONS_MAX, 5), dtype=np.int64),
             lengths_m=np.zeros((VIOLATIONS_MAX, 2)),
             found=np.zeros(3, dtype=np.int64),
@@ -375,7 +377,7 @@ class Checker:
         )
         self._state.book[:, SLOT] = np.arange(len(names))
         self._state.book[:, STOPPED_NS] = NOT
-        self._arguments = (*self._state, *self._law, *self._links)
+        self._arguments = (*self._state, *self._limits, *self._links)
         self._visiting = scenario.planner.name == "spectral"
         self._registers = np.zeros((len(names), scenario.register_width), dtype=np.int64)
         self._rectangle = rectangle_of(scenario.domain)
@@ -383,7 +385,9 @@ class Checker:
             for name in fault.who if isinstance(fault, Late) else ():
                 self._stop(name, "kill", 0)
         if scenario.mapping:
-            self._map_rules = MapChecker(self._survey or MapTracker(self._reader), self._complain)
+            self._map_rules = MapChecker(
+                self._map_tracker or MapTracker(self._decoder), self._complain
+            )
             self._map_rules.open(opening)
 
     def _check(self, batch: Batch) -> None:
@@ -394,11 +398,11 @@ class Checker:
             self._check_injected(batch)
         if self._clocks:
             self._check_clocks(batch)
-        reading = self._reader.read(batch)
-        noted = _check(*reading, *self._arguments, batch.now_ns)
+        columns = self._decoder.read(batch)
+        noted = _check(*columns, *self._arguments, batch.now_ns)
         while noted < 0:
             self._lengthen(GROWING[noted])
-            noted = _check(*reading, *self._arguments, batch.now_ns)
+            noted = _check(*columns, *self._arguments, batch.now_ns)
         if noted:
             self._put_into_words(batch, self._state.found.item(FAULTS))
             self._check_keyframes(batch)
@@ -422,13 +426,13 @@ class Checker:
                 self._complain("refusal", "record", f"{number} is forged, and may have been sent")
 
     def _check_clocks(self, batch: Batch) -> None:
-        for act in batch.acts:
-            if act.skew_ns == 0 and not self._clocks_of.get(act.name):
+        for step_record in batch.step_records:
+            if step_record.skew_ns == 0 and not self._clocks_of.get(step_record.name):
                 continue
-            least_ns, most_ns = self._skews_ns(act.name, act.now_ns)
-            if not least_ns <= act.skew_ns <= most_ns:
-                what = f"its clock is {act.skew_ns} ns ahead, by its faults {most_ns}"
-                self._complain("clock", act.name, what)
+            least_ns, most_ns = self._skews_ns(step_record.name, step_record.now_ns)
+            if not least_ns <= step_record.skew_ns <= most_ns:
+                what = f"its clock is {step_record.skew_ns} ns ahead, by its faults {most_ns}"
+                self._complain("clock", step_record.name, what)
 
     def _skews_ns(self, name: ParticipantId, now_ns: int) -> tuple[int, int]:
         """The least and the most that a clock can be ahead. On the wall it hears of its faults later."""
@@ -492,20 +496,22 @@ class Checker:
     def _take_over(self, incident: ProcessEvent, place: int) -> None:
         """A process takes a body over: as who drove it before, or as a new incarnation."""
         book = self._state.book[place]
-        steps, epoch = book.item(STEPS), book.item(SLOT) // len(self._names)
+        steps, incarnation = book.item(STEPS), book.item(SLOT) // len(self._names)
         disk = self._disk_of(incident.fault)
-        expected = {epoch}
+        expected = {incarnation}
         if steps and disk != "kept":
-            expected = {epoch + 1} if disk == "lost" else {epoch, epoch + 1}
-        if incident.epoch not in expected:
-            what = f"incarnation {incident.epoch} after {epoch}, its disk is {disk}"
+            expected = {incarnation + 1} if disk == "lost" else {incarnation, incarnation + 1}
+        if incident.incarnation not in expected:
+            what = f"incarnation {incident.incarnation} after {incarnation}, its disk is {disk}"
             self._complain("epoch", incident.who, what)
-        ahead = 1 if incident.epoch == epoch else 0  # its last step may have been heard by nobody
+        ahead = (
+            1 if incident.incarnation == incarnation else 0
+        )  # its last step may have been heard by nobody
         if not steps <= incident.step <= steps + ahead:
             what = f"goes on from step {incident.step}, its last was {steps}"
             self._complain("epoch", incident.who, what)
         self._lose_flights(place, incident.now_ns)
-        if incident.epoch > epoch:
+        if incident.incarnation > incarnation:
             self._be_reborn(incident, place)
 
     def _disk_of(self, fault: int) -> str:
@@ -532,15 +538,15 @@ class Checker:
 
     def _be_reborn(self, incident: ProcessEvent, place: int) -> None:
         """All that it knew is gone: its vector is full, its logs are empty, its own is a new one."""
-        if self._law.ledger and self._state.book[place, TOLD]:
+        if self._limits.ledger and self._state.book[place, TOLD]:
             self._check_view(incident.who, place)
         participants = len(self._names)
-        slot = incident.epoch * participants + place
+        slot = incident.incarnation * participants + place
         while slot >= self._state.shipped.shape[0]:
             self._add_slots(participants)
         state = self._state
         state.views[place], state.published[place] = self._units.sample, 0
-        state.have[place] = 0
+        state.version_vector[place] = 0
         book = state.book[place]
         book[SLOT] = slot
         book[[SEQUENCE, DIFFERING, TOLD, REFUSALS_SO_FAR]] = 0
@@ -551,17 +557,17 @@ class Checker:
         self._state = state._replace(
             shipped=np.pad(state.shipped, ((0, more), (0, 0))),
             logs=np.pad(state.logs, ((0, more), (0, 0), (0, 0))),
-            have=np.pad(state.have, ((0, 0), (0, more))),
+            version_vector=np.pad(state.version_vector, ((0, 0), (0, more))),
         )
         self._registers = np.pad(self._registers, ((0, more), (0, 0)))
-        self._arguments = (*self._state, *self._law, *self._links)
+        self._arguments = (*self._state, *self._limits, *self._links)
 
     def _lengthen(self, name: str) -> None:
         """Double one of the arrays that grow with the run."""
         rows = getattr(self._state, name)
         longer = np.concatenate((rows, np.zeros_like(rows)), axis=1)
         self._state = self._state._replace(**{name: longer})
-        self._arguments = (*self._state, *self._law, *self._links)
+        self._arguments = (*self._state, *self._limits, *self._links)
 
     def _put_into_words(self, batch: Batch, faults: int) -> None:
         noted = min(faults, VIOLATIONS_MAX)
@@ -575,30 +581,34 @@ class Checker:
     def _check_keyframes(self, batch: Batch) -> None:
         book, subscriber = self._state.book, self._subscriber
         for place in np.flatnonzero(book[:, KEYFRAME]).tolist():
-            act = batch.acts[book[place, KEYFRAME] - 1]
-            assert act.outputs is not None
-            rebuilt = subscriber.take(act.outputs.weights)
+            step_record = batch.step_records[book[place, KEYFRAME] - 1]
+            assert step_record.outputs is not None
+            rebuilt = subscriber.apply(step_record.outputs.weights)
             weights, view = subscriber.weights, self._state.views[place]
             if not rebuilt or weights is None or weights.shape != view.shape:
                 book[place, SEQUENCE] = 0
-                self._complain("weights", act.name, WORDS[NOT_REBUILT][1])
+                self._complain("weights", step_record.name, WORDS[NOT_REBUILT][1])
                 continue
             self._state.published[place] = weights
             book[place, DIFFERING] = np.count_nonzero(weights != view)
             if book[place, DIFFERING]:
-                self._complain("weights", act.name, WORDS[NOT_ITS_OWN][1])
+                self._complain("weights", step_record.name, WORDS[NOT_ITS_OWN][1])
 
     def _check_registers(self, batch: Batch) -> None:
-        for act in batch.acts:
-            if act.outputs is not None and act.ruling is not None and act.name in self._places:
-                self._check_register(act, act.outputs)
+        for step_record in batch.step_records:
+            if (
+                step_record.outputs is not None
+                and step_record.verdict is not None
+                and step_record.name in self._places
+            ):
+                self._check_register(step_record, step_record.outputs)
 
-    def _check_register(self, act: StepRecord, outputs: Outputs) -> None:
+    def _check_register(self, step_record: StepRecord, outputs: Outputs) -> None:
         """It chooses where it was observed last."""
-        name = act.name
+        name = step_record.name
         slot = self._state.book.item(self._places[name], SLOT)
         if outputs.spent:
-            pose, modes = act.observation.pose, self._scenario.planner.modes
+            pose, modes = step_record.observation.pose, self._scenario.planner.modes
             self._registers[slot] += visit_at(pose.x_m, pose.y_m, self._rectangle, modes)
         points, sums = self._state.shipped.item(slot, WRITES), self._registers[slot].tobytes()
         for envelope in outputs.outbox:
@@ -618,13 +628,13 @@ class Checker:
             news = decode_gossip(envelope.body)
         except RefusedError:
             return None
-        slots = slots_told(news.have, len(self._names), claims=self._law.claims)
+        slots = slots_told(news.version_vector, len(self._names), claims=self._limits.claims)
         if slots is None:
             return None
         return read_register(news.registers, slots, self._scenario.register_width, slot)
 
     def _end(self, ending: Ending) -> None:
-        if self._law.ledger:
+        if self._limits.ledger:
             for name, place in self._places.items():
                 if self._state.book[place, TOLD]:
                     self._check_view(name, place)
@@ -638,7 +648,7 @@ class Checker:
     def _check_view(self, name: ParticipantId, place: int) -> None:
         state = self._state
         spent = np.zeros(self._samples, dtype=np.int64)
-        for slot, length in enumerate(state.have[place].tolist()):
+        for slot, length in enumerate(state.version_vector[place].tolist()):
             entries = state.shipped.item(slot, ENTRIES)
             if length > entries:
                 origin = self._origin(slot)
@@ -654,34 +664,34 @@ class Checker:
 
     def _origin(self, slot: int) -> str:
         """A participant, and which incarnation if it is not the first."""
-        epoch, place = divmod(slot, len(self._names))
-        return f"{self._names[place]}:{epoch}" if epoch else self._names[place]
+        incarnation, place = divmod(slot, len(self._names))
+        return f"{self._names[place]}:{incarnation}" if incarnation else self._names[place]
 
     def _concerned(
         self, batch: Batch, fault: int, row: int, item: int, a: int, b: int
     ) -> tuple[str, str]:
         """Whom a fault is about; and which envelope, which origin, or what the codec says of it."""
         if fault in OF_DECISIONS:
-            verdict = batch.verdicts[row]
-            return verdict.target, f"{verdict.source}#{verdict.sequence}"
-        act = batch.acts[row]
+            decision = batch.decisions[row]
+            return decision.target, f"{decision.source}#{decision.sequence}"
+        step_record = batch.step_records[row]
         if fault in (UNHEARD, OUT_OF_TURN):
-            source, sequence = act.heard[item]
-            return act.name, f"{source}#{sequence}"
+            source, sequence = step_record.heard[item]
+            return step_record.name, f"{source}#{sequence}"
         if fault == WITHHELD:
-            return act.name, f"{self._names[a] if a >= 0 else 'a stranger'}#{b}"
+            return step_record.name, f"{self._names[a] if a >= 0 else 'a stranger'}#{b}"
         if fault in (FOREIGN_LOG, FORGETS, NOBODYS):
-            return act.name, self._origin(item)
-        if fault == REFUSED and act.ruling is not None:
-            return act.name, act.ruling.violations[item]
-        if fault in (NO_SAMPLE, NO_WEIGHT) and act.outputs is not None:
-            return act.name, str(act.outputs.goal)
-        if fault == UNREADABLE and act.outputs is not None:
+            return step_record.name, self._origin(item)
+        if fault == REFUSED and step_record.verdict is not None:
+            return step_record.name, step_record.verdict.violations[item]
+        if fault in (NO_SAMPLE, NO_WEIGHT) and step_record.outputs is not None:
+            return step_record.name, str(step_record.outputs.goal)
+        if fault == UNREADABLE and step_record.outputs is not None:
             try:
-                decode_gossip(act.outputs.outbox[item].body)
+                decode_gossip(step_record.outputs.outbox[item].body)
             except RefusedError as error:
-                return act.name, f": {error}"
-        return act.name, ""
+                return step_record.name, f": {error}"
+        return step_record.name, ""
 
 
 def _within(fault: Fault, now_ns: int) -> bool:
@@ -692,5 +702,5 @@ def check(records: Iterable[Record], *, virtual: bool = True) -> Checker:
     """Check a whole record. virtual: see Checker."""
     checker = Checker(virtual=virtual)
     for record in records:
-        checker.take(record)
+        checker.observe(record)
     return checker

@@ -1,7 +1,7 @@
 """Rules on weight: energy is spent once, and nothing is lost or counted twice."""
 
 from kantor_protocol.base.kernels import kernel
-from kantor_protocol.base.varint import take_int, take_uint
+from kantor_protocol.base.varint import read_int, read_uint
 from kantor_worldsim.observers.checkers.state import (
     BELOW,
     BUDGET,
@@ -31,60 +31,64 @@ from kantor_worldsim.record.columnar import ColumnarBatch
 
 
 @kernel
-def check_energy(state: CheckerState, law: Limits, reading: ColumnarBatch, row: int) -> None:
+def check_energy(state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int) -> None:
     """A step spends units that are left, one point at a time, within the budget."""
-    act = reading.acts[row]
-    who = act[of.PLACE]
+    step_record = columns.step_records[row]
+    who = step_record[of.PLACE]
     book, slot = state.book[who], state.book[who, SLOT]
-    if act[of.SPENT_COUNT] == of.NOT_DECODED:
+    if step_record[of.SPENT_COUNT] == of.NOT_DECODED:
         note_violation(state, GARBLED_SPENT, row, 0, 0, 0, 0.0, 0.0)
         return
     shipped = 0
-    for i in range(act[of.SPENT], act[of.SPENT] + act[of.SPENT_COUNT]):
-        sample, units = reading.pairs[i, of.SAMPLE], reading.pairs[i, of.UNITS]
+    for i in range(step_record[of.SPENT], step_record[of.SPENT] + step_record[of.SPENT_COUNT]):
+        sample, units = columns.pairs[i, of.SAMPLE], columns.pairs[i, of.UNITS]
         shipped += units
         state.consumed[sample] += units
-        if law.ledger:
+        if limits.ledger:
             entry = state.logs[slot, state.shipped[slot, ENTRIES]]
             entry[0], entry[1] = sample, units
             state.shipped[slot, ENTRIES] += 1
-    state.shipped[slot, WRITES] += act[of.SPENT_COUNT] > 0
-    book[POINTS] += act[of.SPENT_COUNT] > 0
+    state.shipped[slot, WRITES] += step_record[of.SPENT_COUNT] > 0
+    book[POINTS] += step_record[of.SPENT_COUNT] > 0
     points = book[POINTS]
-    if shipped > law.point_units:
+    if shipped > limits.point_units:
         note_violation(state, POINT, row, 0, shipped, 0, 0.0, 0.0)
-    if points > law.budget:
+    if points > limits.budget:
         note_violation(state, BUDGET, row, 0, points, 0, 0.0, 0.0)
-    if act[of.ENERGY] < points and who != law.supervisor:
-        note_violation(state, MISCOUNT, row, 0, act[of.ENERGY], points, 0.0, 0.0)
+    if step_record[of.ENERGY] < points and who != limits.supervisor:
+        note_violation(state, MISCOUNT, row, 0, step_record[of.ENERGY], points, 0.0, 0.0)
 
 
 @kernel
-def check_weights(state: CheckerState, law: Limits, reading: ColumnarBatch, row: int) -> None:
+def check_weights(state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int) -> None:
     """Weights only fall, and by what was spent or merged."""
-    act = reading.acts[row]
-    book, view = state.book[act[of.PLACE]], state.views[act[of.PLACE]]
-    if act[of.LOWERED_COUNT] == of.NOT_DECODED:
+    step_record = columns.step_records[row]
+    book, view = state.book[step_record[of.PLACE]], state.views[step_record[of.PLACE]]
+    if step_record[of.LOWERED_COUNT] == of.NOT_DECODED:
         note_violation(state, GARBLED_LOWERED, row, 0, 0, 0, 0.0, 0.0)
-    for i in range(act[of.LOWERED], act[of.LOWERED] + max(0, act[of.LOWERED_COUNT])):
-        sample, left = reading.pairs[i, of.SAMPLE], reading.pairs[i, of.UNITS]
+    for i in range(
+        step_record[of.LOWERED], step_record[of.LOWERED] + max(0, step_record[of.LOWERED_COUNT])
+    ):
+        sample, left = columns.pairs[i, of.SAMPLE], columns.pairs[i, of.UNITS]
         if left >= view[sample]:
             note_violation(state, RISE, row, sample, view[sample], left, 0.0, 0.0)
-        if left < law.sample_units - state.consumed[sample]:
+        if left < limits.sample_units - state.consumed[sample]:
             note_violation(state, BELOW, row, sample, 0, 0, 0.0, 0.0)
-        published = state.published[act[of.PLACE], sample]
+        published = state.published[step_record[of.PLACE], sample]
         book[DIFFERING] += (published != left) - (published != view[sample])
         view[sample] = left
 
 
 @kernel
-def check_published(state: CheckerState, reading: ColumnarBatch, row: int) -> None:
+def check_published(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
     """What has changed since the message before; a keyframe is left to `Checker`, to inflate it."""
-    act = reading.acts[row]
-    payload, at = reading.payload, act[of.WEIGHTS]
-    book, view = state.book[act[of.PLACE]], state.views[act[of.PLACE]]
-    published = state.published[act[of.PLACE]]
-    sequence, base, size, at, end = of.parts_of_weights(payload, at, at + act[of.WEIGHTS_BYTES])
+    step_record = columns.step_records[row]
+    payload, at = columns.payload, step_record[of.WEIGHTS]
+    book, view = state.book[step_record[of.PLACE]], state.views[step_record[of.PLACE]]
+    published = state.published[step_record[of.PLACE]]
+    sequence, base, size, at, end = of.parts_of_weights(
+        payload, at, at + step_record[of.WEIGHTS_BYTES]
+    )
     if end >= 0 and base == 0:
         book[SEQUENCE], book[KEYFRAME] = sequence, row + 1
         state.found[KEYFRAMES] += 1
@@ -92,8 +96,8 @@ def check_published(state: CheckerState, reading: ColumnarBatch, row: int) -> No
     sound = end >= 0 and base == book[SEQUENCE] and size == view.shape[0]
     sample = 0
     while sound and at < end:
-        step, at = take_int(payload, at)
-        units, at = take_uint(payload, at)
+        step, at = read_int(payload, at)
+        units, at = read_uint(payload, at)
         sample += step
         if not (0 <= at <= end and 0 <= sample < size) or units > published[sample]:
             sound = False
@@ -110,10 +114,10 @@ def check_published(state: CheckerState, reading: ColumnarBatch, row: int) -> No
 
 
 @kernel
-def check_goal(state: CheckerState, reading: ColumnarBatch, row: int) -> None:
+def check_goal(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
     """The weight at the time of choosing: what is left now, or what it has shipped since."""
     samples_m, by_x = state.samples_m, state.by_x
-    x_m, y_m = reading.poses_m[row, 2], reading.poses_m[row, 3]
+    x_m, y_m = columns.poses_m[row, 2], columns.poses_m[row, 3]
     low, high = 0, by_x.shape[0]
     while low < high:
         middle = (low + high) // 2
@@ -126,21 +130,23 @@ def check_goal(state: CheckerState, reading: ColumnarBatch, row: int) -> None:
         sample = by_x[low]
         if samples_m[sample, 1] == y_m:
             known = True
-            if state.views[reading.acts[row, of.PLACE], sample] > 0:
+            if state.views[columns.step_records[row, of.PLACE], sample] > 0:
                 return
         low += 1
     if not known:
         note_violation(state, NO_SAMPLE, row, 0, 0, 0, 0.0, 0.0)
-    elif not ships_to(state, reading, row, x_m, y_m):
+    elif not ships_to(state, columns, row, x_m, y_m):
         note_violation(state, NO_WEIGHT, row, 0, 0, 0, 0.0, 0.0)
 
 
 @kernel
-def ships_to(state: CheckerState, reading: ColumnarBatch, row: int, x_m: float, y_m: float) -> bool:
+def ships_to(state: CheckerState, columns: ColumnarBatch, row: int, x_m: float, y_m: float) -> bool:
     """Whether something of what was spent went to this place."""
-    act = reading.acts[row]
-    for i in range(act[of.SPENT], act[of.SPENT] + max(0, act[of.SPENT_COUNT])):
-        place_m = state.samples_m[reading.pairs[i, of.SAMPLE]]
-        if place_m[0] == x_m and place_m[1] == y_m and reading.pairs[i, of.UNITS] > 0:
+    step_record = columns.step_records[row]
+    for i in range(
+        step_record[of.SPENT], step_record[of.SPENT] + max(0, step_record[of.SPENT_COUNT])
+    ):
+        place_m = state.samples_m[columns.pairs[i, of.SAMPLE]]
+        if place_m[0] == x_m and place_m[1] == y_m and columns.pairs[i, of.UNITS] > 0:
             return True
     return False

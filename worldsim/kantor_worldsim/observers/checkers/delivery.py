@@ -40,20 +40,20 @@ def land(state: CheckerState, who: int, row: int) -> None:
 
 @kernel
 def check_inbox(
-    state: CheckerState, law: Limits, reading: ColumnarBatch, row: int, now_ns: int
+    state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int, now_ns: int
 ) -> None:
     """What was heard had arrived; in virtual time also: all that had arrived, in order of arrival."""
-    act = reading.acts[row]
-    who = act[of.PLACE]
+    step_record = columns.step_records[row]
+    who = step_record[of.PLACE]
     flights = state.flights[who]
     if state.book[who, OPEN] == 0:
-        by_ns = act[of.NOW_NS] if law.virtual else now_ns
+        by_ns = step_record[of.NOW_NS] if limits.virtual else now_ns
         for i in range(state.book[who, FLYING]):
             flights[i, 3] = flights[i, 2] <= by_ns
-    state.book[who, OPEN] = law.virtual and not act[of.PRESENT]
+    state.book[who, OPEN] = limits.virtual and not step_record[of.PRESENT]
     before_ns, before_source, before_sequence = 0, 0, 0
-    for item in range(act[of.HEARD_COUNT]):
-        heard = reading.heard[act[of.HEARD] + item]
+    for item in range(step_record[of.HEARD_COUNT]):
+        heard = columns.heard[step_record[of.HEARD] + item]
         first = -1  # the copy that arrived first
         for i in range(state.book[who, FLYING]):
             if (
@@ -68,14 +68,14 @@ def check_inbox(
             continue
         source, sequence, due_ns = flights[first, 0], flights[first, 1], flights[first, 2]
         land(state, who, first)
-        if law.virtual and (
+        if limits.virtual and (
             due_ns < before_ns
             or (due_ns == before_ns and 0 <= source < before_source)
             or (due_ns == before_ns and source == before_source and sequence < before_sequence)
         ):
             note_violation(state, OUT_OF_TURN, row, item, 0, 0, 0.0, 0.0)
         before_ns, before_source, before_sequence = due_ns, source, sequence
-    if law.virtual and act[of.PRESENT]:
+    if limits.virtual and step_record[of.PRESENT]:
         for i in range(state.book[who, FLYING] - 1, -1, -1):
             if flights[i, 3]:
                 note_violation(state, WITHHELD, row, 0, flights[i, 0], flights[i, 1], 0.0, 0.0)
@@ -83,26 +83,26 @@ def check_inbox(
 
 
 @kernel
-def post(state: CheckerState, reading: ColumnarBatch, row: int) -> None:
+def post(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
     """Note the envelopes that a step sends; a sequence number is used once."""
-    act = reading.acts[row]
-    for sent in range(act[of.SENT], act[of.SENT] + act[of.SENT_COUNT]):
-        source, sequence = reading.sent[sent, of.SOURCE], reading.sent[sent, of.SEQUENCE]
+    step_record = columns.step_records[row]
+    for sent in range(step_record[of.SENT], step_record[of.SENT] + step_record[of.SENT_COUNT]):
+        source, sequence = columns.sent[sent, of.SOURCE], columns.sent[sent, of.SEQUENCE]
         if source >= 0:
             book = state.book[source]
             if sequence <= book[NUMBER] and find_posted(state, source, sequence) >= 0:
                 note_violation(state, AGAIN, row, 0, sequence, 0, 0.0, 0.0)
             book[NUMBER] = max(book[NUMBER], sequence)
             posted = state.posted[source, book[POSTED]]
-            posted[0], posted[1] = sequence, reading.sent[sent, of.TARGET]
+            posted[0], posted[1] = sequence, columns.sent[sent, of.TARGET]
             book[POSTED] += 1
 
 
 @kernel
-def post_forged(state: CheckerState, reading: ColumnarBatch) -> None:
+def post_forged(state: CheckerState, columns: ColumnarBatch) -> None:
     """Note the envelopes that a fault has put on the air."""
-    for row in range(reading.sizes[of.INJECTED]):
-        forged, injected = state.forged[0, state.found[FORGED]], reading.injected[row]
+    for row in range(columns.sizes[of.INJECTED]):
+        forged, injected = state.forged[0, state.found[FORGED]], columns.injected[row]
         forged[0], forged[1] = injected[of.SOURCE], injected[of.SEQUENCE]
         forged[2] = injected[of.TARGET]
         state.found[FORGED] += 1
@@ -134,7 +134,7 @@ def target_of(state: CheckerState, source: int, sequence: int) -> int:
 @kernel
 def check_link(
     state: CheckerState,
-    law: Limits,
+    limits: Limits,
     links: FaultTable,
     row: int,
     now_ns: int,
@@ -142,7 +142,9 @@ def check_link(
     receiver: int,
 ) -> None:
     """By the places that both had at the time of sending, before the batch moves them."""
-    range_m = law.supervisor_range_m if law.supervisor in (source, receiver) else law.range_m
+    range_m = (
+        limits.supervisor_range_m if limits.supervisor in (source, receiver) else limits.range_m
+    )
     if links.rules.shape[0] > 0:
         if severs(links, now_ns, source, receiver):
             note_violation(state, CUT, row, 0, 0, 0, 0.0, 0.0)
@@ -156,16 +158,16 @@ def check_link(
 @kernel
 def check_decision(
     state: CheckerState,
-    law: Limits,
+    limits: Limits,
     links: FaultTable,
-    reading: ColumnarBatch,
+    columns: ColumnarBatch,
     row: int,
     now_ns: int,
 ) -> None:
     """A delivery decision is about an envelope that was sent, and about a link that stands."""
-    verdict = reading.verdicts[row]
-    source, sequence = verdict[of.SOURCE], verdict[of.SEQUENCE]
-    receiver, due_ns = verdict[of.TARGET], verdict[of.DUE_NS]
+    decision = columns.decisions[row]
+    source, sequence = decision[of.SOURCE], decision[of.SEQUENCE]
+    receiver, due_ns = decision[of.TARGET], decision[of.DUE_NS]
     target = target_of(state, source, sequence)
     if target == of.STRANGER or receiver < 0:
         note_violation(state, NEVER_SENT, row, 0, 0, 0, 0.0, 0.0)
@@ -175,7 +177,7 @@ def check_decision(
     if due_ns == DROPPED:
         return
     if source >= 0:  # nobody knows where a stranger is
-        check_link(state, law, links, row, now_ns, source, receiver)
+        check_link(state, limits, links, row, now_ns, source, receiver)
     flight = state.flights[receiver, state.book[receiver, FLYING]]
     flight[0], flight[1], flight[2], flight[3] = source, sequence, due_ns, 0
     state.book[receiver, FLYING] += 1

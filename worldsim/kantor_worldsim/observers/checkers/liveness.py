@@ -24,7 +24,7 @@ import numpy.typing as npt
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Outputs, ParticipantId, Pose
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.gossip import CONTACT_PERIODS, ack_timeout_steps
-from kantor_protocol.replication.replica import read_have
+from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.faults.processes import Kill, OnProcesses
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
@@ -61,7 +61,7 @@ def _way_ns(scenario: Scenario) -> int:
 class _Known(NamedTuple):
     """What a participant has said of itself."""
 
-    have: list[int]
+    version_vector: list[int]
     view: npt.NDArray[np.int64]
 
 
@@ -86,15 +86,15 @@ class LivenessChecker:
         """The rules that this record could have broken."""
         self._opening: Opening | None = None
 
-    def take(self, record: Record) -> None:
+    def observe(self, record: Record) -> None:
         """Follow one record."""
         if isinstance(record, Opening):
             self._open(record)
         elif self._opening is None:
             return
         elif isinstance(record, Batch):
-            for act in record.acts:
-                self._follow(act, record.now_ns)
+            for step_record in record.step_records:
+                self._follow(step_record, record.now_ns)
             if self._scenario.faults:
                 self._note_late(record)
         elif isinstance(record, ProcessEvent):
@@ -126,44 +126,50 @@ class LivenessChecker:
     def _complain(self, rule: str, now_ns: int, who: str, what: str) -> None:
         self.complaints.append(f"{rule}: t={now_ns * 1e-9:.3f} s: {who}: {what}")
 
-    def _follow(self, act: StepRecord, now_ns: int) -> None:
-        state = self._states.get(act.name)
-        if state is None or act.outputs is None or act.ruling is None:
+    def _follow(self, step_record: StepRecord, now_ns: int) -> None:
+        state = self._states.get(step_record.name)
+        if state is None or step_record.outputs is None or step_record.verdict is None:
             return
-        outputs, pose = act.outputs, act.ruling.pose
+        outputs, pose = step_record.outputs, step_record.verdict.pose
         state.last = outputs
         if outputs.lowered:
             state.lowered.append(outputs.lowered)
             self._changed_ns = now_ns if outputs.spent else self._changed_ns
         if outputs.spent:
             self._spent.setdefault(state.slot, []).append(outputs.spent)
-        before = self._poses.get(act.name)
+        before = self._poses.get(step_record.name)
         if before is None or pose.x_m != before.x_m or pose.y_m != before.y_m:
-            self._poses[act.name], self._changed_ns = pose, now_ns
-        if act.name != SUPERVISOR and self._scenario.centralized:
-            self._check_contact(state, act, outputs)
+            self._poses[step_record.name], self._changed_ns = pose, now_ns
+        if step_record.name != SUPERVISOR and self._scenario.centralized:
+            self._check_contact(state, step_record, outputs)
 
     def _note_late(self, batch: Batch) -> None:
         on_time_ns = batch.now_ns + self._way_ns
-        self._late_ns += [each.due_ns for each in batch.verdicts if each.due_ns > on_time_ns]
+        self._late_ns += [each.due_ns for each in batch.decisions if each.due_ns > on_time_ns]
 
-    def _check_contact(self, state: _Participant, act: StepRecord, outputs: Outputs) -> None:
+    def _check_contact(
+        self, state: _Participant, step_record: StepRecord, outputs: Outputs
+    ) -> None:
         """L3, for each step of a robot."""
         self.judged.add("L3")
         state.unheard += 1
-        if any(source == SUPERVISOR and number < FORGED_FIRST for source, number in act.heard):
+        if any(
+            source == SUPERVISOR and number < FORGED_FIRST for source, number in step_record.heard
+        ):
             state.unheard = 0
         targets = {envelope.target for envelope in outputs.outbox}
         if state.unheard == 0 and EVERYBODY in targets:
-            self._say_once("L3", act, "hears the supervisor and talks to everybody")
+            self._say_once("L3", step_record, "hears the supervisor and talks to everybody")
         elif state.unheard > _WITHIN_STEPS and targets - {EVERYBODY}:
-            self._say_once("L3", act, f"waits for the supervisor since {state.unheard} steps")
+            self._say_once(
+                "L3", step_record, f"waits for the supervisor since {state.unheard} steps"
+            )
 
-    def _say_once(self, rule: str, act: StepRecord, what: str) -> None:
+    def _say_once(self, rule: str, step_record: StepRecord, what: str) -> None:
         """Of everybody once: what lasts would fill pages."""
-        if f"{rule} {act.name}" not in self._said:
-            self._said.add(f"{rule} {act.name}")
-            self._complain(rule, act.now_ns, act.name, what)
+        if f"{rule} {step_record.name}" not in self._said:
+            self._said.add(f"{rule} {step_record.name}")
+            self._complain(rule, step_record.now_ns, step_record.name, what)
 
     def _befall(self, incident: ProcessEvent) -> None:
         self._changed_ns = max(self._changed_ns, incident.now_ns)
@@ -174,7 +180,7 @@ class LivenessChecker:
             state.alive = False
         elif incident.what in {"start", "join"}:
             state.alive = True
-            slot = incident.epoch * len(self._names) + state.slot % len(self._names)
+            slot = incident.incarnation * len(self._names) + state.slot % len(self._names)
             if slot != state.slot:
                 state.slot, state.last, state.lowered = slot, None, []
                 state.unheard = -ack_timeout_steps(incident.who, self._scenario)
@@ -223,8 +229,10 @@ class LivenessChecker:
         """What a participant holds by its last message, and its view; None if it has said nothing."""
         assert self._opening is not None
         state, samples = self._states[name], self._opening.samples_m.shape[0]
-        have = _have_of(state.last, len(self._names), claims=self._scenario.claiming)
-        if have is None:
+        version_vector = _version_vector_of(
+            state.last, len(self._names), claims=self._scenario.claiming
+        )
+        if version_vector is None:
             return None
         view = np.full(samples, self._opening.units.sample, dtype=np.int64)
         pairs = Pairs()
@@ -232,7 +240,7 @@ class LivenessChecker:
             told = pairs.decode(packed, samples)
             if told is not None:
                 view[told[0]] = told[1]
-        return _Known(have, view)
+        return _Known(version_vector, view)
 
     def _components(
         self, now_ns: int, names: list[ParticipantId]
@@ -301,8 +309,11 @@ class LivenessChecker:
                 self._complain("L1", now_ns, name if theirs is None else first, "said nothing")
                 return
             if self._scenario.merge == "ledger" or self._scenario.mapping:
-                slots = max(len(mine.have), len(theirs.have))
-                one, other = (each.have + [0] * (slots - len(each.have)) for each in (mine, theirs))
+                slots = max(len(mine.version_vector), len(theirs.version_vector))
+                one, other = (
+                    each.version_vector + [0] * (slots - len(each.version_vector))
+                    for each in (mine, theirs)
+                )
                 if one != other:
                     what = f"holds {other} entries, {first} holds {one}"
                     self._complain("L1", now_ns, name, what)
@@ -326,22 +337,22 @@ class LivenessChecker:
                 told = pairs.decode(packed, samples)
                 entries += 0 if told is None else told[0].shape[0]
             held = [
-                state.have[slot]
+                state.version_vector[slot]
                 for other in component
-                if (state := known[other]) is not None and slot < len(state.have)
+                if (state := known[other]) is not None and slot < len(state.version_vector)
             ]
             if max(held, default=0) != entries:
                 what = f"has consumed {entries} entries, and {max(held, default=0)} are known"
                 self._complain("I8", now_ns, name, what)
 
 
-def _have_of(outputs: Outputs | None, roster: int, *, claims: bool) -> list[int] | None:
+def _version_vector_of(outputs: Outputs | None, roster: int, *, claims: bool) -> list[int] | None:
     """The log lengths in the last message of a step."""
     if outputs is None or not outputs.outbox:
         return None
     try:
-        have = decode_gossip(outputs.outbox[-1].body).have
+        version_vector = decode_gossip(outputs.outbox[-1].body).version_vector
     except RefusedError:
         return None
-    slots = slots_told(have, roster, claims=claims)
-    return None if slots is None else read_have(have, slots)
+    slots = slots_told(version_vector, roster, claims=claims)
+    return None if slots is None else read_version_vector(version_vector, slots)

@@ -59,17 +59,17 @@ class MapChecker:
     finish      who says that it has finished can reach no frontier by what it holds (without noise)
     """
 
-    def __init__(self, survey: MapTracker, complain: Complain) -> None:
+    def __init__(self, map_tracker: MapTracker, complain: Complain) -> None:
         """survey: may be shared with other referees of the same run."""
-        self._survey = survey
+        self._map_tracker = map_tracker
         self._complain = complain
 
     def open(self, opening: Opening) -> None:
         """Begin with the first record."""
-        self._survey.take(opening)
+        self._map_tracker.observe(opening)
         self._exact = opening.scenario.sensor.noise_m == 0.0
         self._names = opening.scenario.roster
-        self._poses_m = dict(zip(self._names, self._survey.poses_m, strict=False))
+        self._poses_m = dict(zip(self._names, self._map_tracker.poses_m, strict=False))
         self._radio = opening.scenario.radio
         self._senders_m = dict(self._poses_m)
         supervisor = opening.scenario.supervisor
@@ -83,66 +83,79 @@ class MapChecker:
 
     def befall(self, incident: ProcessEvent) -> None:
         """Follow what befell a process."""
-        self._survey.take(incident)
+        self._map_tracker.observe(incident)
 
     def check(self, batch: Batch) -> int:
         """Follow one batch; how many faults went without a complaint, since there are too many."""
         if self._radio.line_of_sight or self._radio.wall_loss_m > 0.0:
-            for verdict in batch.verdicts:
-                self._check_sight(batch.now_ns, verdict)
-        self._survey.take(batch)
-        faults, count = self._survey.faults
+            for decision in batch.decisions:
+                self._check_sight(batch.now_ns, decision)
+        self._map_tracker.observe(batch)
+        faults, count = self._map_tracker.faults
         for fault, row, _, a, b in faults.tolist():
             self._put_into_words(batch, fault, row, a, b)
-        for act in batch.acts:
-            if act.ruling is not None and act.outputs is not None and act.name in self._poses_m:
-                self._check_way(act)
-                self._check_finish(act)
+        for step_record in batch.step_records:
+            if (
+                step_record.verdict is not None
+                and step_record.outputs is not None
+                and step_record.name in self._poses_m
+            ):
+                self._check_way(step_record)
+                self._check_finish(step_record)
         return count - len(faults)
 
     def _put_into_words(self, batch: Batch, fault: int, row: int, a: int, b: int) -> None:
         rule, text = _WORDS[fault]
         origin = self._names[a % len(self._names)] if fault == FOREIGN else ""
         kind = "occupied" if b else "free"
-        self._complain(rule, batch.acts[row].name, text.format(a=a, b=b, origin=origin, kind=kind))
+        self._complain(
+            rule, batch.step_records[row].name, text.format(a=a, b=b, origin=origin, kind=kind)
+        )
 
-    def _check_sight(self, now_ns: int, verdict: DeliveryDecision) -> None:
+    def _check_sight(self, now_ns: int, decision: DeliveryDecision) -> None:
         """From where both were before anybody moved; range alone is a rule of every run."""
-        if verdict.due_ns == DROPPED:
+        if decision.due_ns == DROPPED:
             return
-        here, there = (self._senders_m.get(name) for name in (verdict.source, verdict.target))
+        here, there = (self._senders_m.get(name) for name in (decision.source, decision.target))
         if here is None or there is None:
             return
-        frame, cells = self._survey.ground
+        frame, cells = self._map_tracker.ground
         walls = walls_between(cells, *frame.uv(*here), *frame.uv(*there))
-        range_m = self._faults.reach_m(now_ns, verdict.source, verdict.target)
+        range_m = self._faults.reach_m(now_ns, decision.source, decision.target)
         hidden = self._radio.line_of_sight and walls > 0
         if hidden or not math.dist(here, there) <= range_m - walls * self._radio.wall_loss_m:
-            heard = f"{verdict.source}#{verdict.sequence}"
-            self._complain("sight", verdict.target, f"hears {heard} through {walls} walls")
+            heard = f"{decision.source}#{decision.sequence}"
+            self._complain("sight", decision.target, f"hears {heard} through {walls} walls")
 
-    def _check_way(self, act: StepRecord) -> None:
-        assert act.ruling is not None
-        before, now = self._poses_m[act.name], (act.ruling.pose.x_m, act.ruling.pose.y_m)
+    def _check_way(self, step_record: StepRecord) -> None:
+        assert step_record.verdict is not None
+        before, now = (
+            self._poses_m[step_record.name],
+            (step_record.verdict.pose.x_m, step_record.verdict.pose.y_m),
+        )
         if now == before:
             return
-        self._poses_m[act.name] = self._senders_m[act.name] = now
-        frame, cells = self._survey.ground
-        if not self._is_free(act.name):
-            self._complain("wall", act.name, f"stands at {now[0]:.6g}, {now[1]:.6g} m in a wall")
+        self._poses_m[step_record.name] = self._senders_m[step_record.name] = now
+        frame, cells = self._map_tracker.ground
+        if not self._is_free(step_record.name):
+            self._complain(
+                "wall", step_record.name, f"stands at {now[0]:.6g}, {now[1]:.6g} m in a wall"
+            )
         elif free_way(cells, FREE, *frame.uv(*before), *frame.uv(*now)) < 1.0:
-            self._complain("wall", act.name, f"went to {now[0]:.6g}, {now[1]:.6g} m through a wall")
+            self._complain(
+                "wall", step_record.name, f"went to {now[0]:.6g}, {now[1]:.6g} m through a wall"
+            )
 
     def _is_free(self, name: ParticipantId) -> bool:
         """Whether a robot is in a free cell now."""
-        cell = self._survey.cell_of(self._survey.places[name])
-        return bool(cell != NOWHERE and self._survey.ground.cells.flat[cell] == FREE)
+        cell = self._map_tracker.cell_of(self._map_tracker.places[name])
+        return bool(cell != NOWHERE and self._map_tracker.ground.cells.flat[cell] == FREE)
 
-    def _check_finish(self, act: StepRecord) -> None:
-        assert act.outputs is not None
-        if act.outputs.state is not State.FINISHED or act.name in self._finished:
+    def _check_finish(self, step_record: StepRecord) -> None:
+        assert step_record.outputs is not None
+        if step_record.outputs.state is not State.FINISHED or step_record.name in self._finished:
             return
-        self._finished.add(act.name)
-        cell = self._survey.reachable(act.name) if self._exact else NEVER
+        self._finished.add(step_record.name)
+        cell = self._map_tracker.reachable(step_record.name) if self._exact else NEVER
         if cell != NEVER:
-            self._complain("finish", act.name, f"could go to the frontier in cell {cell}")
+            self._complain("finish", step_record.name, f"could go to the frontier in cell {cell}")

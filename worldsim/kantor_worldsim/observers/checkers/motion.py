@@ -28,65 +28,71 @@ from kantor_worldsim.world.world import SPEED_TOLERANCE
 
 
 @kernel
-def check_incarnation(state: CheckerState, law: Limits, reading: ColumnarBatch, row: int) -> None:
+def check_incarnation(
+    state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int
+) -> None:
     """Whether it can act at all, and by what clock."""
-    act = reading.acts[row]
-    stopped_ns = state.book[act[of.PLACE], STOPPED_NS]
-    if stopped_ns != NOT and (law.virtual or act[of.NOW_NS] > stopped_ns + law.patience_ns):
+    step_record = columns.step_records[row]
+    stopped_ns = state.book[step_record[of.PLACE], STOPPED_NS]
+    if stopped_ns != NOT and (
+        limits.virtual or step_record[of.NOW_NS] > stopped_ns + limits.patience_ns
+    ):
         note_violation(state, STOPPED, row, 0, 0, 0, stopped_ns * 1e-9, 0.0)
-    if act[of.SKEW_NS] != 0 and not law.clocks:
-        note_violation(state, SKEW, row, 0, act[of.SKEW_NS], 0, 0.0, 0.0)
+    if step_record[of.SKEW_NS] != 0 and not limits.clocks:
+        note_violation(state, SKEW, row, 0, step_record[of.SKEW_NS], 0, 0.0, 0.0)
 
 
 @kernel
-def check_verdict(state: CheckerState, law: Limits, reading: ColumnarBatch, row: int) -> None:
+def check_verdict(state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int) -> None:
     """Who is too fast since its clock has gained on time cannot know, and is not to blame."""
-    act = reading.acts[row]
-    book = state.book[act[of.PLACE]]
-    excused = law.clocks and act[of.SKEW_NS] > book[SKEW_BEFORE_NS]
-    book[SKEW_BEFORE_NS] = act[of.SKEW_NS]
-    for item in range(act[of.VIOLATIONS]):
-        if not (excused and item + 1 == act[of.TOO_FAST]):
+    step_record = columns.step_records[row]
+    book = state.book[step_record[of.PLACE]]
+    excused = limits.clocks and step_record[of.SKEW_NS] > book[SKEW_BEFORE_NS]
+    book[SKEW_BEFORE_NS] = step_record[of.SKEW_NS]
+    for item in range(step_record[of.VIOLATIONS]):
+        if not (excused and item + 1 == step_record[of.TOO_FAST]):
             note_violation(state, REFUSED, row, item, 0, 0, 0.0, 0.0)
 
 
 @kernel
-def check_order(state: CheckerState, reading: ColumnarBatch, row: int) -> None:
+def check_order(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
     """Steps are numbered without gaps, and made with the newest observation."""
-    act = reading.acts[row]
-    book = state.book[act[of.PLACE]]
-    if act[of.STEP] != book[STEPS] + 1:
-        note_violation(state, STEP, row, 0, act[of.STEP], book[STEPS] + 1, 0.0, 0.0)
-    elif act[of.OBSERVED] != book[STEPS]:
-        note_violation(state, STALE, row, 0, act[of.STEP], act[of.OBSERVED], 0.0, 0.0)
-    book[STEPS] = act[of.STEP]
+    step_record = columns.step_records[row]
+    book = state.book[step_record[of.PLACE]]
+    if step_record[of.STEP] != book[STEPS] + 1:
+        note_violation(state, STEP, row, 0, step_record[of.STEP], book[STEPS] + 1, 0.0, 0.0)
+    elif step_record[of.OBSERVED] != book[STEPS]:
+        note_violation(
+            state, STALE, row, 0, step_record[of.STEP], step_record[of.OBSERVED], 0.0, 0.0
+        )
+    book[STEPS] = step_record[of.STEP]
 
 
 @kernel
-def check_refusals(state: CheckerState, reading: ColumnarBatch, row: int) -> None:
+def check_refusals(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
     """It refuses what is forged, and nothing else."""
-    act = reading.acts[row]
-    book = state.book[act[of.PLACE]]
+    step_record = columns.step_records[row]
+    book = state.book[step_record[of.PLACE]]
     forged = 0
-    for item in range(act[of.HEARD], act[of.HEARD] + act[of.HEARD_COUNT]):
-        forged += reading.heard[item, of.SEQUENCE] >= FORGED_FIRST
-    refused = act[of.REFUSED] - book[REFUSALS_SO_FAR]
+    for item in range(step_record[of.HEARD], step_record[of.HEARD] + step_record[of.HEARD_COUNT]):
+        forged += columns.heard[item, of.SEQUENCE] >= FORGED_FIRST
+    refused = step_record[of.REFUSED] - book[REFUSALS_SO_FAR]
     if refused != forged:
         note_violation(state, REFUSALS, row, 0, refused, forged, 0.0, 0.0)
-    book[REFUSALS_SO_FAR] = act[of.REFUSED]
+    book[REFUSALS_SO_FAR] = step_record[of.REFUSED]
 
 
 @kernel
-def check_speed(state: CheckerState, law: Limits, reading: ColumnarBatch, row: int) -> None:
+def check_speed(state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int) -> None:
     """A participant moves no farther than its speed allows since its last step."""
-    act = reading.acts[row]
-    who = act[of.PLACE]
-    elapsed_ns = act[of.NOW_NS] - state.book[who, MOVED_NS]
-    limit_m_s = 0.0 if who == law.supervisor else law.speed_m_s
+    step_record = columns.step_records[row]
+    who = step_record[of.PLACE]
+    elapsed_ns = step_record[of.NOW_NS] - state.book[who, MOVED_NS]
+    limit_m_s = 0.0 if who == limits.supervisor else limits.speed_m_s
     limit_m = limit_m_s * elapsed_ns * 1e-9 * (1.0 + 2.0 * SPEED_TOLERANCE)
-    x_m, y_m = reading.poses_m[row, 0], reading.poses_m[row, 1]
+    x_m, y_m = columns.poses_m[row, 0], columns.poses_m[row, 1]
     way_m = math.hypot(x_m - state.poses_m[who, 0], y_m - state.poses_m[who, 1])
     if not way_m <= limit_m:
         note_violation(state, SPEED, row, 0, 0, 0, way_m, limit_m)
-    state.book[who, MOVED_NS] = act[of.NOW_NS]
+    state.book[who, MOVED_NS] = step_record[of.NOW_NS]
     state.poses_m[who, 0], state.poses_m[who, 1] = x_m, y_m

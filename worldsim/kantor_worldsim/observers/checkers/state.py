@@ -149,7 +149,7 @@ class CheckerState(NamedTuple):
     the turn that is open."""
     forged: npt.NDArray[np.int64]
     """(1, rows, 3): source, sequence, target of what faults have put on the air."""
-    have: npt.NDArray[np.int64]
+    version_vector: npt.NDArray[np.int64]
     """(n, slots) log lengths that each said last it holds."""
     faults: npt.NDArray[np.int64]
     """(rows, 5): fault, act or verdict, item of it, two numbers."""
@@ -201,21 +201,21 @@ def note_violation(
 
 
 @kernel
-def missing_capacity(state: CheckerState, reading: ColumnarBatch) -> int:
+def missing_capacity(state: CheckerState, columns: ColumnarBatch) -> int:
     """Which array has no room for this batch behind what is held of somebody, or 0."""
     book = state.book
     book[:, _COMING : KEYFRAME + 1] = 0
-    for row in range(reading.sizes[of.ACTS]):
-        act = reading.acts[row]
-        if act[of.PLACE] >= 0 and act[of.PRESENT]:
-            book[act[of.PLACE], _COMING] += max(0, act[of.SPENT_COUNT])
-    for row in range(reading.sizes[of.ALL_SENT]):
-        if reading.sent[row, of.SOURCE] >= 0:
-            book[reading.sent[row, of.SOURCE], _COMING + 1] += 1
-    for row in range(reading.sizes[of.VERDICTS]):
-        if reading.verdicts[row, of.TARGET] >= 0:
-            book[reading.verdicts[row, of.TARGET], _COMING + 2] += 1
-    if state.found[FORGED] + reading.sizes[of.INJECTED] > state.forged.shape[1]:
+    for row in range(columns.sizes[of.ACTS]):
+        step_record = columns.step_records[row]
+        if step_record[of.PLACE] >= 0 and step_record[of.PRESENT]:
+            book[step_record[of.PLACE], _COMING] += max(0, step_record[of.SPENT_COUNT])
+    for row in range(columns.sizes[of.ALL_SENT]):
+        if columns.sent[row, of.SOURCE] >= 0:
+            book[columns.sent[row, of.SOURCE], _COMING + 1] += 1
+    for row in range(columns.sizes[of.VERDICTS]):
+        if columns.decisions[row, of.TARGET] >= 0:
+            book[columns.decisions[row, of.TARGET], _COMING + 2] += 1
+    if state.found[FORGED] + columns.sizes[of.INJECTED] > state.forged.shape[1]:
         return _NO_FORGED
     for who in range(book.shape[0]):
         if state.shipped[book[who, SLOT], ENTRIES] + book[who, _COMING] > state.logs.shape[1]:

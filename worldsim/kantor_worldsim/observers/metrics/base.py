@@ -62,23 +62,23 @@ class Snapshot(NamedTuple):
 class RunMetrics:
     """Follows the records of one run: what is the same whatever is explored.
 
-    A kind of mission adds what it measures: `_begin`, `_attend`, `_row`, `_glimpse` and `_measured`.
+    A kind of mission adds what it measures: `_begin`, `_attend`, `_row`, `_snapshot_of` and `_measured`.
     """
 
     columns: ClassVar[tuple[str, ...]]
     """The names in a row."""
 
-    def __init__(self, reader: ColumnarDecoder | None = None) -> None:
+    def __init__(self, decoder: ColumnarDecoder | None = None) -> None:
         """reader: the one that another referee of the same run reads by."""
         self.rows: list[Any] = []
         self.finds: list[tuple[float, ParticipantId, int, float, float]] = []
         """(time, robot, target, x, y), world frame."""
-        self._reader = reader or ColumnarDecoder()
+        self._decoder = decoder or ColumnarDecoder()
         self._opening: Opening | None = None
         self._every = 1
         """Periods from one row to the next."""
 
-    def take(self, record: Record) -> None:
+    def observe(self, record: Record) -> None:
         """Follow one record."""
         if isinstance(record, Opening):
             self._open(record)
@@ -91,7 +91,7 @@ class RunMetrics:
             self._row(last=True)
 
     def _open(self, opening: Opening) -> None:
-        self._reader.read(opening)
+        self._decoder.read(opening)
         scenario, site = opening.scenario, opening.site
         self._opening, self._scenario, self._units = opening, scenario, opening.units
         self._period_ns = scenario.period_ns
@@ -142,15 +142,15 @@ class RunMetrics:
         self._walk.advance(batch.now_ns)
         self._out_of_range += batch.out_of_range
         self._absences += len(batch.absent)
-        for toll in batch.tolls:
+        for stats in batch.fault_stats:
             for deed in LINK_COUNTERS:
-                self._tolls[toll.fault, deed] += getattr(toll, deed)
+                self._tolls[stats.fault, deed] += getattr(stats, deed)
         if self._started_ns:
             self._note_rejoining(batch)
-        reading = self._reader.read(batch)
-        if follow(*reading, *self._arguments):
+        columns = self._decoder.read(batch)
+        if follow(*columns, *self._arguments):
             self._note_finds(batch)
-        self._attend(batch, reading)
+        self._attend(batch, columns)
 
     def _befall(self, incident: ProcessEvent) -> None:
         """Follow what befell a process."""
@@ -170,16 +170,16 @@ class RunMetrics:
         name = incident.who
         if name in self._gone:
             self._started_ns[name] = incident.now_ns
-        if incident.epoch <= self._epochs[name]:
+        if incident.incarnation <= self._epochs[name]:
             return
-        self._epochs[name] = incident.epoch
+        self._epochs[name] = incident.incarnation
         place = self._scenario.roster.index(name)
         begin_anew(*self._tally, place, self._units.sample)
 
     def _note_rejoining(self, batch: Batch) -> None:
-        for act in batch.acts:
-            if act.outputs is not None and act.name in self._started_ns:
-                started_ns = self._started_ns.pop(act.name)
+        for step_record in batch.step_records:
+            if step_record.outputs is not None and step_record.name in self._started_ns:
+                started_ns = self._started_ns.pop(step_record.name)
                 self._rejoined_ns.append(max(0, batch.now_ns - started_ns))
 
     @property
@@ -198,25 +198,26 @@ class RunMetrics:
         return self._tally.counts.item(DROPS)
 
     def _note_finds(self, batch: Batch) -> None:
-        for act in batch.acts:
-            if act.ruling is not None and act.outputs is not None:
-                time_s = act.now_ns * 1e-9
+        for step_record in batch.step_records:
+            if step_record.verdict is not None and step_record.outputs is not None:
+                time_s = step_record.now_ns * 1e-9
                 self.finds += [
-                    (time_s, act.name, target, x, y) for target, x, y in act.ruling.found
+                    (time_s, step_record.name, target, x, y)
+                    for target, x, y in step_record.verdict.found
                 ]
 
     def _begin(self, opening: Opening) -> None:
         """Prepare for the run, before its first row."""
         raise NotImplementedError
 
-    def _attend(self, batch: Batch, reading: tuple[Any, ...]) -> None:
+    def _attend(self, batch: Batch, columns: tuple[Any, ...]) -> None:
         """Follow a batch that has been counted. reading: a Reading as arguments of a kernel."""
 
     def _row(self, *, last: bool = False) -> None:
         """Measure."""
         raise NotImplementedError
 
-    def _glimpse(self) -> dict[str, Any]:
+    def _snapshot_of(self) -> dict[str, Any]:
         """By the last row: `w_ub`, `mass_left` and what else there is in a Glance."""
         raise NotImplementedError
 
@@ -224,7 +225,7 @@ class RunMetrics:
         """What a Result has beside the counts."""
         raise NotImplementedError
 
-    def glance(self) -> Snapshot:
+    def snapshot(self) -> Snapshot:
         """How the run stands, by the last row."""
         if not self.rows:
             return Snapshot(0, 0, 0, 0, 0.0, 0, 0.0, 0, 1.0)
@@ -240,7 +241,7 @@ class RunMetrics:
             links=last.links,
             messages_per_s=rate,
             robots_done=int(self._tally.standing[:, 1].sum()),
-            **self._glimpse(),
+            **self._snapshot_of(),
         )
 
     def result(

@@ -161,13 +161,13 @@ class DensityMetrics(RunMetrics):
     rows: list[DensityRow]
 
     def __init__(
-        self, exact_every: int | None = None, reader: ColumnarDecoder | None = None
+        self, exact_every: int | None = None, decoder: ColumnarDecoder | None = None
     ) -> None:
         """exact_every: periods from one exact distance to the next; 0: at the end only; None: never.
 
-        reader: the one that another referee of the same run reads by.
+        decoder: the one that another referee of the same run reads by.
         """
-        super().__init__(reader)
+        super().__init__(decoder)
         self._exact_every = exact_every
 
     def _begin(self, opening: Opening) -> None:
@@ -191,17 +191,23 @@ class DensityMetrics(RunMetrics):
         self._auction = Auction(robots, samples, self._every)
         self._points: list[tuple[float, float, int]] = []
 
-    def _attend(self, _batch: Batch, reading: tuple[Any, ...]) -> None:
+    def _attend(self, _batch: Batch, columns: tuple[Any, ...]) -> None:
         if self._exact_every is not None:
-            self._note_points(of.ColumnarBatch(*reading))
+            self._note_points(of.ColumnarBatch(*columns))
 
-    def _note_points(self, reading: of.ColumnarBatch) -> None:
+    def _note_points(self, columns: of.ColumnarBatch) -> None:
         """Where a point was shipped, and how many units."""
-        for row in range(reading.sizes[of.ACTS]):
-            act = reading.acts[row]
-            if act[of.PLACE] >= 0 and act[of.SPENT_COUNT] > 0 and not act[of.VOID]:
-                shipped = reading.pairs[act[of.SPENT] : act[of.SPENT] + act[of.SPENT_COUNT]]
-                x, y = reading.poses_m[row, :2].tolist()
+        for row in range(columns.sizes[of.ACTS]):
+            step_record = columns.step_records[row]
+            if (
+                step_record[of.PLACE] >= 0
+                and step_record[of.SPENT_COUNT] > 0
+                and not step_record[of.VOID]
+            ):
+                shipped = columns.pairs[
+                    step_record[of.SPENT] : step_record[of.SPENT] + step_record[of.SPENT_COUNT]
+                ]
+                x, y = columns.poses_m[row, :2].tolist()
                 self._points.append((x, y, int(shipped[:, of.UNITS].sum())))
 
     def _row(self, *, last: bool = False) -> None:
@@ -260,7 +266,7 @@ class DensityMetrics(RunMetrics):
             np.ones(samples_m.shape[0]),
         )
 
-    def _glimpse(self) -> dict[str, Any]:
+    def _snapshot_of(self) -> dict[str, Any]:
         return {"w_ub": self.rows[-1].w_ub_paper, "mass_left": self.rows[-1].mass_left}
 
     def _measured(self) -> dict[str, Any]:

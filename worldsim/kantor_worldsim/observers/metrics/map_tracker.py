@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.grid import NOWHERE
-from kantor_protocol.base.incarnations import EPOCHS_MAX
+from kantor_protocol.base.incarnations import INCARNATIONS_MAX
 from kantor_protocol.base.machine import Observation, ParticipantId, Pose
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
 from kantor_protocol.wire.messages import RefusedError
@@ -53,12 +53,12 @@ class MapTracker:
     Whoever wants to know how things stood before a record asks before anybody hands it on.
     """
 
-    def __init__(self, reader: ColumnarDecoder | None = None) -> None:
+    def __init__(self, decoder: ColumnarDecoder | None = None) -> None:
         """reader: the one that another referee of the same run reads by."""
-        self._reader = reader or ColumnarDecoder()
+        self._decoder = decoder or ColumnarDecoder()
         self._record: Record | None = None
 
-    def take(self, record: Record) -> None:
+    def observe(self, record: Record) -> None:
         """Follow one record. The first must be an opening with a true map; raises RefusedError."""
         if record is self._record:
             return
@@ -71,7 +71,7 @@ class MapTracker:
             self._take_over(record)
 
     def _open(self, opening: Opening) -> None:
-        self._reader.read(opening)
+        self._decoder.read(opening)
         scenario, site = opening.scenario, opening.site
         if site.ground is None:
             raise RefusedError("a mission on a map, and no map in its opening")
@@ -83,13 +83,13 @@ class MapTracker:
         self.tick = 0
         robots, cells, everybody = scenario.robots.count, self.frame.cells, len(scenario.roster)
         assert entries(self.frame) < 2**31
-        self.books = MapTrackerState(
+        self.state = MapTrackerState(
             first_tick=np.full(cells, NEVER, dtype=np.int32),
             frontier=np.zeros(cells, dtype=np.bool_),
             held=np.zeros((robots, cells), dtype=np.uint8),
             made=np.zeros((everybody, 4096), dtype=np.int32),
             told=np.zeros((everybody, 4096), dtype=np.int32),
-            have=np.zeros((everybody, everybody), dtype=np.int64),
+            version_vector=np.zeros((everybody, everybody), dtype=np.int64),
             folded=np.zeros((robots, everybody), dtype=np.int64),
             written=np.zeros((everybody, 4), dtype=np.int64),
             slots=np.arange(everybody),
@@ -98,12 +98,12 @@ class MapTracker:
             union=np.zeros(4, dtype=np.int64),
             faults=np.zeros((FAULTS_MAX, 5), dtype=np.int64),
         )
-        self._land = GroundTruth(
+        self._ground = GroundTruth(
             np.ascontiguousarray(self.ground.cells),
             self.observable.ravel(),
             scenario.sensor.noise_m == 0.0,
         )
-        self._arguments = (*self.books, *self._land)
+        self._arguments = (*self.state, *self._ground)
         self.poses_m: list[tuple[float, float]] = [(x, y) for x, y in site.starts_m.tolist()]
         """Where the robots are, world frame."""
         self.ways_m = [0.0] * robots
@@ -130,34 +130,34 @@ class MapTracker:
     @property
     def seen(self) -> int:
         """Cells that anybody has seen."""
-        return self.books.union.item(SEEN)
+        return self.state.union.item(SEEN)
 
     @property
     def stamps(self) -> npt.NDArray[np.int32]:
         """(seen,) the ticks at which the cells that count were first seen."""
-        ticks = self.books.first_tick[self._land.counting]
+        ticks = self.state.first_tick[self._ground.counting]
         return np.asarray(ticks[ticks >= 0])
 
     @property
     def own_cells(self) -> npt.NDArray[np.int64]:
         """(n,) how many cells each robot has seen itself; a view."""
-        return self.books.counts[:, OWN_CELLS]
+        return self.state.counts[:, OWN_CELLS]
 
     @property
     def held_cells(self) -> npt.NDArray[np.int64]:
         """(n,) how many cells each robot knows; a view."""
-        return self.books.counts[:, HELD_CELLS]
+        return self.state.counts[:, HELD_CELLS]
 
     @property
     def log_bytes(self) -> int:
         """Of logs in all that robots have sent."""
-        return self.books.union.item(LOG_BYTES)
+        return self.state.union.item(LOG_BYTES)
 
     @property
     def faults(self) -> tuple[npt.NDArray[np.int64], int]:
         """Of the last batch, as in Books, and how many there are."""
-        count = self.books.union.item(FAULTS)
-        return self.books.faults[: min(count, FAULTS_MAX)], count
+        count = self.state.union.item(FAULTS)
+        return self.state.faults[: min(count, FAULTS_MAX)], count
 
     def cell_of(self, place: int) -> int:
         """The cell in which a robot is, or NOWHERE."""
@@ -169,13 +169,16 @@ class MapTracker:
 
         Frontiers that it may have called none in entries that it has not sent yet do not count.
         """
-        place, books = self.places[name], self.books
+        place, state = self.places[name], self.state
         start = self.cell_of(place)
         if start == NOWHERE:
             return NEVER
-        held = books.held[place]
-        slot = books.slots[place]
-        untold = books.have[place, slot] > books.written[slot, MADE] + books.written[slot, VOIDS]
+        held = state.held[place]
+        slot = state.slots[place]
+        untold = (
+            state.version_vector[place, slot]
+            > state.written[slot, MADE] + state.written[slot, VOIDS]
+        )
         while True:
             cell = int(find_way(held, start, self.frame.columns, self._queue))
             if cell == NEVER or not untold or not self._is_near(place, cell):
@@ -183,7 +186,7 @@ class MapTracker:
             held[cell] |= VOID
 
     def _is_near(self, place: int, cell: int) -> bool:
-        stood = self.books.stood[place, : self.books.counts[place, STOOD]]
+        stood = self.state.stood[place, : self.state.counts[place, STOOD]]
         row, column = divmod(cell, self.frame.columns)
         apart = np.maximum(
             abs(stood // self.frame.columns - row), abs(stood % self.frame.columns - column)
@@ -191,24 +194,26 @@ class MapTracker:
         return bool((apart <= VOID_CELLS).any())
 
     def _follow(self, batch: Batch) -> None:
-        self.books.union[FAULTS] = 0
+        self.state.union[FAULTS] = 0
         self.tick = batch.now_ns // self._period_ns
-        reading = ColumnarBatch(*self._reader.read(batch))
+        columns = ColumnarBatch(*self._decoder.read(batch))
         acted = [
-            (row, self.places[act.name], act)
-            for row, act in enumerate(batch.acts)
-            if act.name in self.places and act.outputs is not None and act.ruling is not None
+            (row, self.places[step_record.name], step_record)
+            for row, step_record in enumerate(batch.step_records)
+            if step_record.name in self.places
+            and step_record.outputs is not None
+            and step_record.verdict is not None
         ]
-        for row, place, act in acted:
-            self._look(place, act.observation, row)
-        acts = reading.acts[: reading.sizes[of.ACTS]]
-        self._reserve("told", "written", TOLD, int(acts[:, of.BODY_BYTES].max(initial=0)))
-        follow(*reading, *self._arguments)
-        for _, place, act in acted:
-            assert act.ruling is not None
-            assert act.outputs is not None
-            self._move(place, act.ruling)
-            self._strive(place, act.outputs.goal)
+        for row, place, step_record in acted:
+            self._look(place, step_record.observation, row)
+        step_records = columns.step_records[: columns.sizes[of.ACTS]]
+        self._reserve("told", "written", TOLD, int(step_records[:, of.BODY_BYTES].max(initial=0)))
+        follow(*columns, *self._arguments)
+        for _, place, step_record in acted:
+            assert step_record.verdict is not None
+            assert step_record.outputs is not None
+            self._move(place, step_record.verdict)
+            self._strive(place, step_record.outputs.goal)
         self._note_moments()
 
     def _new_evidence(self) -> OccupancyLog:
@@ -221,33 +226,33 @@ class MapTracker:
         if incident.who not in names:
             return
         who, roster = names.index(incident.who), len(names)
-        slot = incident.epoch * roster + who
-        if not self.books.slots[who] < slot <= EPOCHS_MAX * roster + who:
+        slot = incident.incarnation * roster + who
+        if not self.state.slots[who] < slot <= INCARNATIONS_MAX * roster + who:
             return
-        while slot >= self.books.have.shape[1]:
+        while slot >= self.state.version_vector.shape[1]:
             self._add_slots(roster)
-        books = self.books
-        books.slots[who] = slot
-        books.have[who] = 0
-        if who < books.held.shape[0]:
-            books.held[who] &= OWN  # a body counts a cell once
-            books.folded[who] = 0
-            books.counts[who, [HELD_CELLS, STOOD]] = 0
+        state = self.state
+        state.slots[who] = slot
+        state.version_vector[who] = 0
+        if who < state.held.shape[0]:
+            state.held[who] &= OWN  # a body counts a cell once
+            state.folded[who] = 0
+            state.counts[who, [HELD_CELLS, STOOD]] = 0
             self._evidence[who] = self._new_evidence()
             self._looked[who], self._strived[who] = (NEVER, None), (None, 0)
             self._stand(who, self.cell_of(who))
 
     def _add_slots(self, more: int) -> None:
         """Room for another incarnation of everybody."""
-        books = self.books
-        self.books = books._replace(
-            made=np.pad(books.made, ((0, more), (0, 0))),
-            told=np.pad(books.told, ((0, more), (0, 0))),
-            written=np.pad(books.written, ((0, more), (0, 0))),
-            have=np.pad(books.have, ((0, 0), (0, more))),
-            folded=np.pad(books.folded, ((0, 0), (0, more))),
+        state = self.state
+        self.state = state._replace(
+            made=np.pad(state.made, ((0, more), (0, 0))),
+            told=np.pad(state.told, ((0, more), (0, 0))),
+            written=np.pad(state.written, ((0, more), (0, 0))),
+            version_vector=np.pad(state.version_vector, ((0, 0), (0, more))),
+            folded=np.pad(state.folded, ((0, 0), (0, more))),
         )
-        self._arguments = (*self.books, *self._land)
+        self._arguments = (*self.state, *self._ground)
 
     def _look(self, place: int, observation: Observation, row: int) -> None:
         """A robot takes in each new scan once; it learns of ranges when it has moved."""
@@ -256,15 +261,15 @@ class MapTracker:
             return
         pose = observation.pose
         self._looked[place] = observation.step, pose
-        news = self._evidence[place].take(observation.scan, pose, moved=pose != before)
+        news = self._evidence[place].observe(observation.scan, pose, moved=pose != before)
         if news.shape[0]:
             self._reserve("made", "written", MADE, news.shape[0])
             look(*self._arguments, news, place, row, self.tick)
 
-    def _move(self, place: int, ruling: StepVerdict) -> None:
+    def _move(self, place: int, verdict: StepVerdict) -> None:
         x_m, y_m = self.poses_m[place]
-        pose = ruling.pose
-        if ruling.bumped:
+        pose = verdict.pose
+        if verdict.bumped:
             self.bumps.append((pose.x_m, pose.y_m))
         if (pose.x_m, pose.y_m) != (x_m, y_m):
             self.ways_m[place] += math.hypot(pose.x_m - x_m, pose.y_m - y_m)
@@ -283,28 +288,28 @@ class MapTracker:
 
     def _stand(self, place: int, cell: int) -> None:
         """Note the cell in which a robot is."""
-        count = self.books.counts.item(place, STOOD)
-        if count and self.books.stood.item(place, count - 1) == cell:
+        count = self.state.counts.item(place, STOOD)
+        if count and self.state.stood.item(place, count - 1) == cell:
             return
         self._reserve("stood", "counts", STOOD, 1)
-        self.books.stood[place, count] = cell
-        self.books.counts[place, STOOD] += 1
+        self.state.stood[place, count] = cell
+        self.state.counts[place, STOOD] += 1
 
     def _reserve(self, name: str, counted: str, column: int, more: int) -> None:
         """Room for so many more entries in one of the arrays that grow with the run."""
-        rows = getattr(self.books, name)
-        needed = int(getattr(self.books, counted)[:, column].max()) + more
+        rows = getattr(self.state, name)
+        needed = int(getattr(self.state, counted)[:, column].max()) + more
         if needed <= rows.shape[1]:
             return
         longer = np.zeros((rows.shape[0], 2 * needed), dtype=rows.dtype)
         longer[:, : rows.shape[1]] = rows
-        self.books = self.books._replace(**{name: longer})
-        self._arguments = (*self.books, *self._land)
+        self.state = self.state._replace(**{name: longer})
+        self._arguments = (*self.state, *self._ground)
 
     def _note_moments(self) -> None:
         """When the union was complete, and when nearly everything was known to somebody, to everybody."""
         seen, total, tick = self.seen, self.total, self.tick
-        if self.completed_tick is None and seen and not self.books.union[FRONTIERS]:
+        if self.completed_tick is None and seen and not self.state.union[FRONTIERS]:
             self.completed_tick = tick
         if self.t95_tick is None and 100 * seen >= 95 * total:
             self.t95_tick = tick

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from kantor_protocol.base.grid import FREE
 from kantor_protocol.base.kernels import kernel
-from kantor_protocol.base.varint import take_int, take_uint
+from kantor_protocol.base.varint import read_int, read_uint
 from kantor_protocol.replication.replica_kernels import LENGTH_MAX
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch
@@ -59,7 +59,7 @@ class MapTrackerState(NamedTuple):
     """(slots, rows) the entries that each robot's scans gave."""
     told: npt.NDArray[np.int32]
     """(slots, rows) its log as it sends it: the same, and frontiers that are none."""
-    have: npt.NDArray[np.int64]
+    version_vector: npt.NDArray[np.int64]
     """(p, slots) the version vector that each has sent last."""
     folded: npt.NDArray[np.int64]
     """(n, slots) entries of others' logs that are in `held`."""
@@ -90,11 +90,11 @@ class GroundTruth(NamedTuple):
 
 
 @kernel
-def _note(books: MapTrackerState, fault: int, row: int, item: int, a: int, b: int) -> None:
-    at = books.union[FAULTS]
-    books.union[FAULTS] += 1
-    if at < books.faults.shape[0]:
-        noted = books.faults[at]
+def _note(state: MapTrackerState, fault: int, row: int, item: int, a: int, b: int) -> None:
+    at = state.union[FAULTS]
+    state.union[FAULTS] += 1
+    if at < state.faults.shape[0]:
+        noted = state.faults[at]
         noted[0], noted[1], noted[2], noted[3], noted[4] = fault, row, item, a, b
 
 
@@ -111,51 +111,51 @@ def is_frontier(known: np.ndarray, mask: int, cell: int, columns: int) -> bool:
 
 
 @kernel
-def _renew(books: MapTrackerState, land: GroundTruth, cell: int) -> None:
+def _renew(state: MapTrackerState, ground: GroundTruth, cell: int) -> None:
     """Whether a cell is a frontier of what anybody has seen."""
-    rows, columns = land.truth.shape
-    first, column = books.first_tick, cell % columns
+    rows, columns = ground.truth.shape
+    first, column = state.first_tick, cell % columns
     now = False
-    if first[cell] >= 0 and land.counting[cell] and land.truth[cell // columns, column] == FREE:
+    if first[cell] >= 0 and ground.counting[cell] and ground.truth[cell // columns, column] == FREE:
         now = bool(
             (column > 0 and first[cell - 1] < 0)
             or (column + 1 < columns and first[cell + 1] < 0)
             or (cell >= columns and first[cell - columns] < 0)
             or (cell + columns < rows * columns and first[cell + columns] < 0)
         )
-    books.union[FRONTIERS] += int(now) - int(books.frontier[cell])
-    books.frontier[cell] = now
+    state.union[FRONTIERS] += int(now) - int(state.frontier[cell])
+    state.frontier[cell] = now
 
 
 @kernel
-def _stamp(books: MapTrackerState, land: GroundTruth, cell: int, tick: int) -> None:
+def _stamp(state: MapTrackerState, ground: GroundTruth, cell: int, tick: int) -> None:
     """Somebody sees a cell for the first time."""
-    columns = land.truth.shape[1]
-    books.first_tick[cell] = tick
-    books.union[SEEN] += land.counting[cell]
-    _renew(books, land, cell)
+    columns = ground.truth.shape[1]
+    state.first_tick[cell] = tick
+    state.union[SEEN] += ground.counting[cell]
+    _renew(state, ground, cell)
     if cell % columns > 0:
-        _renew(books, land, cell - 1)
+        _renew(state, ground, cell - 1)
     if cell % columns + 1 < columns:
-        _renew(books, land, cell + 1)
+        _renew(state, ground, cell + 1)
     if cell >= columns:
-        _renew(books, land, cell - columns)
-    if cell + columns < books.first_tick.shape[0]:
-        _renew(books, land, cell + columns)
+        _renew(state, ground, cell - columns)
+    if cell + columns < state.first_tick.shape[0]:
+        _renew(state, ground, cell + columns)
 
 
 @kernel
-def _hold(books: MapTrackerState, land: GroundTruth, who: int, entry: int) -> None:
+def _hold(state: MapTrackerState, ground: GroundTruth, who: int, entry: int) -> None:
     """A robot learns an entry, its own or another's."""
-    cells = books.first_tick.shape[0]
-    held = books.held[who]
+    cells = state.first_tick.shape[0]
+    held = state.held[who]
     if entry >= 3 * cells:
         return
     if entry >= 2 * cells:
         held[entry - 2 * cells] |= VOID
         return
     cell = entry >> 1
-    books.counts[who, HELD_CELLS] += held[cell] & KIND == 0 and land.counting[cell]
+    state.counts[who, HELD_CELLS] += held[cell] & KIND == 0 and ground.counting[cell]
     held[cell] = (held[cell] & (VOID | OWN)) | (FREE + (entry & 1))
 
 
@@ -166,7 +166,7 @@ def look(
     held: np.ndarray,
     made: np.ndarray,
     told: np.ndarray,
-    have: np.ndarray,
+    version_vector: np.ndarray,
     folded: np.ndarray,
     written: np.ndarray,
     slots: np.ndarray,
@@ -183,13 +183,13 @@ def look(
     tick: int,
 ) -> None:
     """A robot takes in what a scan says. news: (k,) entries; `made` has room for them."""
-    books = MapTrackerState(
+    state = MapTrackerState(
         first_tick,
         frontier,
         held,
         made,
         told,
-        have,
+        version_vector,
         folded,
         written,
         slots,
@@ -198,44 +198,44 @@ def look(
         union,
         faults,
     )
-    land = GroundTruth(truth, counting, exact)
+    ground = GroundTruth(truth, counting, exact)
     cells, columns = first_tick.shape[0], truth.shape[1]
     for i in range(news.shape[0]):
         entry = news[i]
         made[slots[who], written[slots[who], MADE]] = entry
         written[slots[who], MADE] += 1
-        _hold(books, land, who, entry)
+        _hold(state, ground, who, entry)
         if entry >= 2 * cells:
             continue
         cell = entry >> 1
         if exact and (truth[cell // columns, cell % columns] == FREE) != (entry & 1 == 0):
-            _note(books, FALSE_CELL, row, 0, cell, entry & 1)
+            _note(state, FALSE_CELL, row, 0, cell, entry & 1)
         counts[who, OWN_CELLS] += held[who, cell] & OWN == 0 and counting[cell]
         held[who, cell] |= OWN
         if first_tick[cell] < 0:
-            _stamp(books, land, cell, tick)
+            _stamp(state, ground, cell, tick)
 
 
 @kernel
 def _is_log(payload: bytes, at: int, end: int, origins: int) -> bool:
     """Whether payload[at:end] is a row of suffixes of bare entries, see News.logs."""
     while 0 <= at < end:
-        origin, at = take_uint(payload, at)
-        start, at = take_uint(payload, at)
-        span, at = take_uint(payload, at)
-        count, at = take_uint(payload, at)
+        origin, at = read_uint(payload, at)
+        start, at = read_uint(payload, at)
+        span, at = read_uint(payload, at)
+        count, at = read_uint(payload, at)
         if at < 0 or origin >= origins or start > LENGTH_MAX or count > end - at or count != span:
             return False
         for _ in range(count):
-            _step, at = take_int(payload, at)
+            _step, at = read_int(payload, at)
     return at == end
 
 
 @kernel
-def _is_near(books: MapTrackerState, who: int, cell: int, columns: int) -> bool:
+def _is_near(state: MapTrackerState, who: int, cell: int, columns: int) -> bool:
     """Whether a robot has ever stood near a cell."""
-    for i in range(books.counts[who, STOOD] - 1, -1, -1):
-        stood = books.stood[who, i]
+    for i in range(state.counts[who, STOOD] - 1, -1, -1):
+        stood = state.stood[who, i]
         rows_apart = abs(stood // columns - cell // columns)
         if max(rows_apart, abs(stood % columns - cell % columns)) <= VOID_CELLS:
             return True
@@ -243,119 +243,121 @@ def _is_near(books: MapTrackerState, who: int, cell: int, columns: int) -> bool:
 
 
 @kernel
-def _append(books: MapTrackerState, land: GroundTruth, who: int, entry: int) -> int:
+def _append(state: MapTrackerState, ground: GroundTruth, who: int, entry: int) -> int:
     """A robot tells the next entry of its log: a fault, or NEVER."""
-    cells, slot = books.first_tick.shape[0], books.slots[who]
-    written = books.written[slot]
+    cells, slot = state.first_tick.shape[0], state.slots[who]
+    written = state.written[slot]
     if 2 * cells <= entry < 3 * cells:
-        if not _is_near(books, who, entry - 2 * cells, land.truth.shape[1]):
+        if not _is_near(state, who, entry - 2 * cells, ground.truth.shape[1]):
             return FAR_VOID
         written[VOIDS] += 1
-        _hold(books, land, who, entry)
-    elif written[MATCHED] < written[MADE] and books.made[slot, written[MATCHED]] == entry:
+        _hold(state, ground, who, entry)
+    elif written[MATCHED] < written[MADE] and state.made[slot, written[MATCHED]] == entry:
         written[MATCHED] += 1
     else:
         return NOT_ITS_SCANS
-    books.told[slot, written[TOLD]] = entry
+    state.told[slot, written[TOLD]] = entry
     written[TOLD] += 1
     return NEVER
 
 
 @kernel
 def _follow_entry(
-    books: MapTrackerState, land: GroundTruth, who: int, origin: int, position: int, entry: int
+    state: MapTrackerState, ground: GroundTruth, who: int, origin: int, position: int, entry: int
 ) -> int:
     """An entry of a slot's log as `who` sends it: a fault, or NEVER."""
-    own = origin == books.slots[who]
-    if position < books.written[origin, TOLD]:
-        same = books.told[origin, position] == entry
+    own = origin == state.slots[who]
+    if position < state.written[origin, TOLD]:
+        same = state.told[origin, position] == entry
         return NEVER if same else NOT_ITS_SCANS if own else FOREIGN
-    if not own or who >= books.held.shape[0]:
+    if not own or who >= state.held.shape[0]:
         return FOREIGN
-    if position == books.written[origin, TOLD]:
-        return int(_append(books, land, who, entry))
+    if position == state.written[origin, TOLD]:
+        return int(_append(state, ground, who, entry))
     return GAP
 
 
 @kernel
-def _follow_have(
-    books: MapTrackerState, payload: bytes, at: int, told: int, who: int, row: int, item: int
+def _follow_version_vector(
+    state: MapTrackerState, payload: bytes, at: int, told: int, who: int, row: int, item: int
 ) -> None:
     """A version vector of `told` slots never falls and never names what nobody has told."""
-    robots = books.held.shape[0]
-    for origin in range(max(told, books.have.shape[1])):
+    robots = state.held.shape[0]
+    for origin in range(max(told, state.version_vector.shape[1])):
         length = 0
         if origin < told:
-            length, at = take_uint(payload, at)
-        if origin >= books.have.shape[1]:
+            length, at = read_uint(payload, at)
+        if origin >= state.version_vector.shape[1]:
             if length > 0:
-                _note(books, MORE, row, item, length, 0)
+                _note(state, MORE, row, item, length, 0)
             continue
-        before, books.have[who, origin] = books.have[who, origin], length
+        before, state.version_vector[who, origin] = state.version_vector[who, origin], length
         if length < before:
-            _note(books, FORGETS, row, item, length, before)
-        if origin != books.slots[who] or who >= robots:
-            known = books.written[origin, TOLD]
+            _note(state, FORGETS, row, item, length, before)
+        if origin != state.slots[who] or who >= robots:
+            known = state.written[origin, TOLD]
             if length > known:
-                _note(books, MORE, row, item, length, known)
+                _note(state, MORE, row, item, length, known)
         else:
-            known = books.written[origin, MADE] + books.written[origin, VOIDS]
-            if not known <= length <= known + books.first_tick.shape[0]:
-                _note(books, SHORT, row, item, length, known)
+            known = state.written[origin, MADE] + state.written[origin, VOIDS]
+            if not known <= length <= known + state.first_tick.shape[0]:
+                _note(state, SHORT, row, item, length, known)
 
 
 @kernel
 def _follow_logs(
-    books: MapTrackerState,
-    land: GroundTruth,
-    reading: ColumnarBatch,
+    state: MapTrackerState,
+    ground: GroundTruth,
+    columns: ColumnarBatch,
     row: int,
     item: int,
     at: int,
     end: int,
 ) -> None:
     """The suffixes in payload[at:end], up to the first fault."""
-    who, payload = reading.acts[row, of.PLACE], reading.payload
+    who, payload = columns.step_records[row, of.PLACE], columns.payload
     while at < end:
-        origin, at = take_uint(payload, at)
-        position, at = take_uint(payload, at)
-        _span, at = take_uint(payload, at)
-        count, at = take_uint(payload, at)
+        origin, at = read_uint(payload, at)
+        position, at = read_uint(payload, at)
+        _span, at = read_uint(payload, at)
+        count, at = read_uint(payload, at)
         entry = 0
         for _ in range(count):
-            step, at = take_int(payload, at)
+            step, at = read_int(payload, at)
             entry += step
-            fault = _follow_entry(books, land, who, origin, position, entry)
+            fault = _follow_entry(state, ground, who, origin, position, entry)
             if fault != NEVER:
-                _note(books, fault, row, item, origin, position)
+                _note(state, fault, row, item, origin, position)
                 return
             position += 1
 
 
 @kernel
 def _follow_news(
-    books: MapTrackerState, land: GroundTruth, reading: ColumnarBatch, row: int, item: int
+    state: MapTrackerState, ground: GroundTruth, columns: ColumnarBatch, row: int, item: int
 ) -> None:
     """One envelope: its logs, then its version vector, then what the sender holds by it."""
-    who = reading.acts[row, of.PLACE]
-    sent = reading.sent[reading.acts[row, of.SENT] + item]
-    payload = reading.payload
-    _epoch, have, have_end, at, end = of.parts_of_news(payload, sent[of.BODY], sent[of.BODY_END])
-    roster, robots = books.slots.shape[0], books.held.shape[0]
-    slots = _slots(payload, have, have_end, roster) if end >= 0 else 0
-    if slots == 0 or not _is_log(payload, at, end, books.have.shape[1]):
-        _note(books, UNREADABLE, row, item, 0, 0)
+    who = columns.step_records[row, of.PLACE]
+    sent = columns.sent[columns.step_records[row, of.SENT] + item]
+    payload = columns.payload
+    _incarnation, version_vector, have_end, at, end = of.parts_of_gossip(
+        payload, sent[of.BODY], sent[of.BODY_END]
+    )
+    roster, robots = state.slots.shape[0], state.held.shape[0]
+    slots = _slots(payload, version_vector, have_end, roster) if end >= 0 else 0
+    if slots == 0 or not _is_log(payload, at, end, state.version_vector.shape[1]):
+        _note(state, UNREADABLE, row, item, 0, 0)
         return
     if who < robots:
-        books.union[LOG_BYTES] += end - at
-    _follow_logs(books, land, reading, row, item, at, end)
-    _follow_have(books, payload, have, slots, who, row, item)
-    for origin in range(books.have.shape[1] if who < robots else 0):
-        last = min(books.have[who, origin], books.written[origin, TOLD])
-        if origin != books.slots[who]:
-            for i in range(books.folded[who, origin], last):
-                _hold(books, land, who, books.told[origin, i])
-            books.folded[who, origin] = max(last, books.folded[who, origin])
+        state.union[LOG_BYTES] += end - at
+    _follow_logs(state, ground, columns, row, item, at, end)
+    _follow_version_vector(state, payload, version_vector, slots, who, row, item)
+    for origin in range(state.version_vector.shape[1] if who < robots else 0):
+        last = min(state.version_vector[who, origin], state.written[origin, TOLD])
+        if origin != state.slots[who]:
+            for i in range(state.folded[who, origin], last):
+                _hold(state, ground, who, state.told[origin, i])
+            state.folded[who, origin] = max(last, state.folded[who, origin])
 
 
 @kernel
@@ -363,7 +365,7 @@ def _slots(payload: bytes, at: int, end: int, roster: int) -> int:
     """How many slots the version vector in payload[at:end] is for; 0 if it is none."""
     numbers = 0
     while 0 <= at < end:
-        _length, at = take_uint(payload, at)
+        _length, at = read_uint(payload, at)
         numbers += 1
     return numbers if at == end and numbers % roster == 0 else 0
 
@@ -372,11 +374,11 @@ def _slots(payload: bytes, at: int, end: int, roster: int) -> int:
 def follow(
     payload: bytes,
     sizes: np.ndarray,
-    acts: np.ndarray,
+    step_records: np.ndarray,
     poses_m: np.ndarray,
     heard: np.ndarray,
     sent: np.ndarray,
-    verdicts: np.ndarray,
+    decisions: np.ndarray,
     pairs: np.ndarray,
     injected: np.ndarray,
     first_tick: np.ndarray,
@@ -384,7 +386,7 @@ def follow(
     held: np.ndarray,
     made: np.ndarray,
     told: np.ndarray,
-    have: np.ndarray,
+    version_vector: np.ndarray,
     folded: np.ndarray,
     written: np.ndarray,
     slots: np.ndarray,
@@ -397,13 +399,13 @@ def follow(
     exact: bool,
 ) -> None:
     """Follow what is sent in one batch; `told` has room for it."""
-    books = MapTrackerState(
+    state = MapTrackerState(
         first_tick,
         frontier,
         held,
         made,
         told,
-        have,
+        version_vector,
         folded,
         written,
         slots,
@@ -412,13 +414,15 @@ def follow(
         union,
         faults,
     )
-    land = GroundTruth(truth, counting, exact)
-    reading = ColumnarBatch(payload, sizes, acts, poses_m, heard, sent, verdicts, pairs, injected)
+    ground = GroundTruth(truth, counting, exact)
+    columns = ColumnarBatch(
+        payload, sizes, step_records, poses_m, heard, sent, decisions, pairs, injected
+    )
     for row in range(sizes[of.ACTS]):
-        who = acts[row, of.PLACE]
-        if who >= 0 and acts[row, of.PRESENT]:
-            for item in range(acts[row, of.SENT_COUNT]):
-                _follow_news(books, land, reading, row, item)
+        who = step_records[row, of.PLACE]
+        if who >= 0 and step_records[row, of.PRESENT]:
+            for item in range(step_records[row, of.SENT_COUNT]):
+                _follow_news(state, ground, columns, row, item)
 
 
 @kernel

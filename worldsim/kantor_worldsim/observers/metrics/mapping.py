@@ -117,11 +117,11 @@ class MapMetrics(RunMetrics):
     rows: list[MapRow]
 
     def __init__(
-        self, reader: ColumnarDecoder | None = None, survey: MapTracker | None = None
+        self, decoder: ColumnarDecoder | None = None, map_tracker: MapTracker | None = None
     ) -> None:
         """reader, survey: those that other referees of the same run follow it by, after this one."""
-        super().__init__(reader)
-        self.survey = survey or MapTracker(self._reader)
+        super().__init__(decoder)
+        self.map_tracker = map_tracker or MapTracker(self._decoder)
         self.shares: list[list[float]] = []
         """For each row, the share that each robot knows."""
         self.stall_ns = 0
@@ -129,11 +129,11 @@ class MapMetrics(RunMetrics):
         self.switches = 0
 
     def _begin(self, opening: Opening) -> None:
-        self.survey.take(opening)
-        scenario, frame = opening.scenario, self.survey.frame
+        self.map_tracker.observe(opening)
+        scenario, frame = opening.scenario, self.map_tracker.frame
         self._every = scenario.metrics.every or EVERY
         self._robots = scenario.robots.count
-        self._cells = np.flatnonzero(self.survey.observable.ravel())
+        self._cells = np.flatnonzero(self.map_tracker.observable.ravel())
         rows, columns = np.divmod(self._cells, frame.columns)
         self._blocks = _FINEST * (_FINEST * rows // frame.rows) + (
             _FINEST * columns // frame.columns
@@ -149,44 +149,46 @@ class MapMetrics(RunMetrics):
             name: _Pace((x, y)) for name, (x, y) in zip(scenario.robot_ids, starts_m, strict=True)
         }
         self._range_m = scenario.sensor.range_m
-        self._walls = Walls.of(scenario.radio, self.survey.ground)
+        self._walls = Walls.of(scenario.radio, self.map_tracker.ground)
         self._resolution_m = frame.resolution_m
 
     def _attend(self, batch: Batch, _reading: tuple[Any, ...]) -> None:
-        self.survey.take(batch)  # not before: a row tells how things stood at the end of its tick
-        for act in batch.acts:
-            pace = self._paces.get(act.name)
+        self.map_tracker.observe(
+            batch
+        )  # not before: a row tells how things stood at the end of its tick
+        for step_record in batch.step_records:
+            pace = self._paces.get(step_record.name)
             if pace is not None:
-                self._keep_pace(pace, act)
+                self._keep_pace(pace, step_record)
 
-    def _keep_pace(self, pace: _Pace, act: StepRecord) -> None:
+    def _keep_pace(self, pace: _Pace, step_record: StepRecord) -> None:
         """Whether a robot has changed its mind before the move, and whether it moves."""
-        if act.outputs is None or act.ruling is None:
+        if step_record.outputs is None or step_record.verdict is None:
             return
-        goal_m = act.outputs.goal
+        goal_m = step_record.outputs.goal
         if goal_m != pace.goal_m:
             if goal_m is not None and pace.goal_m is not None and not pace.arrived:
                 self.switches += math.dist(goal_m, pace.goal_m) > self._range_m
             pace.goal_m, pace.arrived = goal_m, False
-        xy_m = act.ruling.pose.x_m, act.ruling.pose.y_m
-        if xy_m != pace.xy_m or act.outputs.state is not State.EXPLORING:
-            pace.xy_m, pace.moved_ns = xy_m, act.now_ns
+        xy_m = step_record.verdict.pose.x_m, step_record.verdict.pose.y_m
+        if xy_m != pace.xy_m or step_record.outputs.state is not State.EXPLORING:
+            pace.xy_m, pace.moved_ns = xy_m, step_record.now_ns
         else:
-            self.stall_ns = max(self.stall_ns, act.now_ns - pace.moved_ns)
+            self.stall_ns = max(self.stall_ns, step_record.now_ns - pace.moved_ns)
         if goal_m is not None and math.dist(goal_m, xy_m) <= self._resolution_m:
             pace.arrived = True
 
     def _row(self, *, last: bool = False) -> None:
-        survey = self.survey
+        map_tracker = self.map_tracker
         self._measure(sample=self._tick > 0 and (not last or self._tick % self._every == 0))
-        self.shares.append((survey.held_cells / max(1, survey.total)).tolist())
+        self.shares.append((map_tracker.held_cells / max(1, map_tracker.total)).tolist())
         self.rows.append(
             MapRow(
                 tick=self._tick,
                 time_s=self._tick * self._period_ns * 1e-9,
-                explored=survey.seen / max(1, survey.total),
+                explored=map_tracker.seen / max(1, map_tracker.total),
                 explored_least=min(self.shares[-1]),
-                distance_m=math.fsum(survey.ways_m),
+                distance_m=math.fsum(map_tracker.ways_m),
                 overlap=self._overlap,
                 wtv=self._now.item(0, _SHOWN),
                 epv=self._now.item(1, _SHOWN),
@@ -199,19 +201,19 @@ class MapMetrics(RunMetrics):
 
     @property
     def _overlap(self) -> float:
-        seen = self.survey.seen
-        return int(self.survey.own_cells.sum()) / seen - 1.0 if seen else 0.0
+        seen = self.map_tracker.seen
+        return int(self.map_tracker.own_cells.sum()) / seen - 1.0 if seen else 0.0
 
     def _measure(self, *, sample: bool) -> None:
         """WTV and EPV now. sample: they count in the means over time."""
-        survey = self.survey
-        origin_m = np.array(survey.frame.origin_m)
+        map_tracker = self.map_tracker
+        origin_m = np.array(map_tracker.frame.origin_m)
         _sum_blocks(
             self._cells,
             self._blocks,
-            survey.books.first_tick,
-            survey.frame.columns,
-            (np.array(survey.poses_m) - origin_m) / survey.frame.resolution_m,
+            map_tracker.state.first_tick,
+            map_tracker.frame.columns,
+            (np.array(map_tracker.poses_m) - origin_m) / map_tracker.frame.resolution_m,
             self._tick,
             self._sums,
         )
@@ -229,12 +231,12 @@ class MapMetrics(RunMetrics):
         merged = [_merged(np.stack((seen_w, explored)), shape) for shape in SHAPES]
         return ByRegions(*(_variance(waits, cells) for waits, cells in merged))
 
-    def _glimpse(self) -> dict[str, Any]:
+    def _snapshot_of(self) -> dict[str, Any]:
         last = self.rows[-1]
         return {"w_ub": 0.0, "mass_left": 1.0 - last.explored, "distance_m": last.distance_m}
 
     def _measured(self) -> dict[str, Any]:
-        survey, last = self.survey, self.rows[-1]
+        map_tracker, last = self.map_tracker, self.rows[-1]
         mean = self._over_time / self._samples if self._samples else self._now
         return {
             "w_ub_start": 0.0,
@@ -245,17 +247,17 @@ class MapMetrics(RunMetrics):
             "mass_double_counted": 0.0,
             "map": MapResult(
                 explored=last.explored,
-                completed_tick=survey.completed_tick,
-                t95_tick=survey.t95_tick,
-                t99_tick=survey.t99_tick,
-                all_t99_tick=survey.all_t99_tick,
+                completed_tick=map_tracker.completed_tick,
+                t95_tick=map_tracker.t95_tick,
+                t99_tick=map_tracker.t99_tick,
+                all_t99_tick=map_tracker.all_t99_tick,
                 distance_m=last.distance_m,
-                longest_m=max(survey.ways_m),
+                longest_m=max(map_tracker.ways_m),
                 overlap=last.overlap,
-                bumps=len(survey.bumps),
+                bumps=len(map_tracker.bumps),
                 switches=self.switches,
                 stall_ticks=self.stall_ns // self._period_ns,
-                log_bytes_per_robot_tick=survey.log_bytes / max(1, self.steps),
+                log_bytes_per_robot_tick=map_tracker.log_bytes / max(1, self.steps),
                 wtv_final=self._final_wtv(),
                 wtv_mean=ByRegions(*mean[0].tolist()),
                 epv_final=ByRegions(*self._now[1].tolist()),

@@ -101,11 +101,11 @@ def _ship(
 def follow(
     _payload: bytes,
     sizes: np.ndarray,
-    acts: np.ndarray,
+    step_records: np.ndarray,
     poses_m: np.ndarray,
     _heard: np.ndarray,
     _sent: np.ndarray,
-    verdicts: np.ndarray,
+    decisions: np.ndarray,
     pairs: np.ndarray,
     _injected: np.ndarray,
     counts: np.ndarray,
@@ -126,34 +126,40 @@ def follow(
     tally = RunTally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left)
     finds = 0
     for row in range(sizes[of.VERDICTS]):
-        counts[DROPS if verdicts[row, of.DUE_NS] == DROPPED else DELIVERIES] += 1
+        counts[DROPS if decisions[row, of.DUE_NS] == DROPPED else DELIVERIES] += 1
     for row in range(sizes[of.ACTS]):
-        act = acts[row]
-        place = act[of.PLACE]
-        if place < 0 or not act[of.PRESENT]:
+        step_record = step_records[row]
+        place = step_record[of.PLACE]
+        if place < 0 or not step_record[of.PRESENT]:
             continue
-        counts[VIOLATIONS] += act[of.VIOLATIONS]
-        if act[of.TOO_FAST] > 0 and act[of.SKEW_NS] > standing[place, 3]:  # see the checker's rule
+        counts[VIOLATIONS] += step_record[of.VIOLATIONS]
+        if (
+            step_record[of.TOO_FAST] > 0 and step_record[of.SKEW_NS] > standing[place, 3]
+        ):  # see the checker's rule
             counts[VIOLATIONS] -= 1
-        standing[place, 3] = act[of.SKEW_NS]
-        standing[place, 0] = act[of.REFUSED]
-        for i in range(act[of.LOWERED], act[of.LOWERED] + max(0, act[of.LOWERED_COUNT])):
+        standing[place, 3] = step_record[of.SKEW_NS]
+        standing[place, 0] = step_record[of.REFUSED]
+        for i in range(
+            step_record[of.LOWERED], step_record[of.LOWERED] + max(0, step_record[of.LOWERED_COUNT])
+        ):
             _lower(tally, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS])
         if place >= xy_m.shape[0]:  # the supervisor
             continue
         xy_m[place, 0], xy_m[place, 1] = poses_m[row, 0], poses_m[row, 1]
         counts[STEPS] += 1
-        counts[BYTES_WEIGHTS] += act[of.WEIGHTS_BYTES]
-        counts[BYTES_TOTAL] += act[of.WEIGHTS_BYTES] + act[of.BODY_BYTES]
-        finds += act[of.FINDS]
-        if act[of.HEARD_COUNT] > 0 and counts[FIRST_CONTACT] == NEVER:
-            counts[FIRST_CONTACT] = act[of.STEP]
-        if act[of.STATE] != State.EXPLORING.value:
+        counts[BYTES_WEIGHTS] += step_record[of.WEIGHTS_BYTES]
+        counts[BYTES_TOTAL] += step_record[of.WEIGHTS_BYTES] + step_record[of.BODY_BYTES]
+        finds += step_record[of.FINDS]
+        if step_record[of.HEARD_COUNT] > 0 and counts[FIRST_CONTACT] == NEVER:
+            counts[FIRST_CONTACT] = step_record[of.STEP]
+        if step_record[of.STATE] != State.EXPLORING.value:
             standing[place, 1] = 1
-        if act[of.STATE] == State.FINISHED.value and standing[place, 2] == NEVER:
-            standing[place, 2] = act[of.STEP]
-        if act[of.SPENT_COUNT] > 0 and not act[of.VOID]:
+        if step_record[of.STATE] == State.FINISHED.value and standing[place, 2] == NEVER:
+            standing[place, 2] = step_record[of.STEP]
+        if step_record[of.SPENT_COUNT] > 0 and not step_record[of.VOID]:
             counts[ENERGY] += 1
-            for i in range(act[of.SPENT], act[of.SPENT] + act[of.SPENT_COUNT]):
+            for i in range(
+                step_record[of.SPENT], step_record[of.SPENT] + step_record[of.SPENT_COUNT]
+            ):
                 _ship(tally, samples_m, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS], whole)
     return finds
