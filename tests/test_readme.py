@@ -35,6 +35,11 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 
+FOLDERS = (
+    *(".ci", "agent", "benchmarks", "docker", "docs", "fleet", "protocol"),
+    *("supervisor", "tests", "worldsim"),
+)
+"""What is in the repository, whatever else stands beside it."""
 PROGRAMS = frozenset(
     {".", "cd", "cp", "docker", "docker-compose", "echo", "find", "install", "journalctl"}
     | {"nft", "pip", "python3", "scp", "systemctl"}
@@ -340,25 +345,23 @@ def complaints_of_links(document: Document) -> Iterator[str]:
 @functools.cache
 def tree() -> frozenset[str]:
     """Every file and folder of the repository, from its root and from below."""
-    listed = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
-        cwd=ROOT, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    paths = [Path(line) for line in listed.stdout.splitlines() if (ROOT / line).exists()]
-    whole = {parent for path in paths for parent in (path, *path.parents)}
+    inside = (path for folder in FOLDERS for path in (ROOT / folder).rglob("*"))
+    whole = [
+        *map(Path, FOLDERS),
+        *(path.relative_to(ROOT) for path in (*ROOT.glob("*.*"), *inside)),
+    ]
     return frozenset("/".join(path.parts[i:]) for path in whole for i in range(len(path.parts)))
 
 
 def complaints_of_paths(document: Document) -> Iterator[str]:
     """Files, folders and modules in backticks that there are not."""
-    folders = {path.name for path in ROOT.iterdir() if path.is_dir()}
     for span in document.spans:
         if re.fullmatch(r"kantor_\w+(\.\w+)+", span):
             place = span.replace(".", "/")
             if not {place, f"{place}.py"} & tree():
                 yield f"`{span}`: no such module"
         elif re.fullmatch(r"[\w.-]+(/[\w.@-]+)*/?", span):
-            inside = "/" in span and span.partition("/")[0] in folders
+            inside = "/" in span and span.partition("/")[0] in FOLDERS
             is_path = span.endswith((".py", ".md", ".sh", ".service", "/")) or inside
             if is_path and span.rstrip("/") not in tree() and span not in MADE:
                 yield f"`{span}`: no such path"
