@@ -543,6 +543,9 @@ def test_the_planner_in_the_readme_explores(
     )
 
     assert result["mass_left"] == 0.0
+    assert (
+        result["w_ub"]["paper"] < 0.5 * result["w_ub_start"]
+    )  # where it stands still it does not fall
 
 
 @pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
