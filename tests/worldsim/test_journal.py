@@ -116,7 +116,7 @@ def test_digest_is_the_same_with_and_without_a_file(
     """The digest is of the records: no file, no metrics and no clock enter it."""
     without = Journal()
     for record in records:
-        without.observe(record)
+        without.append(record)
     without.close()
     from_file = Digest()
     written = write(records, folder / "digest.mcap")
