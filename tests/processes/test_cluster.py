@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 SMALL = ("energy.points=400", "energy.steps=400", "samples.count=200", "targets.count=50")
 VARY, SEEDS = "radio.range_m=50,100", "0:10"
 RUNS = 20
-ENVIRONMENT = {"PYTHONPATH": str(Path(workers.__file__).parent)}
+ENVIRONMENT = {"PYTHONPATH": str(Path(workers.__file__).parents[1])}
 """Of a cluster: its workers find the tests' work."""
 
 
