@@ -15,8 +15,8 @@ import atheris
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 _DECODERS = [
-    *(f"kantor_protocol.{name}" for name in ("scenario", "faults", "credentials", "keys", "diary")),
-    *(f"kantor_worldsim.{name}" for name in ("maps", "density", "journal")),
+    *(f"kantor_protocol.{name}" for name in ("scenario", "transport.credentials", "wire", "node.wal")),
+    *(f"kantor_worldsim.{name}" for name in ("world.maps", "world.density", "record.journal")),
     *("kantor_fleet.sweep", "tomllib", "mcap"),
 ]
 
