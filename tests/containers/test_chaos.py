@@ -23,7 +23,7 @@ def test_deeds_come_in_order_and_ends_before_beginnings() -> None:
         )
     )
 
-    assert [(deed.at_s, deed.who, deed.what) for deed in deeds] == [
+    assert [(deed.at_s, deed.who, deed.kind) for deed in deeds] == [
         (3, "r1", "cut"),
         (5, "worldsim", "kill"),
         (6, "worldsim", "start"),

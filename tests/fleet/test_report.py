@@ -22,7 +22,7 @@ from kantor_protocol.base.machine import Observation, Outputs, Pose, State
 from kantor_protocol.scenario.load import parse
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record, StepRecord
 from kantor_worldsim.world.world import StepVerdict, WorldSetup
 
@@ -70,7 +70,7 @@ def play(*overrides: str, seed: int = 1) -> list[Record]:
     site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
     simulation = Simulation(scenario, seed, site, [records.append])
-    simulate(simulation, in_process(team(scenario, seed, site)), seed, lambda: False)
+    simulate(simulation, InProcessExchange(team(scenario, seed, site)), seed, lambda: False)
     return records
 
 

@@ -177,7 +177,7 @@ def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
                         f"replayed: {step_record.name} differs at its step {step_record.outputs.step}",
                     )
                 steps += 1
-            team.mailbag.post(record)
+            team.mailbag.add(record)
     return True, f"replayed: {steps} steps of {team.count} participants, all the same"
 
 
@@ -199,7 +199,7 @@ class _Team:
     def follow(self, incident: ProcessEvent) -> None:
         """A process that comes back goes on, unless it is another incarnation."""
         who = incident.who
-        if incident.what not in {"start", "join"} or who == WORLD_SIM:
+        if incident.kind not in {"start", "join"} or who == WORLD_SIM:
             return
         if self._world.begin(who, incident.incarnation):
             self._machines[who] = self._participant(who)

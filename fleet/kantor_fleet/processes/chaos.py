@@ -136,7 +136,7 @@ def _judged(
             (
                 incident.now_ns * 1e-9
                 for incident in incidents
-                if (incident.who, incident.what) == (deed.who, awaited)
+                if (incident.who, incident.kind) == (deed.who, awaited)
                 and incident.now_ns * 1e-9 >= from_s
             ),
             None,

@@ -169,7 +169,7 @@ class Run:
                 self._follow_act(step_record)
 
     def _befall(self, incident: ProcessEvent) -> None:
-        name, what, now_s = incident.who, incident.what, incident.now_ns * 1e-9
+        name, what, now_s = incident.who, incident.kind, incident.now_ns * 1e-9
         if what in {"kill", "pause", "fill", "leave"}:
             self._away.setdefault(name, (what, now_s))
             if what == "kill" and name in self.trails:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import replicas
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,6 +17,7 @@ from kantor_protocol.replication.replica import Replica, read_version_vector
 from kantor_protocol.replication.replica_kernels import NOBODY, spend
 from kantor_protocol.wire.version_vector import slots_told
 from kantor_protocol.wire.weights import Units
+from support import replicas
 from support.strategies import examples
 
 N = 6

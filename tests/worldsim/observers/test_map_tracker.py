@@ -22,7 +22,7 @@ from kantor_protocol.replication.replica import Replica, read_version_vector
 from kantor_protocol.wire.messages import decode_gossip
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
 from kantor_worldsim.observers.metrics.map_tracker_kernels import KIND, TOLD
@@ -242,7 +242,7 @@ def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
     records: list[Record] = []
     simulation = Simulation(scenario, 1, site, [records.append])
     build = functools.partial(participant, "r1", scenario, 1, site)
-    play_all = in_process(
+    play_all = InProcessExchange(
         team(scenario, 1, site) | {"r1": KillableNode(build, simulation.body("r1"))}
     )
     rounds = iter(range(10_000))

@@ -94,6 +94,7 @@ from kantor_worldsim.radio.fault_kernels import FaultTable
 from kantor_worldsim.radio.link_faults import LinkFaults
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch, ColumnarDecoder
+from kantor_worldsim.record.process_events import ProcessEventKind
 from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record, StepRecord
 
 
@@ -334,7 +335,7 @@ class Checker:
             name: [fault for fault in self._clocks if name in fault.who] for name in names
         }
         self._deeds: dict[tuple[int, ParticipantId, str], ScheduledProcessFault] = {
-            (deed.fault, deed.who, deed.what): deed for deed in schedule_of(scenario)
+            (deed.fault, deed.who, deed.kind): deed for deed in schedule_of(scenario)
         }
         self._stopped: dict[ParticipantId, dict[str, int]] = {name: {} for name in names}
         self._stopped[WORLD_SIM] = {}
@@ -452,7 +453,7 @@ class Checker:
     def _befall(self, incident: ProcessEvent) -> None:
         """Follow what befell a process."""
         self._pass_time(incident.now_ns)
-        name, what = incident.who, incident.what
+        name, what = incident.who, incident.kind
         if name not in self._stopped:
             self._complain("incident", name, "not in the roster")
             return
@@ -470,10 +471,10 @@ class Checker:
 
     def _check_cause(self, incident: ProcessEvent) -> None:
         """Whether a fault says so, or nobody."""
-        fault, name, what = incident.fault, incident.who, incident.what
+        fault, name, what = incident.fault, incident.who, incident.kind
         if what == "let in":
             self._complain("epoch", name, "an impostor was let in")
-            what = "pretend"
+            what = ProcessEventKind.IMPOSTOR_REFUSED
         if fault < 0:
             if what not in {"leave", "join"}:
                 self._complain("incident", name, f"{what}, and no fault says so")
@@ -641,7 +642,7 @@ class Checker:
         for deed in self._deeds.values():
             if deed.at_ns < ending.now_ns and self._virtual and not deed.mid_step:
                 what = (
-                    f"no {deed.what}, and fault {deed.fault} says so at {deed.at_ns * 1e-9:.3f} s"
+                    f"no {deed.kind}, and fault {deed.fault} says so at {deed.at_ns * 1e-9:.3f} s"
                 )
                 self._complain("incident", deed.who, what)
 

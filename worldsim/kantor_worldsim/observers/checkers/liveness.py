@@ -30,7 +30,7 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
 from kantor_protocol.wire.version_vector import slots_told
 from kantor_worldsim.observers.checkers.state import FORGED_FIRST
-from kantor_worldsim.radio.channel import Field, Walls, hears
+from kantor_worldsim.radio.channel import LinkGeometry, Walls, hears
 from kantor_worldsim.radio.link_faults import LinkFaults
 from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record, StepRecord
 
@@ -176,9 +176,9 @@ class LivenessChecker:
         state = self._states.get(incident.who)
         if state is None:
             return
-        if incident.what in {"kill", "leave"}:
+        if incident.kind in {"kill", "leave"}:
             state.alive = False
-        elif incident.what in {"start", "join"}:
+        elif incident.kind in {"start", "join"}:
             state.alive = True
             slot = incident.incarnation * len(self._names) + state.slot % len(self._names)
             if slot != state.slot:
@@ -280,7 +280,7 @@ class LivenessChecker:
         xy_m = np.array([(poses[name].x_m, poses[name].y_m) for name in self._names])
         walls = Walls.of(scenario.radio, opening.site.ground)
         stands = scenario.supervisor.pose_m is not None
-        field = Field(*walls, xy_m, places.get(SUPERVISOR, -1), stands)
+        field = LinkGeometry(*walls, xy_m, places.get(SUPERVISOR, -1), stands)
         guided = scenario.centralized and self._states[SUPERVISOR].alive
 
         def reaches(one: ParticipantId, other: ParticipantId) -> bool:

@@ -154,7 +154,7 @@ class RunMetrics:
 
     def _befall(self, incident: ProcessEvent) -> None:
         """Follow what befell a process."""
-        name, what = incident.who, incident.what
+        name, what = incident.who, incident.kind
         if incident.fault >= 0 and what in PROCESS_COUNTERS:
             self._tolls[incident.fault, PROCESS_COUNTERS[what]] += 1
         if what in {"kill", "leave"}:

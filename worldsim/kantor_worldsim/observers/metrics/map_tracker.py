@@ -67,7 +67,7 @@ class MapTracker:
             self._open(record)
         elif isinstance(record, Batch):
             self._follow(record)
-        elif isinstance(record, ProcessEvent) and record.what in {"start", "join"}:
+        elif isinstance(record, ProcessEvent) and record.kind in {"start", "join"}:
             self._take_over(record)
 
     def _open(self, opening: Opening) -> None:
