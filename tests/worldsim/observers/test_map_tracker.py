@@ -25,7 +25,7 @@ from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
-from kantor_worldsim.observers.metrics.map_tracker_kernels import KIND, TOLD
+from kantor_worldsim.observers.metrics.map_tracker_kernels import AS_SENT, KIND
 from kantor_worldsim.record.columnar import ColumnarDecoder
 from kantor_worldsim.record.records import Batch, Opening, Record, StepRecord
 from kantor_worldsim.world.maps import Ground, parts
@@ -139,10 +139,10 @@ def test_robots_know_what_their_own_charts_show() -> None:
     replica = Replica(1, 2, entries(frame), None, ledger=True, claims=False)
     chart = FusedMap(frame, 2)
     for place in (0, 1):
-        count = map_tracker.state.written.item(place, TOLD)
+        count = map_tracker.state.written.item(place, AS_SENT)
         replica.store.length[place] = 0
         replica.reserve(count)
-        replica.store.logs[place, :count, 0] = map_tracker.state.told[place, :count]
+        replica.store.logs[place, :count, 0] = map_tracker.state.as_sent[place, :count]
         replica.store.length[place] = count
     chart.fold(replica)
 

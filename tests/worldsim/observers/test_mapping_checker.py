@@ -373,7 +373,7 @@ def test_frontier_may_be_called_none_from_beside_it() -> None:
     assert rules(_calls_near_frontier_none(explored(*ALONE))) == set()
 
 
-def test_frontier_may_be_called_none_after_heading_for_it_in_vain() -> None:
+def test_frontier_may_be_declared_dead_after_heading_for_it_in_vain() -> None:
     """A robot that has had the same goal for `planner.patience` steps may give it up from afar."""
     slow = (*ALONE, "vehicle.speed_m_s=4")
     records = explored(*slow)
@@ -392,7 +392,7 @@ def test_frontier_may_be_called_none_after_heading_for_it_in_vain() -> None:
     given_up = put(records, step_record, says(lambda news: having(tells(news), r1=1)))
 
     def accused(records: Records) -> bool:
-        return any("calls a frontier none" in line for line in check(records).complaints)
+        return any("declares a frontier dead" in line for line in check(records).complaints)
 
     assert accused(given_up)
     assert not accused(opened(given_up, scenario=on_map(*slow, "planner.patience=1")))

@@ -232,7 +232,7 @@ class Simulation:
     def note(self, event: ProcessEvent) -> None:
         """Record a process event, and apply what follows for positions, messages and who is waited for."""
         self.now_ns, self.done_ns = max(self.now_ns, event.now_ns), event.now_ns
-        if event.kind is ProcessEventKind.KILL:
+        if event.kind == ProcessEventKind.KILL:
             self._died_ns[event.who] = event.now_ns
         fault = self.scenario.faults[event.fault] if event.fault >= 0 else None
         self.faults_done += fault is not None

@@ -142,10 +142,10 @@ class FaultInjector:
     def _begin_on_world_sim(self, scheduled: ScheduledProcessFault, now_ns: int) -> None:
         end_ns = self._scenario.faults[scheduled.fault].until_ns or now_ns
         after_s = max(0.0, (end_ns - now_ns) * 1e-9 / self._speed)
-        if scheduled.kind is ProcessEventKind.KILL:
+        if scheduled.kind == ProcessEventKind.KILL:
             self._note(scheduled, scheduled.kind, now_ns)  # the command does not return
             self._command(CommandKind.RESTART_WORLD_SIM, WORLD_SIM, after_s)
-        elif scheduled.kind is ProcessEventKind.PAUSE:
+        elif scheduled.kind == ProcessEventKind.PAUSE:
             self._command(CommandKind.REST_WORLD_SIM, WORLD_SIM, after_s)
 
     def _is_done(self, scheduled: ScheduledProcessFault, now_ns: int) -> bool:
@@ -156,16 +156,16 @@ class FaultInjector:
         done = True
         if who == WORLD_SIM:
             pass
-        elif kind is ProcessEventKind.KILL:
+        elif kind == ProcessEventKind.KILL:
             done = not lobby.is_present(who)
             if scheduled.mid_step and waited_s > _STEPS_TO_DIE * self._period_s:
                 self._command(CommandKind.KILL, who)  # it makes no more steps
-        elif kind is ProcessEventKind.START:
+        elif kind == ProcessEventKind.START:
             done = lobby.arrivals(who) > self._arrivals
             if done:
                 ready = lobby.last_ready(who)
                 incarnation, step = ready.incarnation, ready.step
-        elif kind is ProcessEventKind.IMPOSTOR_REFUSED:
+        elif kind == ProcessEventKind.IMPOSTOR_REFUSED:
             refused = self._command(CommandKind.IS_IMPOSTOR_REFUSED, who)
             done = refused is not None
             kind = kind if refused else ProcessEventKind.IMPOSTOR_ADMITTED
@@ -225,5 +225,5 @@ def world_starts_ns(schedule: list[ScheduledProcessFault], done: int) -> int | N
     if past[-1:] != [ProcessEventKind.KILL]:
         return None
     return next(
-        event.at_ns for i, event in of_world if i >= done and event.kind is ProcessEventKind.START
+        event.at_ns for i, event in of_world if i >= done and event.kind == ProcessEventKind.START
     )

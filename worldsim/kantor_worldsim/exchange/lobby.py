@@ -361,7 +361,7 @@ class Lobby:
         assert self._clock is not None
         now_ns, ready = max(self._clock(), self._simulation.now_ns), self._last_ready.get(name)
         step = incarnation = 0
-        if kind is ProcessEventKind.JOIN and ready is not None:
+        if kind == ProcessEventKind.JOIN and ready is not None:
             # A process that was only frozen was ready long ago.
             step = max(ready.step, self._simulation.body(name).step)
             incarnation = ready.incarnation
