@@ -19,7 +19,7 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import decode_gossip, decode_inputs, encode
 from kantor_protocol.wire.weights import Units, WeightsSubscriber
 from kantor_supervisor.density import DensitySupervisor
-from support.strategies import Transcript, cast, mission, rehearse, scattered
+from support.strategies import Transcript, build_team, mission, scattered, step_rounds
 
 N = 12
 SAMPLES_M = scattered(N)
@@ -35,7 +35,7 @@ EVERY_MISSION = pytest.mark.parametrize("name", list(MISSIONS))
 
 def transcripts(name: str, rounds: int = 30) -> dict[str, Transcript]:
     """What everybody took in and put out."""
-    return rehearse(cast(MISSIONS[name], SAMPLES_M), MISSIONS[name], rounds)
+    return step_rounds(build_team(MISSIONS[name], SAMPLES_M), MISSIONS[name], rounds)
 
 
 def supervisor(scenario: Scenario) -> DensitySupervisor:
@@ -126,8 +126,8 @@ def test_sum_of_all_spending_is_broadcast() -> None:
 def test_robot_hears_of_another_only_through_the_supervisor() -> None:
     """centralized: without the supervisor's word, robots know nothing of each other."""
     scenario = MISSIONS["ledger"]
-    deaf = rehearse(
-        cast(scenario, SAMPLES_M), scenario, 10, lambda speaker, _: speaker != SUPERVISOR
+    deaf = step_rounds(
+        build_team(scenario, SAMPLES_M), scenario, 10, lambda speaker, _: speaker != SUPERVISOR
     )
     heard = [len(inputs.inbox) for inputs, _ in deaf["r1"]]
     lowered = [outputs.energy_spent for _, outputs in deaf["r1"]]

@@ -178,12 +178,12 @@ class Spectral:
             mean = mean_over_mixture(scenario.density, domain, modes)
         self._mean = np.zeros(modes * modes) if mean is None else mean
         self._follows = mean is None
-        self._walked = -1
+        self._walk_steps = -1
 
     def choose(self, belief: Belief, pose: Pose, _now_ns: int, /) -> Goal | None:
         """Where the steepest descent leaves the domain: a goal so far that no vehicle slows down."""
-        if self._follows and belief.walked != self._walked:
-            self._walked = belief.walked
+        if self._follows and belief.random_walk_steps != self._walk_steps:
+            self._walk_steps = belief.random_walk_steps
             _mean_over(belief.grid.xy_m, self._domain, *self._harmonics, self._mean)
         registers = belief.registers
         x_m, y_m = _choose(

@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from kantor_agent.coordination import assignment
 from kantor_agent.coordination.assignment import (
     Assignment,
-    ProgressMonitor,
-    member_of,
-    order_in,
-    orders_of,
-    register_of,
+    ContactLimits,
+    assigned_target,
+    read_member,
+    robot_register,
+    supervisor_register,
     visible_team,
 )
 from kantor_agent.mapping.cost_map import CostMap
@@ -69,7 +69,7 @@ class World:
         scenario = mission(*overrides)
         self.fused_map = FusedMap(FRAME, 3)
         self.log = Replica(0, 3, entries(FRAME), None, ledger=True, claims=False)
-        self.dispatch = Assignment(scenario, CostMap(scenario, self.fused_map), 0, me)
+        self.assignment = Assignment(scenario, CostMap(scenario, self.fused_map), 0, me)
 
     def see(self, *cells: int) -> None:
         """Cells are free."""
@@ -78,7 +78,7 @@ class World:
 
     def decide(self, *group: Member, tick: int = 10) -> dict[int, Task]:
         """New tasks."""
-        return self.dispatch.decide(group, (), tick)
+        return self.assignment.decide(group, (), tick)
 
 
 def robot(place: int, target: int = NOWHERE, since: int = 0, *, arrived: bool = False) -> Member:
@@ -192,12 +192,12 @@ def test_a_robot_is_known_as_it_is(
         memo.pop()
     me = Member(1, cell, Task(target, tuple(memo)), since, arrived)
     register = np.zeros(20, dtype=np.int64)
-    told = register_of(me, resting=False)
+    told = robot_register(me, resting=False)
     register[: len(told)] = told
 
-    assert member_of(1, register, FRAME.cells, 100) == me
+    assert read_member(1, register, FRAME.cells, 100) == me
     register[1] += 2
-    assert member_of(1, register, FRAME.cells, 100) is None
+    assert read_member(1, register, FRAME.cells, 100) is None
 
 
 @examples(200)
@@ -205,9 +205,9 @@ def test_a_robot_is_known_as_it_is(
 def test_whatever_a_register_holds_it_names_cells_of_the_map(numbers: Sequence[int]) -> None:
     """Hostile numbers give nobody, or somebody within the map and not in the future."""
     register = np.array(numbers, dtype=np.int64)
-    member = member_of(0, register, FRAME.cells, 7)
+    member = read_member(0, register, FRAME.cells, 7)
 
-    assert NOWHERE <= order_in(register, 2, FRAME.cells) < FRAME.cells
+    assert NOWHERE <= assigned_target(register, 2, FRAME.cells) < FRAME.cells
     if member is not None:
         assert 0 <= member.cell < FRAME.cells
         assert NOWHERE <= member.task.target < FRAME.cells
@@ -216,24 +216,24 @@ def test_whatever_a_register_holds_it_names_cells_of_the_map(numbers: Sequence[i
 
 def test_orders_name_a_target_for_every_robot() -> None:
     """Nowhere for whom there is none."""
-    told = orders_of({0: Task(4), 2: Task(0)}, 3, 9)
+    told = supervisor_register({0: Task(4), 2: Task(0)}, 3, 9)
     register = np.zeros(20, dtype=np.int64)
     register[: len(told)] = told
 
-    assert [order_in(register, i, FRAME.cells) for i in range(3)] == [4, NOWHERE, 0]
+    assert [assigned_target(register, i, FRAME.cells) for i in range(3)] == [4, NOWHERE, 0]
 
 
 def test_who_is_silent_leaves_the_group_and_then_memory() -> None:
     """First its target counts as taken, then it is free again."""
     held = Registers(0, 2, 12, sums=False)
     other = Registers(1, 2, 12, sums=False, beacon=True)
-    held.write(register_of(robot(0, 3), resting=False))
-    other.write(register_of(robot(1, 5), resting=False))
+    held.write(robot_register(robot(0, 3), resting=False))
+    other.write(robot_register(robot(1, 5), resting=False))
     held.learn(1, other.compose(), 2)
-    patience = ProgressMonitor(contact_steps=2, remember_steps=5)
+    limits = ContactLimits(contact_timeout_steps=2, remember_steps=5)
     seen = []
     for _ in range(8):
-        group, absent = visible_team(held, 2, FRAME, 0, patience)
+        group, absent = visible_team(held, 2, FRAME, 0, limits)
         seen.append(([m.robot for m in group], absent))
         held.end_step()
 
@@ -244,5 +244,5 @@ def test_patience_is_counted_in_own_steps() -> None:
     """A supervisor that steps twice a period waits twice as many steps."""
     scenario = mission("planner.remember_s=3", "clock.period_s=0.5")
 
-    assert ProgressMonitor.of(scenario, scenario.period_ns) == (8, 6)
-    assert ProgressMonitor.of(scenario, scenario.period_ns // 2) == (16, 12)
+    assert ContactLimits.of(scenario, scenario.period_ns) == (8, 6)
+    assert ContactLimits.of(scenario, scenario.period_ns // 2) == (16, 12)

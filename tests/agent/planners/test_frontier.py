@@ -97,11 +97,11 @@ def test_an_inaccessible_frontier_is_left_for_another(replan_on: str) -> None:
     dispatch = Assignment(floor.scenario, floor.cost_map, 0, None)
     stuck = robot(0, 2, 1)
     assert dispatch.decide([stuck], (), 10) == {}
-    floor.fused_map.void[1] = True
+    floor.fused_map.dead_frontiers[1] = True
     floor.fused_map.revision += 1
 
     assert dispatch.decide([stuck], (), 10)[0].target == 7
-    floor.fused_map.void[7] = True
+    floor.fused_map.dead_frontiers[7] = True
     floor.fused_map.revision += 1
     assert dispatch.decide([stuck], (), 20)[0].target == NOWHERE
 

@@ -269,7 +269,7 @@ def test_what_walls_enclose_belongs_to_no_region() -> None:
 def test_an_unknown_part_without_a_frontier_belongs_to_no_region() -> None:
     # Somebody stood before the right one and saw nothing new.
     situation = scene("?..a..?")
-    situation.cost_map.fused_map.void[5] = True
+    situation.cost_map.fused_map.dead_frontiers[5] = True
     situation.cost_map.fused_map.revision += 1
     situation = situation._replace(frontiers=situation.cost_map.fused_map.frontiers)
     assert regions_of(situation, 6).places == [[0, PARTS // 2]]

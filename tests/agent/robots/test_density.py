@@ -33,12 +33,12 @@ from kantor_protocol.wire.weights import Units, WeightsSubscriber
 from support.strategies import (
     MINIMUM,
     Transcript,
-    cast,
+    build_team,
     examples,
     in_a_row,
     mission,
-    rehearse,
     scattered,
+    step_rounds,
 )
 
 N = 12
@@ -67,7 +67,7 @@ def robot(scenario: Scenario, name: str = "r1") -> DensityRobot:
 def transcripts(name: str, rounds: int = 40) -> dict[str, Transcript]:
     """What the robots of a mission took in and put out; the supervisor is left out."""
     scenario = MISSIONS[name]
-    played = rehearse(cast(scenario, SAMPLES_M), scenario, rounds)
+    played = step_rounds(build_team(scenario, SAMPLES_M), scenario, rounds)
     return {robot_id: played[robot_id] for robot_id in scenario.robot_ids}
 
 
@@ -325,9 +325,9 @@ def test_any_bodies_are_survived(bodies: list[bytes]) -> None:
 def test_robot_that_is_done_keeps_relaying(overrides: tuple[str, ...]) -> None:
     """r2 is exhausted after its first step and stands between r1 and r3: news still gets across."""
     scenario = mission(*overrides)
-    machines = cast(scenario, SAMPLES_M)
+    machines = build_team(scenario, SAMPLES_M)
     machines["r2"] = robot(mission("energy.steps=1", *overrides), "r2")
-    played = rehearse(machines, scenario, 40, in_a_row)
+    played = step_rounds(machines, scenario, 40, in_a_row)
     vectors = []
     for robot_id in ("r1", "r3"):
         vector = dict.fromkeys(range(N), UNITS.sample)
@@ -347,7 +347,7 @@ def test_concurrent_robots_do_not_stay_together() -> None:
     apart = {}
     for claims in (True, False):
         scenario = mission(starts, f"claims={str(claims).lower()}")
-        played = rehearse(cast(scenario, SAMPLES_M), scenario, 8)
+        played = step_rounds(build_team(scenario, SAMPLES_M), scenario, 8)
         places = [transcript[-1][1].pose for transcript in played.values()]
         apart[claims] = len({(pose.x_m, pose.y_m) for pose in places})
 

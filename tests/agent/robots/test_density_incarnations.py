@@ -35,7 +35,18 @@ from kantor_supervisor.density import DensitySupervisor
 from kantor_worldsim.record.records import Batch, Ending, Record
 from kantor_worldsim.world.world import WorldSetup
 from support.missions import on_map, site_of
-from support.strategies import MINIMUM, cast, examples, mission, scattered, starts
+from support.strategies import (
+    MINIMUM,
+    VALIDATED_ROUNDS,
+    InRange,
+    all_in_range,
+    build_team,
+    examples,
+    mission,
+    scattered,
+    start_poses,
+    validate_all,
+)
 
 N = 12
 SAMPLES_M = scattered(N)
@@ -52,7 +63,6 @@ MISSIONS = {
     "walking": ("samples.diffusion_m=4.0",),
 }
 EVERY_MISSION = pytest.mark.parametrize("name", list(MISSIONS))
-Hears = Callable[[ParticipantId, ParticipantId], bool]
 
 
 class Rehearsal:
@@ -60,8 +70,8 @@ class Rehearsal:
 
     def __init__(self, scenario: Scenario, seed: int = 1) -> None:
         self.scenario, self._seed = scenario, seed
-        self.machines: dict[ParticipantId, StateMachine] = cast(scenario, SAMPLES_M, seed)
-        self.bodies = {name: Body(pose) for name, pose in starts(scenario).items()}
+        self.machines: dict[ParticipantId, StateMachine] = build_team(scenario, SAMPLES_M, seed)
+        self.bodies = {name: Body(pose) for name, pose in start_poses(scenario).items()}
         self.told: dict[ParticipantId, list[Outputs]] = {name: [] for name in self.machines}
         """Of all incarnations, one after the other."""
         self.births: dict[ParticipantId, list[int]] = {name: [0] for name in self.machines}
@@ -82,7 +92,7 @@ class Rehearsal:
 
     def round(
         self,
-        hears: Hears = lambda _speaker, _listener: True,
+        in_range: InRange = all_in_range,
         *,
         absent: Iterable[ParticipantId] = (),
         skew_ns: int = 0,
@@ -107,8 +117,10 @@ class Rehearsal:
         for envelope in sent:
             for name in self.machines:
                 wanted = envelope.target in (EVERYBODY, name) and envelope.source != name
-                if wanted and name not in absent and hears(envelope.source, name):
+                if wanted and name not in absent and in_range(envelope.source, name):
                     self._inboxes[name].append(envelope)
+        if self.rounds % VALIDATED_ROUNDS == 0:
+            validate_all(self.machines.values())
 
     def replica(self, name: ParticipantId) -> Replica:
         """What a participant holds."""
@@ -309,13 +321,13 @@ def test_samples_walk_a_bounded_way_at_once_and_never_back() -> None:
     walked = []
     for step, now_s in enumerate((0.1, 3600.0, 0.3, 0.4, 30.0, 30.1, 30.2, 30.3, 30.4, 30.5, 30.6)):
         robot.step(Inputs(round(now_s * 1e9), Observation(step, Pose(10.0, 10.0))))
-        walked.append(robot._belief.walked)
+        walked.append(robot._belief.random_walk_steps)
 
     assert walked == [1, 33, 33, 33, 65, 97, 129, 161, 193, 225, 257]
     late = DensityRobot("r1", scenario, 1, Body(Pose(10.0, 10.0)), SAMPLES_M)
     for step in range(12):
         late.step(Inputs(30_000_000_000 + step, Observation(step, Pose(10.0, 10.0))))
-    assert late._belief.walked == 300
+    assert late._belief.random_walk_steps == 300
 
 
 # On maps, in the real world-sim.

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from kantor_agent.planners.map_base import Member, Situation, Task, past
+from kantor_agent.planners.map_base import Member, Situation, Task, past_or_long_ago
 from kantor_agent.planners.market.costs import NOBODY, Costs, DistanceField, near, price_of
 from kantor_agent.planners.market.memo import Memo, packed, unpacked
 from kantor_agent.planners.market.rules import MarketRules, is_open, is_reachable, task_is_stale
@@ -181,7 +181,7 @@ class Trader:
         tick, cell = self._passed
         if (
             not self._agenda
-            and self._tick >= past(tick, self._tick) + self._gap
+            and self._tick >= past_or_long_ago(tick, self._tick) + self._gap
             and cell != self._member.cell
         ):
             self._agenda, self._passed = self._goals, (self._tick, self._member.cell)
@@ -221,7 +221,7 @@ class Trader:
         due = self._member.arrived or (self._on_events and (stale or changed))
         if (
             not (due or task.target == NOWHERE)
-            or self._tick < past(self._turned, self._tick) + self._gap
+            or self._tick < past_or_long_ago(self._turned, self._tick) + self._gap
         ):
             return task.target
         self._turned = self._tick
