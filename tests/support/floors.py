@@ -10,7 +10,7 @@ from kantor_agent.mapping.cost_map import CostMap
 from kantor_agent.mapping.fused_map import FusedMap
 from kantor_agent.planners.map_base import Member, Situation, Task
 from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
-from kantor_protocol.replication.occupancy_log import entries
+from kantor_protocol.replication.occupancy_log import dead_frontier, entries
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
@@ -42,7 +42,18 @@ class Floor:
 
     def see(self, cells: npt.ArrayLike, kind: int) -> None:
         """Cells turn out to be free or occupied."""
-        self._replica.append(2 * np.asarray(cells, dtype=np.int64) + (kind == OCCUPIED))
+        self._log(2 * np.asarray(cells, dtype=np.int64) + (kind == OCCUPIED))
+
+    def find_dead(self, cell: int) -> None:
+        """A frontier turns out to be none."""
+        self._log(np.array([dead_frontier(self.fused_map.frame, cell)]))
+
+    def measure(self, *bins: int) -> None:
+        """Ranges are measured, each given by its bin."""
+        self._log(np.array(bins, dtype=np.int64) + 3 * self.fused_map.frame.cells)
+
+    def _log(self, entries: npt.NDArray[np.int64]) -> None:
+        self._replica.append(entries)
         self.fused_map.fold(self._replica)
 
     def validate(self) -> None:

@@ -66,9 +66,7 @@ def test_what_is_left_is_measured_along_the_way() -> None:
 def test_there_is_no_way_through_walls_or_the_unknown() -> None:
     """Nor to where nothing leads."""
     for kind in (OCCUPIED, UNKNOWN):
-        floor = drawn(["...", "...", "..."])
-        floor.fused_map.cells[3:6] = kind
-        floor.fused_map.revision += 1
+        floor = drawn(["...", {OCCUPIED: "###", UNKNOWN: "   "}[kind], "..."])
         assert Navigator(floor.cost_map).head(Pose(0.5, 0.5), 8) is None
 
 
@@ -77,7 +75,6 @@ def test_a_wall_that_appears_is_driven_round() -> None:
     floor = drawn(["...", "...", "..."])
     navigator, pose = Navigator(floor.cost_map), Pose(0.5, 0.5)
     assert navigator.head(pose, 6) == (0.5, 2.5)
-    floor.fused_map.cells[3:5] = OCCUPIED
-    floor.fused_map.revision += 1
+    floor.see([3, 4], OCCUPIED)
 
     assert navigator.head(pose, 6) == (2.5, 0.5)

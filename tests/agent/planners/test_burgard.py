@@ -144,8 +144,8 @@ def test_utilities_are_multiplied_or_lessened() -> None:
 def test_coverage_is_learned_from_measured_ranges() -> None:
     """Eq. 4: three of four were at least as long as bin 10, two came back from the end or not at all."""
     floor = drawn(CORRIDOR)
-    floor.fused_map.ranges[[0, 10, RANGE_BINS - 1]] = 1, 1, 2
-    shares = Burgard(floor.scenario, 0, None)._shares(floor.fused_map.ranges)
+    floor.measure(0, 10, RANGE_BINS - 1, RANGE_BINS - 1)
+    shares = Burgard(floor.scenario, 0, None).shares(floor.fused_map.ranges)
     ten = 10 / RANGE_BINS
 
     assert coverage(0.0, 1.0, shares) == 1.0
@@ -157,7 +157,7 @@ def test_coverage_is_learned_from_measured_ranges() -> None:
 def test_where_nothing_was_measured_coverage_falls_evenly() -> None:
     """The same as without learning."""
     floor = drawn(CORRIDOR)
-    shares = Burgard(floor.scenario, 0, None)._shares(floor.fused_map.ranges)
+    shares = Burgard(floor.scenario, 0, None).shares(floor.fused_map.ranges)
 
     assert [coverage(d, 4.0, shares) for d in (0.0, 1.0, 4.0, 5.0)] == [1.0, 0.75, 0.0, 0.0]
 
@@ -166,8 +166,8 @@ def test_where_nothing_was_measured_coverage_falls_evenly() -> None:
 def test_coverage_that_is_not_learned(kind: str, at_2: float) -> None:
     """Whatever was measured."""
     floor = drawn(CORRIDOR, f"planner.coverage={kind}")
-    floor.fused_map.ranges[0] = 7
-    shares = Burgard(floor.scenario, 0, None)._shares(floor.fused_map.ranges)
+    floor.measure(*[0] * 7)
+    shares = Burgard(floor.scenario, 0, None).shares(floor.fused_map.ranges)
 
     assert coverage(2.0, 3.0, shares) == pytest.approx(at_2)
     assert coverage(3.1, 3.0, shares) == 0.0
@@ -213,7 +213,7 @@ def test_the_assignment_is_that_of_the_table(
 ) -> None:
     """On any floor, to the last bit: the kernel against the paper's loop in plain numbers."""
     floor, situation = data.draw(crowded(*options))
-    floor.fused_map.ranges[: len(ranges)] = ranges
+    floor.measure(*np.repeat(np.arange(len(ranges)), ranges).tolist())
 
     assert targets(floor, situation) == by_the_table(floor, situation)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent.planners.hungarian import Hungarian, _cheapest, spread_out
+from kantor_agent.planners.hungarian import Hungarian, cheapest_pairs, spread_out
 from kantor_agent.planners.map_base import Situation
 from kantor_protocol.base.grid import NOWHERE
 from support.floors import Floor, crowded, drawn, robot
@@ -42,7 +42,7 @@ def test_where_others_head_for_nobody_is_sent(taken: str) -> None:
     assert targets(floor, floor.situation([robot(0, 4)], others, [*absent, 9])) == [2]
 
 
-def test_robots_without_a_frontier_of_their_own_take_the_cheapest() -> None:
+def test_robots_without_a_frontier_of_their_own_take_thecheapest_pairs() -> None:
     """Three robots and two frontiers: the one in the middle is left over."""
     floor = drawn(CORRIDOR)
 
@@ -83,7 +83,7 @@ def test_no_assignment_is_cheaper(seed: int, robots: int, spots: int, closed: fl
     dice = np.random.default_rng(seed)
     travel = dice.integers(0, 20, (robots, spots)).astype(float)
     travel[dice.random((robots, spots)) < closed] = math.inf
-    pairs = _cheapest(travel)
+    pairs = cheapest_pairs(travel)
 
     def rated(choice: tuple[int | None, ...]) -> tuple[int, float]:
         costs = [travel[i, spot] for i, spot in enumerate(choice) if spot is not None]

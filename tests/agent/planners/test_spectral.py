@@ -256,7 +256,7 @@ def test_density_is_that_of_the_samples_where_there_is_no_mixture() -> None:
         cos_x, cos_y = (np.cos(np.outer(k, math.pi * c / 100.0)) for c in (x, y))
         expected = (cos_x[:, None, :] * cos_y[None, :, :]).mean(axis=2)
 
-        np.testing.assert_allclose(planner._mean, expected.ravel(), atol=1e-12)  # type: ignore[attr-defined]
+        np.testing.assert_allclose(planner.mean, expected.ravel(), atol=1e-12)  # type: ignore[attr-defined]
 
 
 def test_mixture_outside_the_domain_falls_back_on_the_samples() -> None:
