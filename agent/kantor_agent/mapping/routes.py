@@ -37,7 +37,7 @@ _SLANTED = 0b10100101
 """The diagonal ones of the eight steps, a bit for each. Steps are in the order of the cells that they lead to."""
 _RING = 256
 """Number of buckets: a power of two."""
-_RATIO_MAX = _RING / _SLANT - 2.0
+RATIO_MAX = _RING / _SLANT - 2.0
 """The ratio of the highest to the lowest cost up to which the ring is wide enough."""
 _LEAST, _MOST = 1e-200, 1e200
 """Costs in between can be divided by one another without overflow."""
@@ -309,7 +309,7 @@ class Routes:
         if not (0 <= source < self.cells and 0.0 < cost[source] < math.inf):
             return self._value
         graph = (self._price, self._moves, self._offsets, int(source), int(until))
-        if most <= _RATIO_MAX * least and least >= _LEAST and most <= _MOST:
+        if most <= RATIO_MAX * least and least >= _LEAST and most <= _MOST:
             buckets = (self._heads, self._links, self._members)
             spread_by_buckets(*graph, least, self._value, self._around, *buckets)
         else:

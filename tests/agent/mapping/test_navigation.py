@@ -34,7 +34,7 @@ def drive(floor: Floor, start: int, target: int, stride_m: float) -> list[tuple[
 
 @examples(100)
 @given(data=st.data(), stride_m=st.floats(0.05, 3.0))
-def test_a_robot_gets_there_and_what_is_left_never_rises(
+def test_a_robot_arrives_and_the_way_left_never_gets_longer(
     data: st.DataObject, stride_m: float
 ) -> None:
     """However slow it is, and however far ahead it sees: otherwise it would seem to be stuck."""
@@ -55,7 +55,7 @@ def test_a_robot_gets_there_and_what_is_left_never_rises(
         assert cell == start or floor.fused_map.cells[cell] == FREE
 
 
-def test_what_is_left_is_measured_along_the_way() -> None:
+def test_the_way_left_is_measured_along_the_way() -> None:
     """A long diagonal is as long as it is, not as many cells as it has."""
     floor = drawn(["." * 100] * 100)
     left = [cells for _, cells in drive(floor, 0, 9999, 1.0)]
@@ -63,7 +63,7 @@ def test_what_is_left_is_measured_along_the_way() -> None:
     assert left[:5] == pytest.approx([99 * math.sqrt(2.0) - i for i in range(5)])
 
 
-def test_there_is_no_way_through_walls_or_the_unknown() -> None:
+def test_no_way_leads_through_walls_or_unknown_cells() -> None:
     """Nor to where nothing leads."""
     for kind in (OCCUPIED, UNKNOWN):
         floor = drawn(["...", {OCCUPIED: "###", UNKNOWN: "   "}[kind], "..."])

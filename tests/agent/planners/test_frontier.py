@@ -28,7 +28,7 @@ def explorer(floor: Floor, me: int | None = None) -> Frontier:
 
 @examples(100)
 @given(data=st.data())
-def test_everybody_takes_the_cheapest_frontier(data: st.DataObject) -> None:
+def test_every_robot_takes_the_cheapest_frontier(data: st.DataObject) -> None:
     """Of equal ones the lowest; nobody cares for targets of others."""
     floor, situation = data.draw(crowded())
     expected = []
@@ -58,7 +58,7 @@ def test_a_frontier_that_was_visited_is_not_chosen_again() -> None:
     assert targets(planner, floor.situation([robot(0, 2, 7), robot(1, 2)])) == [7, 1]
 
 
-def test_one_that_was_only_headed_for_may_be_chosen_again() -> None:
+def test_a_target_that_was_not_reached_may_be_chosen_again() -> None:
     """Visited is where the robot has arrived."""
     floor = drawn(CORRIDOR)
     planner = explorer(floor)
@@ -104,7 +104,7 @@ def test_an_inaccessible_frontier_is_left_for_another(replan_on: str) -> None:
     assert assignment.decide([stuck], (), 20)[0].target == NOWHERE
 
 
-def test_a_robot_has_been_everywhere_before_it_returns() -> None:
+def test_a_robot_visits_every_frontier_before_it_returns_to_one() -> None:
     """Four frontiers that stay what they are, and a robot that arrives at one after the other."""
     floor = drawn(["## ##", "##.##", " ... ", "##.##", "## ##"], "planner=frontier")
     assignment = Assignment(floor.scenario, floor.cost_map, 0, 0)

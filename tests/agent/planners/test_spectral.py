@@ -182,7 +182,7 @@ def test_where_the_gradient_vanishes_a_robot_stays() -> None:
     assert choose(scenario, belief_of(scenario, scattered(12)), (50.0, 50.0)) is None
 
 
-def test_who_has_been_somewhere_goes_elsewhere() -> None:
+def test_a_visited_place_is_left_for_another() -> None:
     """The sums never forget: from the same place, by another way."""
     scenario = mission("planner=spectral")
     belief = belief_of(scenario, scattered(12))
@@ -304,7 +304,7 @@ def test_knowledge_of_others_changes_the_way() -> None:
     assert ways[0][-1] != ways[1][-1]
 
 
-def test_everybody_comes_to_hold_the_same_sums() -> None:
+def test_all_robots_come_to_hold_the_same_sums() -> None:
     """In the end a robot's total is the plain sum of all visits, also by way of a relay."""
     for overrides in ((), ("coordination=centralized",)):
         scenario = mission("planner=spectral", "planner.modes=5", "energy.steps=6", *overrides)

@@ -151,7 +151,7 @@ def pairs(packed: bytes) -> list[tuple[int, int]]:
     deaths=st.sets(st.tuples(st.integers(1, 14), st.integers(0, 3)), max_size=8),
     lost=st.sets(st.integers(0, 200), max_size=80),
 )
-def test_whoever_is_born_again_in_the_end_all_know_the_same(
+def test_all_know_the_same_in_the_end_whatever_incarnations_begin(
     *, name: str, deaths: set[tuple[int, int]], lost: set[int]
 ) -> None:
     """Robots and the supervisor forget all at any moment, messages are lost; then the radio is good."""
@@ -202,7 +202,7 @@ def check_life(played: Rehearsal, name: ParticipantId) -> None:
         assert died == born or subscriber.weights is not None
 
 
-def test_sums_over_visits_count_those_of_the_dead() -> None:
+def test_sums_over_visits_count_those_of_earlier_incarnations() -> None:
     """Spectral: what an incarnation has told of its visits stays in everybody's sums, once."""
     played = Rehearsal(mission(*MISSIONS["spectral"], "energy.points=60"))
     for moment in range(30):
@@ -222,7 +222,7 @@ def test_sums_over_visits_count_those_of_the_dead() -> None:
         assert played.replica(name).registers.total.tolist() == visits.tolist()
 
 
-def test_who_takes_over_a_body_holds_for_a_step() -> None:
+def test_an_incarnation_that_takes_over_a_body_holds_for_a_step() -> None:
     """It cannot know when the body moved last; a full step could break the speed limit."""
     played = Rehearsal(mission(*MISSIONS["spectral"], "energy.points=300"))
     for _ in range(5):
@@ -266,7 +266,7 @@ def test_robots_go_on_without_a_supervisor_and_come_back(merge: str, disk: str) 
         assert weights[0] == [max(0, whole - consumed[sample]) for sample in range(N)]
 
 
-def test_robot_out_of_the_supervisors_reach_is_alone_by_itself() -> None:
+def test_only_the_robot_out_of_the_supervisors_range_fails_over() -> None:
     """Failover is each robot's own: the others go on with the supervisor."""
     played = Rehearsal(mission("coordination=centralized", "energy.points=300"))
     for _ in range(30):
@@ -276,7 +276,7 @@ def test_robot_out_of_the_supervisors_reach_is_alone_by_itself() -> None:
     assert targets == {"r1": EVERYBODY, "r2": SUPERVISOR, "r3": SUPERVISOR}
 
 
-def test_boast_about_its_own_log_moves_nobody() -> None:
+def test_a_version_vector_beyond_the_log_is_accepted_and_changes_nothing() -> None:
     """Whoever claims to hold more of a robot's log than it has written is heard, and no more."""
     played = Rehearsal(mission())
     for _ in range(4):
@@ -392,7 +392,7 @@ def explore(scenario: Scenario, troubled: dict[ParticipantId, Troubled]) -> list
 
 @pytest.mark.parametrize("planner", MAP_PLANNERS)
 @pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
-def test_map_is_explored_whoever_is_born_again(planner: str, coordination: str) -> None:
+def test_map_is_explored_whatever_incarnations_begin(planner: str, coordination: str) -> None:
     """Layers of the dead count on; whoever comes back gets targets and rests at last."""
     scenario = on_map(f"planner.name={planner}", f"coordination={coordination}", "limit_s=300")
     site = site_of(scenario)
