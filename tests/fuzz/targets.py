@@ -32,7 +32,7 @@ from kantor_protocol.node.wal import WalFile
 from kantor_protocol.replication.gossip import build_replica
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
 from kantor_protocol.replication.registers import NUMBER_MAX, read_register
-from kantor_protocol.replication.replica import Replica, read_version_vector
+from kantor_protocol.replication.replica import Replica
 from kantor_protocol.scenario.dump import to_toml, to_tree
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.load import from_tree, parse, with_chaos
@@ -51,6 +51,7 @@ from kantor_protocol.wire.messages import (
     encode,
     encode_gossip,
 )
+from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_protocol.wire.weights import Units, WeightsSubscriber
 from kantor_worldsim.record import columnar
 from kantor_worldsim.record.columnar import ACTS, ALL_HEARD, ALL_SENT, INJECTED, PAIRS, VERDICTS

@@ -27,6 +27,7 @@ import numpy.typing as npt
 from kantor_protocol.base.incarnations import known_to
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.varint import MALFORMED, put_int, put_uint, read_int, read_uint
+from kantor_protocol.wire.version_vector import raise_entries
 
 Register = npt.NDArray[np.int64]
 
@@ -106,10 +107,7 @@ def _learn(
 ) -> None:
     """Take in sound content of as many origins as told."""
     width = values.shape[1]
-    at = 0
-    for origin in range(told):
-        stamp, at = read_uint(content, at)
-        known[source, origin] = max(known[source, origin], stamp)
+    at = raise_entries(content, 0, known[source, :told], STAMP_MAX)
     while 0 <= at < len(content):
         origin, stamp, numbers, at = _read_head(content, at, told, width)
         news = at >= 0 and origin != me and stamp > stamps[origin]

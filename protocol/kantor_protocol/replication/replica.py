@@ -40,8 +40,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.incarnations import known_to
-from kantor_protocol.base.kernels import kernel
-from kantor_protocol.base.varint import Pairs, read_uint
+from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.registers import Registers
 from kantor_protocol.replication.replica_kernels import (
     ENTRIES_MAX,
@@ -60,7 +59,7 @@ from kantor_protocol.replication.replica_kernels import (
     learn,
     pack_lowered,
 )
-from kantor_protocol.wire.version_vector import count_slots
+from kantor_protocol.wire.version_vector import count_ids
 from kantor_protocol.wire.weights import Units, Weights
 
 
@@ -149,7 +148,7 @@ class Replica:
         """Take in a message; False, and nothing changed, when it is malformed."""
         told = 0
         if registers:
-            told = count_slots(version_vector, self.config.roster, 2 if self.config.claims else 1)
+            told = count_ids(version_vector, self.config.roster, 2 if self.config.claims else 1)
             if not self.registers.sound(registers, told):
                 return False
         outcome = learn(*self._fields, version_vector, logs, claims, source)
@@ -259,18 +258,3 @@ def _unclaimed(slots: int) -> npt.NDArray[np.int64]:
     claims = np.zeros((4, slots), dtype=np.int64)
     claims[SAMPLE] = NOBODY
     return claims
-
-
-@kernel
-def _read_version_vector(version_vector: np.ndarray, lengths: np.ndarray) -> int:
-    at = 0
-    for origin in range(lengths.shape[0]):
-        lengths[origin], at = read_uint(version_vector, at)
-    return at
-
-
-def read_version_vector(version_vector: bytes, origins: int) -> list[int] | None:
-    """The log lengths in a version vector, by slot; origins: see `slots.slots_told`. None if malformed."""
-    lengths = np.zeros(origins, dtype=np.int64)
-    at = _read_version_vector(np.frombuffer(version_vector, dtype=np.uint8), lengths)
-    return None if at < 0 else lengths.tolist()

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.varint import put_int, put_uint, read_int, read_uint, skip_numbers
 from kantor_protocol.replication.registers import FRESH_STEPS
-from kantor_protocol.wire.version_vector import count_slots
+from kantor_protocol.wire.version_vector import count_ids, raise_entries
 
 NOBODY = -1
 
@@ -230,9 +230,8 @@ def _apply_version_vector(
         return
     at = 0
     for part in range(parts):
-        for slot in range(part * origins, part * origins + told):
-            held, at = read_uint(version_vector, at)
-            known[slot] = max(known[slot], min(held, KNOWN_MAX))
+        entries = known[part * origins : part * origins + told]
+        at = raise_entries(version_vector, at, entries, KNOWN_MAX)
 
 
 @kernel
@@ -286,7 +285,7 @@ def learn(
         counters,
     )
     config = config_of(settings)
-    told = count_slots(version_vector, config.roster, 2 if config.claims else 1)
+    told = count_ids(version_vector, config.roster, 2 if config.claims else 1)
     if not 0 <= source < told or source == config.me:
         return MALFORMED
     longest = _walk_suffixes(store, config, suffixes, source, told, False)

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import replicas
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX, known_to
 from kantor_protocol.replication.registers import Registers, read_register
-from kantor_protocol.replication.replica import Replica, read_version_vector
+from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import NOBODY, spend
-from kantor_protocol.wire.version_vector import slots_told
+from kantor_protocol.wire.version_vector import covered_ids, read_version_vector
 from kantor_protocol.wire.weights import Units
+from support import replicas
 from support.strategies import examples
 
 N = 6
@@ -89,9 +89,9 @@ def test_a_vector_tells_for_how_many_slots_it_is(*, claims: bool) -> None:
     parts = 2 if claims else 1
     for blocks in range(1, INCARNATIONS_MAX + 2):
         numbers = b"\x85\x01" + bytes(parts * 3 * blocks - 1)
-        assert slots_told(numbers, 3, claims=claims) == 3 * blocks
+        assert covered_ids(numbers, 3, claims=claims) == 3 * blocks
     for content in (b"", bytes(parts * 3 - 1), bytes(parts * 3 * 17), b"\x80" * 3, b"\xff" * 12):
-        assert slots_told(content, 3, claims=claims) is None
+        assert covered_ids(content, 3, claims=claims) is None
 
 
 def test_a_new_incarnation_speaks_of_twice_as_many_slots() -> None:

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import replicas
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import KNOWN_MAX, NOBODY, spend
 from kantor_protocol.wire.weights import Units
+from support import replicas
 from support.strategies import examples
 
 N = 6

@@ -9,7 +9,6 @@ but for what nobody alive has heard of.
 from collections import Counter
 from typing import Any
 
-from support import replicas
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -17,6 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import NOBODY, spend
 from kantor_protocol.wire.weights import Units
+from support import replicas
 from support.strategies import examples
 
 N = 6
