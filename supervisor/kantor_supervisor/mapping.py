@@ -31,7 +31,7 @@ class MappingSupervisor:
         self._robots = scenario.robots.count
         self._replica = build_replica(me, scenario, None, entries(frame), body.incarnation)
         self._radio = Gossip(me, scenario, body.incarnation)
-        self._fused_map = FusedMap(frame, self._replica.slots)
+        self._fused_map = FusedMap(frame, self._replica.origins)
         self._dispatch = Assignment(scenario, CostMap(scenario, self._fused_map), seed, None)
         self._tasks: dict[int, Task] = {}
         self._since: dict[int, int] = {}
@@ -42,7 +42,7 @@ class MappingSupervisor:
     def step(self, inputs: Inputs, /) -> Outputs:
         """Take in what the robots sent, give targets, tell everybody what they lack."""
         self._step += 1
-        self._radio.hear(inputs.inbox, self._replica.learn)
+        self._radio.receive(inputs.inbox, self._replica.merge)
         self._fused_map.fold(self._replica)
         tick = inputs.now_ns // self._period_ns
         for robot, task in self._dispatch.decide(*self._roll_call(tick), tick).items():
@@ -51,7 +51,7 @@ class MappingSupervisor:
         outputs = Outputs(
             step=self._step,
             pose=self._pose,
-            outbox=(self._radio.say(self._replica, self._step, self._pose),),
+            outbox=(self._radio.compose(self._replica, self._step, self._pose),),
             state=State.EXPLORING,
             refused=self._radio.refused,
         )

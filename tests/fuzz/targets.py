@@ -213,7 +213,7 @@ def _learning(name: str, me: str = "r1", samples: int | None = None) -> Callable
             source, version_vector, logs, claims, written = unframe(content)
             place = source[0] % (3 * len(scenario.roster)) if source else 0
             before = _state(replica)
-            taken = replica.learn(place, version_vector, logs, claims, written)
+            taken = replica.merge(place, version_vector, logs, claims, written)
             if not taken:
                 assert _state(replica) == before, "a refused message has changed something"
                 return False
@@ -233,7 +233,7 @@ def _state(replica: Replica) -> list[bytes]:
         *(store.weights, store.length, store.known, store.sending, store.claims),
         *(store.lowered, store.mark, store.counters),
         *(registers.values, registers.total, registers.stamps),
-        *(registers._known, registers._heard, registers._learnt, registers._sent),
+        *(registers._known, registers._received, registers._updated, registers._sent),
     )
     return [array.tobytes() for array in arrays]
 
@@ -258,9 +258,9 @@ def _registers(_folder: Path) -> Decode:
 
     def take(content: bytes) -> bool:
         source, written = unframe(content)
-        sound = registers.sound(written, 3)
+        sound = registers.is_well_formed(written, 3)
         if sound:
-            registers.learn(source[0] % 3 if source else 0, written, 3)
+            registers.merge(source[0] % 3 if source else 0, written, 3)
             assert (registers.values.sum(axis=0) == registers.total).all()
             assert np.abs(registers.values).max() <= NUMBER_MAX
         for origin in range(3):

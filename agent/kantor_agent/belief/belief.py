@@ -177,7 +177,7 @@ class Belief:
             store.weights,
             store.claims,
             store.counters,
-            np.zeros(self.replica.slots, dtype=np.int64),
+            np.zeros(self.replica.origins, dtype=np.int64),
             config.me if config.claims else NOBODY,
         )
         """Grid, weights and claims as arguments of a planner's kernel; see `kernels.kernel`."""

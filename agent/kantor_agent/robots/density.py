@@ -62,7 +62,7 @@ class DensityRobot:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the class."""
-        self._radio.hear(inputs.inbox, self._replica.learn)
+        self._radio.receive(inputs.inbox, self._replica.merge)
         self._locate(inputs.observation)
         self._belief.advance(inputs.now_ns)
         elapsed_ns = max(0, min(inputs.now_ns - self._now_ns, self._period_ns))
@@ -96,7 +96,7 @@ class DensityRobot:
             replica.claim(NOBODY, self._now_ns)
         lowered = replica.packed_lowered()
         weights = self._publisher.step(replica.lowered(), last=state is not State.EXPLORING)
-        envelope = self._radio.say(replica, self._step, self._pose)
+        envelope = self._radio.compose(replica, self._step, self._pose)
         replica.end_step()
         return Outputs(
             step=self._step,

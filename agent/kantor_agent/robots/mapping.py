@@ -60,7 +60,7 @@ class MappingRobot:
         self._robots = scenario.robots.count
         self._replica = build_replica(me, scenario, None, entries(frame), body.incarnation)
         self._radio = Gossip(me, scenario, body.incarnation)
-        self._fused_map = FusedMap(frame, self._replica.slots)
+        self._fused_map = FusedMap(frame, self._replica.origins)
         self._cost_map = CostMap(scenario, self._fused_map)
         self._evidence = OccupancyLog(frame, scenario.sensor, ranges=scenario.learns_ranges)
         self._dispatch = Assignment(scenario, self._cost_map, seed, self._me)
@@ -84,7 +84,7 @@ class MappingRobot:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the module."""
-        self._radio.hear(inputs.inbox, self._replica.learn)
+        self._radio.receive(inputs.inbox, self._replica.merge)
         self._locate(inputs.observation)
         elapsed_ns = max(0, min(inputs.now_ns - self._now_ns, self._period_ns))
         self._now_ns, self._step = inputs.now_ns, self._step + 1
@@ -212,7 +212,7 @@ class MappingRobot:
         cell = self._frame.cell_of(self._pose.x_m, self._pose.y_m)
         me = Member(self._me, cell, self._task, self._since, self._arrived)
         self._replica.registers.write(register_of(me, resting=self._resting))
-        envelope = self._radio.say(self._replica, self._step, self._pose)
+        envelope = self._radio.compose(self._replica, self._step, self._pose)
         self._replica.end_step()
         target = self._task.target
         return Outputs(

@@ -229,7 +229,7 @@ def test_who_is_silent_leaves_the_group_and_then_memory() -> None:
     other = Registers(1, 2, 12, sums=False, beacon=True)
     held.write(register_of(robot(0, 3), resting=False))
     other.write(register_of(robot(1, 5), resting=False))
-    held.learn(1, other.compose(), 2)
+    held.merge(1, other.compose(), 2)
     patience = ProgressMonitor(contact_steps=2, remember_steps=5)
     seen = []
     for _ in range(8):

@@ -28,7 +28,7 @@ def chart_of(*logs: list[int]) -> FusedMap:
         other = replica(origin)
         other.append(np.array(log, dtype=np.int64))
         other.registers.end_step()
-        assert held.learn(origin, *_said(other))
+        assert held.merge(origin, *_said(other))
     fused_map = FusedMap(FRAME, ORIGINS)
     fused_map.fold(held)
     return fused_map
