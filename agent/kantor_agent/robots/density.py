@@ -64,7 +64,7 @@ class DensityRobot:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the class."""
-        self._gossip.hear(inputs.inbox, self._replica.learn)
+        self._gossip.receive(inputs.inbox, self._replica.merge)
         self._locate(inputs.observation)
         self._belief.advance(inputs.now_ns)
         elapsed_s = self._timer.elapsed_s(inputs.now_ns)
@@ -104,7 +104,7 @@ class DensityRobot:
             replica.claim(NOBODY, self._now_ns)
         lowered = replica.packed_lowered()
         weights = self._publisher.step(replica.lowered(), last=state is not State.EXPLORING)
-        envelope = self._gossip.say(replica, self._step, self._pose)
+        envelope = self._gossip.compose(replica, self._step, self._pose)
         replica.end_step()
         return Outputs(
             step=self._step,
