@@ -137,6 +137,27 @@ def test_an_exact_distance_comes_when_asked_for_and_changes_nothing(
     assert f"exact {after['w1_exact']:.4g}" in asked.out
 
 
+@pytest.mark.parametrize("spelling", ["realtime", "wall"])
+def test_a_realtime_run_is_recorded_as_wall(kantor: "Kantor", spelling: str) -> None:
+    """Both names of the exchange are accepted; records, manifest and result.json keep `wall`."""
+    finished = kantor("run", "fleet", "--exchange", spelling, "--speed", 20, *SHORT)
+
+    (folder,) = kantor.runs()
+    assert finished.code == 1, finished.err  # the limit cut it
+    assert result_of(folder)["exchange"] == "wall"
+    assert json.loads((folder / "manifest.json").read_text())["exchange"] == "wall"
+    assert kantor("verify", folder).code == 0
+
+
+@pytest.mark.parametrize("verb", ["run", "worldsim"])
+def test_help_names_the_realtime_exchange(kantor: "Kantor", verb: str) -> None:
+    """With its former name as an alias."""
+    shown = " ".join(kantor(verb, "--help").out.replace("│", " ").split())
+
+    assert "lockstep,realtime,wall}" in shown
+    assert "wall is accepted for it" in shown
+
+
 def test_the_scenario_in_the_folder_runs_again_to_the_same_digest(kantor: "Kantor") -> None:
     """scenario.toml is the resolved scenario, overrides included."""
     in_process(kantor, "paper-decentralized", *SHORT, "--seed", 4)

@@ -1,11 +1,17 @@
 """`kantor worldsim`: its options and their checks."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from kantor_fleet.cli.options import check_seed, check_speed, exact_period
+from kantor_fleet.cli.options import (
+    ProcessExchange,
+    check_seed,
+    check_speed,
+    exact_period,
+    recorded,
+)
 from kantor_fleet.exits import Exit, fail
 
 
@@ -17,7 +23,7 @@ def worldsim(
     credentials: Path = Path("credentials"),
     fleet: str | None = None,
     seed: int = 0,
-    exchange: Literal["lockstep", "wall"] = "wall",
+    exchange: ProcessExchange = "realtime",
     speed: float = 1.0,
     start_after: float | None = None,
     out: Path = Path("runs"),
@@ -36,8 +42,9 @@ def worldsim(
             made, the folder or world-sim's file.
         fleet: Name of the fleet in every key, `kantor` by default; certificates are of a fleet already.
         seed: Decides every draw.
-        exchange: lockstep: step by step together. wall: every robot on its own clock.
-        speed: wall only: simulated seconds in a real one.
+        exchange: lockstep: all step together, batch by batch. realtime: every robot on its own clock; wall is
+            accepted for it.
+        speed: Realtime only: simulated seconds in a real second.
         start_after: Seconds after which to start without whoever is missing; by default never.
         out: Where the run folder is made.
         exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
@@ -69,5 +76,15 @@ def worldsim(
     mission = find(scenario, set, chaos)
     every = exact_period(mission, 0, exchange, exact=exact)
     return host_standalone(
-        mission, seed, exchange, speed, listen, credentials, fleet, start_after, out, every, state
+        mission,
+        seed,
+        recorded(exchange),
+        speed,
+        listen,
+        credentials,
+        fleet,
+        start_after,
+        out,
+        every,
+        state,
     )
