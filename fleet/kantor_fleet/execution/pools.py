@@ -7,7 +7,6 @@ what is running.
 
 import importlib.util
 import logging
-import multiprocessing
 import os
 import shutil
 import signal
@@ -22,6 +21,7 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, NamedTuple
 
 from kantor_fleet.execution.experiment import Case, Outcome, code, reason, run_case
+from kantor_fleet.execution.fork_server import await_fork_server, fork_server
 from kantor_fleet.exits import Exit, fail
 
 if TYPE_CHECKING:
@@ -75,6 +75,8 @@ def local(cases: Iterable[Case], jobs: int, work: Work = run_case) -> Pool:
     A worker that dies, killed for the memory it took, say, costs nobody but its own case a thing. That
     case is tried once more at the end, with nothing beside it; if it kills that worker too it has failed.
     """
+    await_fork_server()
+    yield None  # a caller that was interrupted meanwhile leaves here
     suspects: list[Case] = []
     with closing(_in_processes(cases, jobs, work)) as running:
         for done in running:
@@ -124,8 +126,7 @@ class _Worker:
     """A process that runs one case after another."""
 
     def __init__(self, work: Work) -> None:
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["kantor_fleet.execution.preloaded"])
+        context = fork_server()
         self.pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, work), daemon=True)
         self._process.start()
@@ -149,8 +150,6 @@ class _Worker:
 
 
 def _in_processes(cases: Iterable[Case], jobs: int, work: Work) -> Generator[_Done | None]:
-    for library in ("OMP", "OPENBLAS", "MKL"):
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")  # a core each
     waiting = iter(cases)
     idle: list[_Worker] = []
     busy: dict[object, tuple[_Worker, Case]] = {}  # by the worker's pipe

@@ -3,6 +3,7 @@
 import time
 from pathlib import Path
 
+from kantor_fleet.execution.fork_server import await_fork_server
 from kantor_fleet.execution.in_process_team import play
 from kantor_fleet.execution.preload import warm_up
 from kantor_fleet.exits import Exit, warn
@@ -63,7 +64,7 @@ def _run_in_process(
 def _run_processes(config: FleetConfig, interrupts: Interrupts) -> Exit:
     with ProgressView(config.scenario.name) as view:
         view.note("starting the fleet (the first time, kernels are compiled: about half a minute)")
-        warm_up()
+        await_fork_server()
         if interrupts():
             return Exit.INTERRUPTED
         with local_fleet(config) as fleet:

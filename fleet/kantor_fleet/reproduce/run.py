@@ -11,7 +11,6 @@ from rich.table import Table as Printed
 
 from kantor_fleet.execution.experiment import Case, Outcome
 from kantor_fleet.execution.pools import Pool
-from kantor_fleet.execution.preload import warm_up
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.report.run_progress import RunsView, table_console
@@ -47,7 +46,6 @@ def reproduce(
         interrupts = stack.enter_context(Interrupts())
         kept = any(figure.kept for figure in figures.values())
         journal = stack.enter_context(Journal(out / RUNS, MeasuredRun)) if kept else None
-        warm_up()
         flown = _run_all(orders, start, interrupts, journal)
         if interrupts.code is not None:
             print(f"kantor: interrupted; {_left_off(orders, flown, journal)}", file=sys.stderr)
