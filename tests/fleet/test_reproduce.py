@@ -1,6 +1,5 @@
 """`kantor reproduce`: verdicts that can fail, and figures, numbers and a table from one command."""
 
-import csv
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -24,6 +23,7 @@ from kantor_fleet.reproduce.claims import (
 from kantor_fleet.reproduce.kabir_lee import FIGURES, drop_at_contact, loosest
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, Setting
 from kantor_worldsim.observers.metrics.density import DensityRow
+from support.files import rows_of
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -170,12 +170,10 @@ def test_a_figure_comes_with_its_numbers_and_its_verdicts(kantor: "Kantor") -> N
     with Image.open(folder / "fig8.png") as image:
         assert image.width > 1000
     assert (folder / "fig8.pdf").read_bytes().startswith(b"%PDF")
-    with (folder / "fig8.csv").open(encoding="utf-8", newline="") as file:
-        runs = list(csv.DictReader(file))
+    runs = rows_of(folder / "fig8.csv")
     assert [int(run["seed"]) for run in runs] == [0, 1, 0, 1]
     assert all(0 < int(run["detected"]) <= 500 for run in runs)
-    with (folder / "verdicts.csv").open(encoding="utf-8", newline="") as file:
-        verdicts = list(csv.DictReader(file))
+    verdicts = rows_of(folder / "verdicts.csv")
     assert {line["figure"] for line in verdicts} == {"fig8"}
     assert done.code == (1 if any(line["verdict"] == MISS for line in verdicts) else 0)
     for line in verdicts:

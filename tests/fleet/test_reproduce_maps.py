@@ -1,10 +1,8 @@
 """`kantor reproduce` of papers that explore a map: ratios, even parts, kept runs, pictures."""
 
-import csv
 import itertools
 import math
 import signal
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -49,6 +47,7 @@ from kantor_worldsim.observers.metrics.result import (
     MapResult,
     Result,
 )
+from support.files import rows_of, wait_until
 from support.strategies import examples
 
 if TYPE_CHECKING:
@@ -400,11 +399,6 @@ def finished_run(seed: int = 0, tick: int = 7, regions: float = 3.0) -> Result:
 # The command
 
 
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def kept(folder: Path) -> int:
     """Runs in the journal."""
     try:
@@ -488,9 +482,7 @@ def test_interrupted_it_goes_on_where_it_was_stopped(kantor: "Kantor") -> None:
     folder = kantor.folder / "figures"
     order = ("reproduce", "kme-all", "--runs", 3, "--jobs", 1, "--out", "figures")
     running = kantor.start(*order)
-    give_up = time.monotonic() + 100.0
-    while kept(folder) < 2 and time.monotonic() < give_up:
-        time.sleep(0.05)  # a file has no event to wait for
+    wait_until(lambda: kept(folder) >= 2)
     running.send_signal(signal.SIGINT)
     _, told = running.communicate(timeout=60.0)
     before = kept(folder)

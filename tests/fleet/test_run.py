@@ -1,14 +1,17 @@
 """`kantor run`, `scenarios` and `verify` as a user runs them."""
 
-import csv
 import json
+import os
 import shutil
 import signal
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import psutil
 import pytest
+
+from support.files import rows_of, wait_until
+from support.fleets import result_of
 
 if TYPE_CHECKING:
     from conftest import Finished, Kantor
@@ -20,13 +23,6 @@ RESULT_NAMES = [
     "out_of_range_refused", "violations", "digest", "wall_s",
 ]  # fmt: skip
 SHORT = ("--set", "limit_s=5")
-
-
-def result_of(folder: Path) -> dict[str, object]:
-    """result.json of a run folder."""
-    tree = json.loads((folder / "result.json").read_text())
-    assert isinstance(tree, dict)
-    return tree
 
 
 def in_process(kantor: "Kantor", *arguments: object) -> "Finished":
@@ -130,8 +126,8 @@ def test_an_exact_distance_comes_when_asked_for_and_changes_nothing(
     before, after = (result_of(folder) for folder in kantor.runs())
     assert before["digest"] == after["digest"]
     assert before["w1_exact"] is None
-    with (kantor.runs()[1] / "metrics.csv").open(encoding="utf-8", newline="") as file:
-        exact = {int(row["tick"]): row["w1_exact"] for row in csv.DictReader(file)}
+    rows = rows_of(kantor.runs()[1] / "metrics.csv")
+    exact = {int(row["tick"]): row["w1_exact"] for row in rows}
     assert {tick for tick, value in exact.items() if value} == {0, 15, 30, 40}
     assert float(exact[40]) == after["w1_exact"]
     assert f"exact {after['w1_exact']:.4g}" in asked.out
@@ -232,6 +228,20 @@ def test_ctrl_c_leaves_a_valid_partial_record(kantor: "Kantor") -> None:
     assert result_of(folder)["ended"] == "interrupted"
     assert (folder / "report.png").exists()
     assert kantor("verify", folder).code == 0
+
+
+def test_ctrl_c_while_kernels_are_compiled_ends_the_command_at_once(kantor: "Kantor") -> None:
+    """SIGINT to the whole group, as a terminal sends it: exit code 130 and no traceback."""
+    cache = kantor.folder / "kernels"
+    process = kantor.start("run", "fleet", NUMBA_CACHE_DIR=str(cache))
+    wait_until(lambda: any(cache.rglob("*.nbi")))
+    started = psutil.Process(process.pid).children(recursive=True)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert psutil.wait_procs(started, timeout=10)[1] == []
 
 
 def test_a_full_disk_cuts_the_record_and_not_the_mission(kantor: "Kantor") -> None:

@@ -1,11 +1,9 @@
 """`kantor sweep`: plans, journals, tables, and what happens to workers and to impatient users."""
 
-import csv
 import json
 import os
 import signal
 import statistics
-import time
 from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path
@@ -22,6 +20,7 @@ from kantor_fleet.sweep.journal import Journal
 from kantor_fleet.sweep.plan import Key, SweepError, parse_seeds, plan
 from kantor_fleet.sweep.run import SweepConfig, sweep
 from kantor_fleet.sweep.summary import Spread
+from support.files import rows_of, wait_until
 from support.strategies import mission
 from support.workers import DEADLY_SEED, die_of_a_seed, fail_of_a_seed
 
@@ -36,26 +35,12 @@ RUNS = 24
 FULL = (*VARIED, "--seeds", "0:6", *SMALL)
 
 
-def rows_of(path: Path) -> list[dict[str, str]]:
-    """A table."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def journal_lines(folder: Path) -> list[bytes]:
     """The whole lines of a journal, without its header."""
     try:
         return (folder / "runs.jsonl").read_bytes().split(b"\n")[1:-1]
     except FileNotFoundError:
         return []
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    """A file has no event to wait for."""
-    give_up = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < give_up
-        time.sleep(0.005)
 
 
 # Plans
