@@ -51,9 +51,9 @@ def reproduce(
     """
     from kantor_fleet.execution.pools import pool  # noqa: PLC0415
     from kantor_fleet.reproduce import papers  # noqa: PLC0415
-    from kantor_fleet.reproduce.measured_runs import run_all  # noqa: PLC0415
+    from kantor_fleet.reproduce.measured_runs import run_measured  # noqa: PLC0415
     from kantor_fleet.reproduce.run import reproduce as reproduce_figures  # noqa: PLC0415
 
     if runs is not None and runs < 2:
         fail(Exit.USAGE, f"--runs {runs}: give at least 2, an interval needs them")
-    return reproduce_figures(papers.figures(figure), runs, pool(jobs, work=run_all), out)
+    return reproduce_figures(papers.figures(figure), runs, pool(jobs, work=run_measured), out)

@@ -30,23 +30,23 @@ from kantor_worldsim.world.world import World, WorldSetup
 
 def verify(folder: Path) -> Exit:
     """Print a verdict on each thing that can be verified; NOT_MET if any differs."""
-    found = verdicts(folder)
+    found = findings(folder)
     for held, line in found:
         print(f"{'ok  ' if held else 'FAIL'}  {line}")
     return Exit.DONE if all(held for held, _ in found) else Exit.NOT_MET
 
 
-def verdicts(folder: Path, records: list[tuple[bytes, Record]] | None = None) -> "list[Verdict]":
+def findings(folder: Path, records: list[tuple[bytes, Record]] | None = None) -> "list[Finding]":
     """A verdict on each thing that can be verified. records: the journal, if it has been read."""
     manifest = _manifest(folder)
     records = _journal(folder) if records is None else records
     if not records or not isinstance(records[0][1], Opening):
         return [(False, f"{JOURNAL}: no opening record in it")]
-    found = list(_verdicts_on_file(folder, manifest, records))
+    found = list(_findings_on_file(folder, manifest, records))
     try:
         found += [
-            _verdict_of_checker(manifest, records),
-            _verdict_of_execution(manifest, records),
+            _finding_of_checker(manifest, records),
+            _finding_of_execution(manifest, records),
         ]
     except (
         RefusedError,
@@ -77,13 +77,13 @@ def _journal(folder: Path) -> list[tuple[bytes, Record]]:
         fail(Exit.USAGE, f"{folder / JOURNAL}: no such file; give a folder that a run left")
 
 
-Verdict = tuple[bool, str]
+Finding = tuple[bool, str]
 """Whether it held, and a line about it."""
 
 
-def _verdicts_on_file(
+def _findings_on_file(
     folder: Path, manifest: dict[str, Any], records: list[tuple[bytes, Record]]
-) -> Iterator[Verdict]:
+) -> Iterator[Finding]:
     if "digest" not in manifest:
         yield True, f"{JOURNAL}: the run was killed; {len(records)} records up to then"
         return
@@ -99,7 +99,7 @@ def _verdicts_on_file(
     yield same, f"digest of {digest.records} records: {digest.hex}"
 
 
-def _verdict_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Verdict:
+def _finding_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Finding:
     virtual = manifest.get("exchange") != "wall"
     checker = check((record for _, record in records), virtual=virtual)
     if not checker.count:
@@ -107,7 +107,7 @@ def _verdict_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Rec
     return False, f"checker: {checker.count} complaints, first: {checker.complaints[0]}"
 
 
-def _verdict_of_execution(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Verdict:
+def _finding_of_execution(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Finding:
     opening = records[0][1]
     assert isinstance(opening, Opening)
     if manifest.get("exchange") == "wall" or any(_chance(opening.scenario, records)):
@@ -125,7 +125,7 @@ def _chance(scenario: Scenario, records: list[tuple[bytes, Record]]) -> Iterator
             yield not all(outages.dies(name, record.now_ns) for name in record.absent)
 
 
-def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
+def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> Finding:
     """The whole run anew, in process, record by record."""
     scenario, seed = opening.scenario, opening.seed
     world = scenario.map
@@ -153,7 +153,7 @@ def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
     return True, f"executed again: {compared} records, every byte the same"
 
 
-def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
+def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Finding:
     """Every participant anew, each from the inbox that it had."""
     team = _Team(opening)
     steps = 0

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from kantor_fleet.execution.verify import verdicts
+from kantor_fleet.execution.verify import findings
 from kantor_fleet.exits import Exit, fail
 from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.scenario.faults.base import Fault
@@ -64,7 +64,7 @@ def chaos_docker(storm: Path, project: str, patience_s: float) -> Exit:
     found = [
         *_judged(run, deeds, done, clock.speed),
         (code == 0, f"world-sim ended with exit code {code}"),
-        *verdicts(run),
+        *findings(run),
     ]
     for held, line in found:
         print(f"{'ok  ' if held else 'FAIL'}  {line}")

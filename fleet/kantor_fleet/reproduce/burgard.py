@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from kantor_fleet.reproduce import explored
-from kantor_fleet.reproduce.claims import Claim, MeanRatio, Same
-from kantor_fleet.reproduce.figure import Figure
+from kantor_fleet.reproduce.claims import Claim, IdenticalRuns, MeanRatio
+from kantor_fleet.reproduce.figure import PaperFigure
 from kantor_fleet.reproduce.measured_runs import Setting
 from kantor_fleet.reproduce.measures import distance_m, finished, map_row
 
@@ -112,7 +112,7 @@ def _claims(reading: Reading) -> Iterator[Claim]:
     name = reading.letter
     alone, alone_uncoordinated = (setting(1, coordinated=how) for how in (True, False))
     if reading.coordinated[0] == reading.uncoordinated[0]:
-        yield Same(
+        yield IdenticalRuns(
             f"{name}: 1 robot, coordinated and not",
             alone,
             alone_uncoordinated,
@@ -185,16 +185,16 @@ _RADIO = (
     ),
 )
 
-FIG_8 = Figure(
+FIG_8 = PaperFigure(
     "time to explore an office, coordinated and not",
     _RUNS,
     (*(claim for reading in READINGS for claim in _claims(reading)), *_RADIO),
-    lambda flights: explored.bars(
+    lambda measured: explored.bars(
         READINGS[0].setting(1, coordinated=True).find(),
         {
             f"({reading.letter}) {reading.text}": {
                 coordinated: {
-                    robots: flights[reading.setting(robots, coordinated=coordinated)]
+                    robots: measured[reading.setting(robots, coordinated=coordinated)]
                     for robots in TEAMS
                 }
                 for coordinated in (False, True)

@@ -19,7 +19,7 @@ TOLD = "told"
 """Neither the paper nor a reading of it says what it has to be."""
 
 
-class Verdict(NamedTuple):
+class ClaimVerdict(NamedTuple):
     """One line of the table."""
 
     figure: str
@@ -38,15 +38,15 @@ class Claim(Protocol):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """The settings that it needs flown."""
+        """The settings that it needs run."""
         ...
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """The line of the table."""
         ...
 
 
-class Median(NamedTuple):
+class MedianInBand(NamedTuple):
     """The median over the runs lies in a band."""
 
     text: str
@@ -64,15 +64,15 @@ class Median(NamedTuple):
         """One."""
         return (self.setting,)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """Median [quartiles] against the band."""
-        values = [self.measure(flight) for flight in flights[self.setting]]
+        values = [self.measure(run) for run in measured[self.setting]]
         first, median, third = quartiles(values)
         shown = [f"{value:.{self.digits}f}" for value in (median, first, third)]
         ours = f"{shown[0]} [{shown[1]}, {shown[2]}]{self.unit}"
         met = self.low <= median <= self.high
         verdict = MISS if not met else UNMATCHED if self.why else OK
-        return Verdict(figure, self.text, self.published, self._band, ours, verdict, self.why)
+        return ClaimVerdict(figure, self.text, self.published, self._band, ours, verdict, self.why)
 
     @property
     def _band(self) -> str:
@@ -82,7 +82,7 @@ class Median(NamedTuple):
         return f"≤ {high}{self.unit}" if math.isinf(self.low) else f"{low} to {high}{self.unit}"
 
 
-class Spread(NamedTuple):
+class NarrowestSpread(NamedTuple):
     """The quartiles of one setting lie closer together than those of all others."""
 
     text: str
@@ -97,19 +97,21 @@ class Spread(NamedTuple):
         """The narrow one first."""
         return (self.narrow, *self.others)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """Interquartile ranges."""
         ranges = []
         for setting in self.settings:
-            first, _, third = quartiles([self.measure(flight) for flight in flights[setting]])
+            first, _, third = quartiles([self.measure(run) for run in measured[setting]])
             ranges.append(third - first)
         ours = f"{ranges[0]:.1f} against " + ", ".join(f"{width:.1f}" for width in ranges[1:])
         met = ranges[0] < min(ranges[1:])
         verdict = OK if met else MISS
-        return Verdict(figure, self.text, self.published, "smallest", ours + self.unit, verdict)
+        return ClaimVerdict(
+            figure, self.text, self.published, "smallest", ours + self.unit, verdict
+        )
 
 
-class Ahead(NamedTuple):
+class PairedLead(NamedTuple):
     """One setting lies above another, seed by seed and, where asked, with intervals apart."""
 
     text: str
@@ -129,10 +131,10 @@ class Ahead(NamedTuple):
         """Upper, lower."""
         return (self.upper, self.lower)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """Means with 95 % intervals by Student's t, and the paired gap."""
         upper, lower = (
-            [self.measure(flight) for flight in flights[setting]] for setting in self.settings
+            [self.measure(run) for run in measured[setting]] for setting in self.settings
         )
         gap, half = interval([one - other for one, other in zip(upper, lower, strict=True)])
         (high, high_half), (low, low_half) = interval(upper), interval(lower)
@@ -143,10 +145,12 @@ class Ahead(NamedTuple):
             f"{high:.1f} ± {high_half:.1f} against {low:.1f} ± {low_half:.1f}{self.unit}, "
             f"paired {gap:+.1f} ± {half:.1f}"
         )
-        return Verdict(figure, self.text, self.published, self.reading, ours, OK if met else MISS)
+        return ClaimVerdict(
+            figure, self.text, self.published, self.reading, ours, OK if met else MISS
+        )
 
 
-class Range(NamedTuple):
+class WideRange(NamedTuple):
     """One run of each of several settings that hardly differ: how far apart the outcomes lie."""
 
     text: str
@@ -157,17 +161,17 @@ class Range(NamedTuple):
     measure: Measure
     unit: str
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """From the lowest to the highest."""
-        values = [self.measure(flights[setting][0]) for setting in self.settings]
+        values = [self.measure(measured[setting][0]) for setting in self.settings]
         low, high = min(values), max(values)
         ours = f"{low:.1f} to {high:.1f}{self.unit} over {len(values)} starts"
         reading = f"≥ {self.least:g} points apart"
         verdict = OK if high - low >= self.least else MISS
-        return Verdict(figure, self.text, self.published, reading, ours, verdict)
+        return ClaimVerdict(figure, self.text, self.published, reading, ours, verdict)
 
 
-class Ratio(NamedTuple):
+class MedianRatio(NamedTuple):
     """The ratio of two settings' medians, told and not judged: it depends on the implementation."""
 
     text: str
@@ -182,17 +186,17 @@ class Ratio(NamedTuple):
         """Over, under."""
         return (self.over, self.under)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """Medians, and one over the other."""
         over, under = (
-            statistics.median(self.measure(flight) for flight in flights[setting])
+            statistics.median(self.measure(run) for run in measured[setting])
             for setting in self.settings
         )
         ours = f"{over:.3f} s against {under:.3f} s: {over / under:.2f} times"
-        return Verdict(figure, self.text, self.published, "either", ours, UNMATCHED, self.why)
+        return ClaimVerdict(figure, self.text, self.published, "either", ours, UNMATCHED, self.why)
 
 
-class Share(NamedTuple):
+class RareShare(NamedTuple):
     """The share of runs in which something happens stays below a bound."""
 
     text: str
@@ -206,14 +210,14 @@ class Share(NamedTuple):
         """One."""
         return (self.setting,)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """Runs among all."""
-        runs = flights[self.setting]
-        count = sum(self.happens(flight) for flight in runs)
+        runs = measured[self.setting]
+        count = sum(self.happens(run) for run in runs)
         verdict = OK if count <= self.most * len(runs) else MISS
         reading = f"≤ {100.0 * self.most:.0f} %"
         ours = f"{100.0 * count / len(runs):.0f} % ({count} of {len(runs)})"
-        return Verdict(figure, self.text, self.published, reading, ours, verdict)
+        return ClaimVerdict(figure, self.text, self.published, reading, ours, verdict)
 
 
 class MeanRatio(NamedTuple):
@@ -234,14 +238,14 @@ class MeanRatio(NamedTuple):
         """Over, under."""
         return (self.over, self.under)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """The ratio with its 95 % bootstrap interval, whole starts drawn again."""
         over, under = (
-            [self.measure(flight) for flight in flights[setting]] for setting in self.settings
+            [self.measure(run) for run in measured[setting]] for setting in self.settings
         )
         ratio, low, high = mean_ratio(over, under)
         ours = f"{ratio:.2f} [{low:.2f}, {high:.2f}]"
-        return Verdict(
+        return ClaimVerdict(
             figure, self.text, self.published, self.reading, ours, self._verdict(ratio), self.why
         )
 
@@ -253,7 +257,7 @@ class MeanRatio(NamedTuple):
         return TOLD if math.isinf(self.low) and math.isinf(self.high) else OK
 
 
-class Same(NamedTuple):
+class IdenticalRuns(NamedTuple):
     """Two settings come to the same in every run."""
 
     text: str
@@ -267,18 +271,18 @@ class Same(NamedTuple):
         """Both."""
         return (self.one, self.other)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """Runs that agree in every measure, among all."""
-        pairs = list(zip(*(flights[setting] for setting in self.settings), strict=True))
+        pairs = list(zip(*(measured[setting] for setting in self.settings), strict=True))
         same = sum(
             all(measure(one) == measure(other) for measure in self.measures) for one, other in pairs
         )
         verdict = OK if same == len(pairs) else MISS
         ours = f"{same} of {len(pairs)} runs the same"
-        return Verdict(figure, self.text, self.published, "every run the same", ours, verdict)
+        return ClaimVerdict(figure, self.text, self.published, "every run the same", ours, verdict)
 
 
-class Lowest(NamedTuple):
+class LowestMean(NamedTuple):
     """Among the means of several settings the first is the lowest."""
 
     text: str
@@ -295,10 +299,10 @@ class Lowest(NamedTuple):
         """The first is the one in question."""
         return tuple(setting for _, setting in self.named)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """The means in order."""
         means = {
-            name: statistics.fmean(self.measure(flight) for flight in flights[setting])
+            name: statistics.fmean(self.measure(run) for run in measured[setting])
             for name, setting in self.named
         }
         first = means[self.named[0][0]]
@@ -314,14 +318,14 @@ class Lowest(NamedTuple):
         else:
             verdict = OK if lowest else UNMATCHED
         why = "" if lowest else self.why
-        return Verdict(figure, self.text, self.published, reading, ours, verdict, why)
+        return ClaimVerdict(figure, self.text, self.published, reading, ours, verdict, why)
 
 
 Group = tuple[Setting, ...]
 """Settings whose runs are taken together."""
 
 
-class GeometricRatio(NamedTuple):
+class GeometricMeanRatio(NamedTuple):
     """The geometric mean of ratios, run by run, over several settings stays below a bound."""
 
     text: str
@@ -340,19 +344,23 @@ class GeometricRatio(NamedTuple):
         """All of over, all of under."""
         return (*self.over, *self.under)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """The mean with its 95 % factor by Student's t on logarithms."""
-        ratios = list(paired_ratios(flights, self.over, self.under, self.measure))
+        ratios = list(paired_ratios(measured, self.over, self.under, self.measure))
         if not ratios:
             ours = "no runs"
-            return Verdict(figure, self.text, self.published, self.reading, ours, TOLD, self.why)
+            return ClaimVerdict(
+                figure, self.text, self.published, self.reading, ours, TOLD, self.why
+            )
         mean, factor = geometric(ratios)
         verdict = TOLD if math.isinf(self.most) else OK if mean <= self.most else MISS
         ours = f"{times(mean, factor)} (n = {len(ratios)})"
-        return Verdict(figure, self.text, self.published, self.reading, ours, verdict, self.why)
+        return ClaimVerdict(
+            figure, self.text, self.published, self.reading, ours, verdict, self.why
+        )
 
 
-class Lower(NamedTuple):
+class LowerThroughout(NamedTuple):
     """Of several pairs of groups the first lies below the second, setting by setting."""
 
     text: str
@@ -366,26 +374,28 @@ class Lower(NamedTuple):
         """Of all pairs."""
         return tuple(s for _, lower, upper in self.named for s in (*lower, *upper))
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """Lower over upper; missed if one lies above, beyond its interval if it has one."""
         ratios = {
             name: geometric(found)
             for name, lower, upper in self.named
-            if (found := list(self._ratios(flights, lower, upper)))
+            if (found := list(self._ratios(measured, lower, upper)))
         }
         ours = ", ".join(f"{name} {times(*ratio)}" for name, ratio in ratios.items())
         missed = any(
             mean > (factor if math.isfinite(factor) else 1.0) for mean, factor in ratios.values()
         )
         reading = "each below 1, or not clearly above"
-        return Verdict(figure, self.text, self.published, reading, ours, MISS if missed else OK)
+        return ClaimVerdict(
+            figure, self.text, self.published, reading, ours, MISS if missed else OK
+        )
 
-    def _ratios(self, flights: MeasuredRuns, lower: Group, upper: Group) -> Iterator[float]:
+    def _ratios(self, measured: MeasuredRuns, lower: Group, upper: Group) -> Iterator[float]:
         """Of geometric means, of settings that have runs: their starts are not the same ones."""
         for one, other in zip(lower, upper, strict=True):
-            if flights.get(one) and flights.get(other):
+            if measured.get(one) and measured.get(other):
                 low, high = (
-                    geometric(map(self.measure, flights[each]))[0] for each in (one, other)
+                    geometric(map(self.measure, measured[each]))[0] for each in (one, other)
                 )
                 yield low / high
 
@@ -403,11 +413,11 @@ def mean_ratio(
 
 
 def paired_ratios(
-    flights: MeasuredRuns, over: Group, under: Group, measure: Measure
+    measured: MeasuredRuns, over: Group, under: Group, measure: Measure
 ) -> Iterator[float]:
     """Of all runs that both of a pair of settings have, and whose measures are above 0."""
     for one, other in zip(over, under, strict=True):
-        for upper, lower in zip(flights.get(one, ()), flights.get(other, ()), strict=True):
+        for upper, lower in zip(measured.get(one, ()), measured.get(other, ()), strict=True):
             if measure(upper) > 0.0 and measure(lower) > 0.0:
                 yield measure(upper) / measure(lower)
 

@@ -66,7 +66,7 @@ def curves(panels: Mapping[int, Mapping[str, Sequence[MeasuredRun]]], name: str)
     places = figure.subplots(2, 2)
     for letter, axes, (robots, lines) in zip("abcd", places.flat, panels.items(), strict=True):
         for (label, runs), (colour, style, width) in zip(lines.items(), _LINES, strict=False):
-            ticks, mean = mean_curve([flight.course for flight in runs], name)
+            ticks, mean = mean_curve([run.course for run in runs], name)
             axes.plot(ticks, mean, color=colour, ls=style, lw=width, label=label)
             axes.plot(ticks[-1], mean[-1], "o", color=colour, ms=4.0)
         axes.set_xlim(left=0.0)
@@ -142,8 +142,7 @@ def _draw_bars(axes: Axes, sides: Mapping[bool, Runs], finished: Measure, period
         sides.items(), (-0.2, 0.2), (TEAM[1], TEAM[0]), strict=True
     ):
         means = [
-            interval([period_s * finished(flight) for flight in flights])
-            for flights in runs.values()
+            interval([period_s * finished(run) for run in team_runs]) for team_runs in runs.values()
         ]
         axes.bar(
             np.array(list(runs)) + shift,

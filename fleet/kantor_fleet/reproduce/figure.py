@@ -1,4 +1,4 @@
-"""A figure of a paper: what it needs flown, what it claims, how it is drawn and told."""
+"""A figure of a paper: what it needs run, what it claims, how it is drawn and told."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from kantor_fleet.sweep.table import Row
 from kantor_worldsim.observers.metrics.result import Result
 
 RunRequests = Mapping[Setting, Sequence[int]]
-"""The seeds that each setting is flown with."""
+"""The seeds that each setting is run with."""
 
 
 class ResultTable(NamedTuple):
@@ -24,7 +24,7 @@ class ResultTable(NamedTuple):
     """For a person, a text in every column."""
 
 
-class Figure(NamedTuple):
+class PaperFigure(NamedTuple):
     """A figure of a paper."""
 
     title: str
@@ -36,15 +36,15 @@ class Figure(NamedTuple):
     """What the CSV says of a run."""
     drawn: tuple[Setting, ...] = ()
     """Settings that are drawn, though nothing is claimed of them."""
-    part: Callable[[int], RunRequests] | None = None
+    select: Callable[[int], RunRequests] | None = None
     """What is flown if `runs` counts something else than the runs for each setting."""
     table: Callable[[MeasuredRuns], ResultTable] | None = None
     kept: bool = False
     """Finished runs are kept in the folder, so that the same command goes on from there."""
 
-    def orders(self) -> RunRequests:
-        """What it needs flown."""
-        if self.part is not None:
-            return self.part(self.runs)
+    def requests(self) -> RunRequests:
+        """What it needs run."""
+        if self.select is not None:
+            return self.select(self.runs)
         claimed = (setting for claim in self.claims for setting in claim.settings)
         return {setting: range(min(self.runs, setting.most)) for setting in (*claimed, *self.drawn)}

@@ -1,4 +1,4 @@
-"""The runs behind a figure: settings in, measured flights out."""
+"""The runs behind a figure: settings in, measured measured out."""
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import NamedTuple
 from kantor_fleet.execution.experiment import Case, Outcome, reason
 from kantor_fleet.execution.in_process_team import play, team
 from kantor_fleet.scenarios.catalog import find
-from kantor_fleet.sweep.plan import Key, plan
+from kantor_fleet.sweep.plan import RunKey, plan
 from kantor_protocol.base.machine import SUPERVISOR, Inputs, Outputs, StateMachine
 from kantor_protocol.node.recovery import KillableNode
 from kantor_protocol.scenario.schema import Scenario
@@ -17,7 +17,7 @@ from kantor_worldsim.record.records import Record
 from kantor_worldsim.world.world import WorldSetup
 
 EXACT_EVERY = 100
-"""Periods from one exact distance to the next, in the flights that have them."""
+"""Periods from one exact distance to the next, in the measured that have them."""
 
 
 class Setting(NamedTuple):
@@ -38,7 +38,7 @@ class Setting(NamedTuple):
         """The scenario itself."""
         return find(self.scenario, self.overrides)
 
-    def cases(self, seeds: Iterable[int]) -> list[tuple[Key, Case]]:
+    def cases(self, seeds: Iterable[int]) -> list[tuple[RunKey, Case]]:
         """Runs of it, each with what it is kept under."""
         text = ",".join(map(str, seeds))
         return list(plan(self.scenario, (), text, self.overrides, exact=self.exact).cases())
@@ -81,7 +81,7 @@ class _Timed:
         return outputs
 
 
-def run_all(case: Case) -> MeasuredRun:
+def run_measured(case: Case) -> MeasuredRun:
     """Run a case with every referee, and keep how it went."""
     try:
         return _run_one(case)

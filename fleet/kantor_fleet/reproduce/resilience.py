@@ -15,9 +15,9 @@ import numpy.typing as npt
 from matplotlib.figure import Figure as Picture
 
 from kantor_fleet.reproduce import drawing
-from kantor_fleet.reproduce.claims import MISS, OK, TOLD, Measure, Verdict
+from kantor_fleet.reproduce.claims import MISS, OK, TOLD, ClaimVerdict, Measure
 from kantor_fleet.reproduce.drawing import Course, Panel
-from kantor_fleet.reproduce.figure import Figure, ResultTable, RunRequests
+from kantor_fleet.reproduce.figure import PaperFigure, ResultTable, RunRequests
 from kantor_fleet.reproduce.kabir_lee import detected
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, Setting
 from kantor_fleet.reproduce.measures import finished
@@ -42,7 +42,7 @@ _TEAM = (
 )
 
 
-class Scourge(NamedTuple):
+class GradedFault(NamedTuple):
     """A kind of fault in several degrees."""
 
     name: str
@@ -74,14 +74,14 @@ def _losing(robots: float, seed: int) -> list[str]:
     ]
 
 
-SCOURGES = (
-    Scourge("drop rate", "%", (0, 10, 20, 30, 40, 50, 60), _dropping),
-    Scourge("halves parted, share of the mission", "%", (0, 12.5, 25, 37.5, 50), _parted),
-    Scourge("robots lost for good", "of 10", (0, 1, 2, 3, 4), _losing, seeded=True),
+GRADED_FAULTS = (
+    GradedFault("drop rate", "%", (0, 10, 20, 30, 40, 50, 60), _dropping),
+    GradedFault("halves parted, share of the mission", "%", (0, 12.5, 25, 37.5, 50), _parted),
+    GradedFault("robots lost for good", "of 10", (0, 1, 2, 3, 4), _losing, seeded=True),
 )
 
 
-class Aim(NamedTuple):
+class Objective(NamedTuple):
     """Something that is measured, and with how many points for each robot."""
 
     name: str
@@ -90,43 +90,45 @@ class Aim(NamedTuple):
     steps: int
 
 
-DETECTION = Aim("detected", " points", detected, _SCARCE)
-FINISHING = Aim("finishing", " ticks", finished, _PLENTY)
-AIMS = (DETECTION, FINISHING)
+DETECTION = Objective("detected", " points", detected, _SCARCE)
+FINISHING = Objective("finishing", " ticks", finished, _PLENTY)
+OBJECTIVES = (DETECTION, FINISHING)
 
 
-def setting(merge: str, aim: Aim, scourge: Scourge, degree: float, seed: int) -> Setting:
-    """What is flown with a seed."""
-    faults = ", ".join(scourge.faults(degree, seed)) if degree else ""
+def setting(
+    merge: str, objective: Objective, graded: GradedFault, degree: float, seed: int
+) -> Setting:
+    """What is each with a seed."""
+    faults = ", ".join(graded.faults(degree, seed)) if degree else ""
     return Setting(
         "fleet",
-        (*_TEAM, f"energy.steps={aim.steps}", *MERGES[merge], *((f"faults=[{faults}]",) if faults else ())),
+        (*_TEAM, f"energy.steps={objective.steps}", *MERGES[merge], *((f"faults=[{faults}]",) if faults else ())),
     )  # fmt: skip
 
 
-def part(runs: int) -> RunRequests:
+def requests(runs: int) -> RunRequests:
     """Every condition with every seed."""
-    orders: dict[Setting, set[int]] = {}
-    for aim in AIMS:
-        for scourge in SCOURGES:
-            for degree in scourge.degrees:
+    requested: dict[Setting, set[int]] = {}
+    for objective in OBJECTIVES:
+        for graded in GRADED_FAULTS:
+            for degree in graded.degrees:
                 for merge in MERGES:
                     for seed in range(runs):
-                        flown = setting(merge, aim, scourge, degree, seed)
-                        orders.setdefault(flown, set()).add(seed)
-    return {flown: sorted(seeds) for flown, seeds in orders.items()}
+                        each = setting(merge, objective, graded, degree, seed)
+                        requested.setdefault(each, set()).add(seed)
+    return {each: sorted(seeds) for each, seeds in requested.items()}
 
 
 def values(
-    flights: MeasuredRuns, merge: str, aim: Aim, scourge: Scourge, degree: float
+    measured: MeasuredRuns, merge: str, objective: Objective, graded: GradedFault, degree: float
 ) -> npt.NDArray[np.float64]:
     """(runs,) what was measured, in the order of the seeds."""
-    runs = len(flights[setting(merge, aim, scourge, 0, 0)])
+    runs = len(measured[setting(merge, objective, graded, 0, 0)])
     found: list[MeasuredRun] = []
     for seed in range(runs):
-        flown = flights[setting(merge, aim, scourge, degree, seed)]
-        found.append(flown[0 if scourge.seeded and degree else seed])
-    return np.array([aim.measure(flight) for flight in found])
+        each = measured[setting(merge, objective, graded, degree, seed)]
+        found.append(each[0 if graded.seeded and degree else seed])
+    return np.array([objective.measure(run) for run in found])
 
 
 class Estimate(NamedTuple):
@@ -150,110 +152,115 @@ class Estimate(NamedTuple):
         return f"{mean} [{low}, {high}]"
 
 
-class Better(NamedTuple):
-    """The ledger is better than the minimum in every degree of a scourge, seed by seed."""
+class LedgerLead(NamedTuple):
+    """The ledger is better than the minimum in every degree of a graded, seed by seed."""
 
-    aim: Aim
-    scourge: Scourge
+    objective: Objective
+    graded: GradedFault
 
     @property
     def settings(self) -> tuple[Setting, ...]:
         """Of no fault; the figure knows the others."""
-        return tuple(setting(merge, self.aim, self.scourge, 0, 0) for merge in MERGES)
+        return tuple(setting(merge, self.objective, self.graded, 0, 0) for merge in MERGES)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """The smallest gap, with its interval; ahead if every interval lies above 0."""
-        sign = 1.0 if self.aim is DETECTION else -1.0
+        sign = 1.0 if self.objective is DETECTION else -1.0
         gaps = {
-            degree: Estimate.of(sign * (self._values(flights, "ledger", degree) - self._values(flights, "min", degree)))
-            for degree in self.scourge.degrees
+            degree: Estimate.of(sign * (self._values(measured, "ledger", degree) - self._values(measured, "min", degree)))
+            for degree in self.graded.degrees
         }  # fmt: skip
         degree, least = min(gaps.items(), key=lambda item: item[1].low)
         met = all(gap.low > 0.0 for gap in gaps.values())
-        what = "more detected" if self.aim is DETECTION else "sooner finished"
-        return Verdict(
+        what = "more detected" if self.objective is DETECTION else "sooner finished"
+        return ClaimVerdict(
             figure,
-            f"{self.scourge.name}: ledger over min, {what}, in every degree",
+            f"{self.graded.name}: ledger over min, {what}, in every degree",
             "",
             "above 0",
-            f"least {least.text('+')}{self.aim.unit} at {degree:g} {self.scourge.unit}",
+            f"least {least.text('+')}{self.objective.unit} at {degree:g} {self.graded.unit}",
             OK if met else MISS,
         )
 
-    def _values(self, flights: MeasuredRuns, merge: str, degree: float) -> npt.NDArray[np.float64]:
-        return values(flights, merge, self.aim, self.scourge, degree)
+    def _values(self, measured: MeasuredRuns, merge: str, degree: float) -> npt.NDArray[np.float64]:
+        return values(measured, merge, self.objective, self.graded, degree)
 
 
-class Price(NamedTuple):
-    """What the worst degree of a scourge costs; told as measured."""
+class CostOfFault(NamedTuple):
+    """What the worst degree of a graded costs; told as measured."""
 
     merge: str
-    aim: Aim
-    scourge: Scourge
+    objective: Objective
+    graded: GradedFault
 
     @property
     def settings(self) -> tuple[Setting, ...]:
         """Of no fault; the figure knows the others."""
-        return (setting(self.merge, self.aim, self.scourge, 0, 0),)
+        return (setting(self.merge, self.objective, self.graded, 0, 0),)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """The paired change."""
-        worst = self.scourge.degrees[-1]
+        worst = self.graded.degrees[-1]
         none, much = (
-            values(flights, self.merge, self.aim, self.scourge, degree) for degree in (0, worst)
+            values(measured, self.merge, self.objective, self.graded, degree)
+            for degree in (0, worst)
         )
-        text = f"{self.scourge.name}: {self.merge}, {self.aim.name}, {worst:g} {self.scourge.unit} against none"
-        ours = f"{Estimate.of(much - none).text('+')}{self.aim.unit}"
-        return Verdict(figure, text, "", "as measured", ours, TOLD)
+        text = f"{self.graded.name}: {self.merge}, {self.objective.name}, {worst:g} {self.graded.unit} against none"
+        ours = f"{Estimate.of(much - none).text('+')}{self.objective.unit}"
+        return ClaimVerdict(figure, text, "", "as measured", ours, TOLD)
 
 
-def _estimates(flights: MeasuredRuns, merge: str, aim: Aim, scourge: Scourge) -> Iterator[Estimate]:
-    for degree in scourge.degrees:
-        yield Estimate.of(values(flights, merge, aim, scourge, degree))
+def _estimates(
+    measured: MeasuredRuns, merge: str, objective: Objective, graded: GradedFault
+) -> Iterator[Estimate]:
+    for degree in graded.degrees:
+        yield Estimate.of(values(measured, merge, objective, graded, degree))
 
 
-def _draw(flights: MeasuredRuns) -> Picture:
+def _draw(measured: MeasuredRuns) -> Picture:
     panels = [
         Panel(
-            f"{scourge.name}, {scourge.unit}",
-            "detected, % (energy scarce)" if aim is DETECTION else "finished, tick (energy plenty)",
+            f"{graded.name}, {graded.unit}",
+            "detected, % (energy scarce)"
+            if objective is DETECTION
+            else "finished, tick (energy plenty)",
             {
-                merge: Course(scourge.degrees, tuple(_estimates(flights, merge, aim, scourge)))
+                merge: Course(graded.degrees, tuple(_estimates(measured, merge, objective, graded)))
                 for merge in MERGES
             },
         )
-        for aim in AIMS
-        for scourge in SCOURGES
+        for objective in OBJECTIVES
+        for graded in GRADED_FAULTS
     ]
-    return drawing.resilience(panels, len(SCOURGES))
+    return drawing.resilience(panels, len(GRADED_FAULTS))
 
 
-def _table(flights: MeasuredRuns) -> ResultTable:
-    rows = list(_rows(flights))
+def _table(measured: MeasuredRuns) -> ResultTable:
+    rows = list(_rows(measured))
     shown: list[Row] = []
-    columns = [f"{merge}: {aim.name}" for aim in AIMS for merge in MERGES]
-    for scourge in SCOURGES:
-        for degree in scourge.degrees:
-            here = [r for r in rows if (r["fault"], r["degree"]) == (scourge.name, degree)]
+    columns = [f"{merge}: {objective.name}" for objective in OBJECTIVES for merge in MERGES]
+    for graded in GRADED_FAULTS:
+        for degree in graded.degrees:
+            here = [r for r in rows if (r["fault"], r["degree"]) == (graded.name, degree)]
             cells = [Estimate(r["mean"], r["low_95"], r["high_95"]).text() for r in here]
-            fault = f"{scourge.name}: {degree:g} {scourge.unit}"
-            shown.append({"fault": fault} | dict(zip(columns, cells, strict=True)))
+            condition = f"{graded.name}: {degree:g} {graded.unit}"
+            shown.append({"fault": condition} | dict(zip(columns, cells, strict=True)))
     runs = rows[0]["runs"]
     title = f"{ROBOTS} robots, N = {SAMPLES}, M = {POINTS}, mean [95 %] over {runs} seeds: detected, %; finished, tick"
     return ResultTable(title, rows, shown)
 
 
-def _rows(flights: MeasuredRuns) -> Iterator[Row]:
-    for scourge in SCOURGES:
-        for degree in scourge.degrees:
-            for aim in AIMS:
+def _rows(measured: MeasuredRuns) -> Iterator[Row]:
+    for graded in GRADED_FAULTS:
+        for degree in graded.degrees:
+            for objective in OBJECTIVES:
                 for merge in MERGES:
-                    sample = values(flights, merge, aim, scourge, degree)
+                    sample = values(measured, merge, objective, graded, degree)
                     mean, low, high = Estimate.of(sample)
                     yield {
-                        "fault": scourge.name,
+                        "fault": graded.name,
                         "degree": degree,
-                        "measure": aim.name,
+                        "measure": objective.name,
                         "merge": merge,
                         "runs": sample.size,
                         "mean": mean,
@@ -276,21 +283,26 @@ def _row(result: Result) -> Row:
     }
 
 
-def _claims() -> Iterator[Better | Price]:
-    yield from (Better(aim, scourge) for aim in AIMS for scourge in SCOURGES)
+def _claims() -> Iterator[LedgerLead | CostOfFault]:
     yield from (
-        Price(merge, aim, scourge) for aim in AIMS for scourge in SCOURGES for merge in MERGES
+        LedgerLead(objective, graded) for objective in OBJECTIVES for graded in GRADED_FAULTS
+    )
+    yield from (
+        CostOfFault(merge, objective, graded)
+        for objective in OBJECTIVES
+        for graded in GRADED_FAULTS
+        for merge in MERGES
     )
 
 
 FIGURES = {
-    "resilience": Figure(
+    "resilience": PaperFigure(
         "quality under loss: drop rate, partitions, lost robots",
         RUNS,
         tuple(_claims()),
         _draw,
         _row,
-        part=part,
+        select=requests,
         table=_table,
         kept=True,
     )

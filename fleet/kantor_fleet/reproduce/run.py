@@ -13,12 +13,12 @@ from kantor_fleet.execution.experiment import Case, Outcome
 from kantor_fleet.execution.pools import Pool
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
-from kantor_fleet.report.run_progress import RunsView, table_console
-from kantor_fleet.reproduce.claims import MISS, UNMATCHED, Verdict
-from kantor_fleet.reproduce.figure import Figure, ResultTable, RunRequests
+from kantor_fleet.report.run_progress import RunProgressView, table_console
+from kantor_fleet.reproduce.claims import MISS, UNMATCHED, ClaimVerdict
+from kantor_fleet.reproduce.figure import PaperFigure, ResultTable, RunRequests
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, Setting
-from kantor_fleet.sweep.journal import Journal
-from kantor_fleet.sweep.plan import Key
+from kantor_fleet.sweep.journal import RunsJournal
+from kantor_fleet.sweep.plan import RunKey
 from kantor_fleet.sweep.table import Row, write_csv
 from kantor_worldsim.observers.metrics.wasserstein_exact import available
 
@@ -32,7 +32,7 @@ RunsBySetting = Mapping[tuple[Setting, int], MeasuredRun]
 
 
 def reproduce(
-    figures: Mapping[str, Figure],
+    figures: Mapping[str, PaperFigure],
     runs: int | None,
     start: Callable[[Iterable[Case]], Pool],
     out: Path,
@@ -41,23 +41,25 @@ def reproduce(
     started = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     figures = {name: _affordable(figure, runs) for name, figure in figures.items()}
-    orders = _orders(figures.values())
+    requested = _requests(figures.values())
     with ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
         kept = any(figure.kept for figure in figures.values())
-        journal = stack.enter_context(Journal(out / RUNS, MeasuredRun)) if kept else None
-        flown = _run_all(orders, start, interrupts, journal)
+        journal = stack.enter_context(RunsJournal(out / RUNS, MeasuredRun)) if kept else None
+        measured = _run_all(requested, start, interrupts, journal)
         if interrupts.code is not None:
-            print(f"kantor: interrupted; {_left_off(orders, flown, journal)}", file=sys.stderr)
+            print(
+                f"kantor: interrupted; {_left_off(requested, measured, journal)}", file=sys.stderr
+            )
             return interrupts.code
-    broken = [flight for flight in flown.values() if flight.failed is not None]
-    failed = [flight for flight in broken if flight.result is None or journal is None]
+    broken = [run for run in measured.values() if run.failed is not None]
+    failed = [run for run in broken if run.result is None or journal is None]
     if failed:
         again = "; the same command runs these again" if journal else ""
         print(f"kantor: {len(failed)} runs failed; nothing was written{again}", file=sys.stderr)
         return Exit.NOT_MET
     verdicts = [
-        line for name, figure in figures.items() for line in _conclude(name, figure, flown, out)
+        line for name, figure in figures.items() for line in _conclude(name, figure, measured, out)
     ]
     _write_verdicts(out / "verdicts.csv", verdicts)
     _print(verdicts)
@@ -68,32 +70,34 @@ def reproduce(
     return Exit.NOT_MET if missed or broken else Exit.DONE
 
 
-def _left_off(orders: RunRequests, flown: RunsBySetting, journal: Journal | None) -> str:
+def _left_off(requested: RunRequests, measured: RunsBySetting, journal: RunsJournal | None) -> str:
     """What there is of an interrupted figure."""
     if journal is None:
         return "nothing was written"
-    total = sum(map(len, orders.values()))
-    return f"{len(flown)} of {total} runs are done; the same command goes on from there"
+    total = sum(map(len, requested.values()))
+    return f"{len(measured)} of {total} runs are done; the same command goes on from there"
 
 
-def _conclude(name: str, figure: Figure, flown: RunsBySetting, out: Path) -> list[Verdict]:
+def _conclude(
+    name: str, figure: PaperFigure, measured: RunsBySetting, out: Path
+) -> list[ClaimVerdict]:
     """Write the numbers and the picture of a figure, and judge its claims."""
-    flights = {
-        setting: [flown[setting, seed] for seed in seeds]
-        for setting, seeds in figure.orders().items()
+    by_setting = {
+        setting: [measured[setting, seed] for seed in seeds]
+        for setting, seeds in figure.requests().items()
     }
-    _write_runs(out / f"{name}.csv", figure, flights)
-    picture = figure.draw(flights)
+    _write_runs(out / f"{name}.csv", figure, by_setting)
+    picture = figure.draw(by_setting)
     picture.savefig(out / f"{name}.png", dpi=120)
     picture.savefig(out / f"{name}.pdf", metadata={"CreationDate": None})
     if figure.table is not None:
-        table = figure.table(flights)
+        table = figure.table(by_setting)
         write_csv(out / f"{name}-table.csv", list(table.rows[0]), table.rows)
         _print_table(table)
-    return [claim.judge(name, flights) for claim in figure.claims]
+    return [claim.judge(name, by_setting) for claim in figure.claims]
 
 
-def _affordable(figure: Figure, runs: int | None) -> Figure:
+def _affordable(figure: PaperFigure, runs: int | None) -> PaperFigure:
     """The figure with as many runs as asked for, without exact distances if there is no solver."""
     exact = available()
     claims = tuple(
@@ -104,11 +108,11 @@ def _affordable(figure: Figure, runs: int | None) -> Figure:
     return figure._replace(claims=claims, runs=runs or figure.runs)
 
 
-def _orders(figures: Iterable[Figure]) -> RunRequests:
+def _requests(figures: Iterable[PaperFigure]) -> RunRequests:
     """All seeds that some figure wants of a setting; the long settings first."""
     wanted: dict[Setting, set[int]] = {}
     for figure in figures:
-        for setting, seeds in figure.orders().items():
+        for setting, seeds in figure.requests().items():
             wanted.setdefault(setting, set()).update(seeds)
     return {
         setting: sorted(seeds)
@@ -117,35 +121,35 @@ def _orders(figures: Iterable[Figure]) -> RunRequests:
 
 
 def _run_all(
-    orders: RunRequests,
+    requested: RunRequests,
     start: Callable[[Iterable[Case]], Pool],
     interrupts: Interrupts,
-    journal: Journal | None,
+    journal: RunsJournal | None,
 ) -> RunsBySetting:
-    """What is not kept yet is flown, and kept if there is a journal."""
-    flown: dict[tuple[Setting, int], MeasuredRun] = {}
-    left: dict[Case, tuple[Setting, Key]] = {}
-    for setting, seeds in orders.items():
+    """What is not kept yet is measured, and kept if there is a journal."""
+    measured: dict[tuple[Setting, int], MeasuredRun] = {}
+    left: dict[Case, tuple[Setting, RunKey]] = {}
+    for setting, seeds in requested.items():
         for key, case in setting.cases(seeds):
             known = journal.outcomes.get(key) if journal is not None else None
             if isinstance(known, MeasuredRun) and known.result is not None:
-                flown[setting, case.seed] = known
+                measured[setting, case.seed] = known
             else:
                 left[case] = setting, key
     if not left:
-        return flown
-    with RunsView(len(left)) as view, closing(start(left)) as pool:
+        return measured
+    with RunProgressView(len(left)) as view, closing(start(left)) as pool:
         for done in pool:
             if done is not None:
                 case, outcome = done
-                (setting, key), flight = left[case], _measured(outcome)
-                flown[setting, case.seed] = flight
+                (setting, key), run = left[case], _measured(outcome)
+                measured[setting, case.seed] = run
                 if journal is not None:
-                    journal.add(key, flight)
+                    journal.add(key, run)
                 view.count(outcome.failed)
             if interrupts():
                 break
-    return flown
+    return measured
 
 
 def _measured(outcome: Outcome) -> MeasuredRun:
@@ -153,12 +157,12 @@ def _measured(outcome: Outcome) -> MeasuredRun:
     return outcome if isinstance(outcome, MeasuredRun) else MeasuredRun(failed=outcome.failed)
 
 
-def _write_verdicts(path: Path, verdicts: Sequence[Verdict]) -> None:
+def _write_verdicts(path: Path, verdicts: Sequence[ClaimVerdict]) -> None:
     """Beside those of other figures that were drawn into the same folder before."""
     anew = {line.figure for line in verdicts}
     before = _rows_of(path)
     kept = [row for row in before if row["figure"] not in anew]
-    write_csv(path, Verdict._fields, [*kept, *(line._asdict() for line in verdicts)])
+    write_csv(path, ClaimVerdict._fields, [*kept, *(line._asdict() for line in verdicts)])
 
 
 def _rows_of(path: Path) -> list[Row]:
@@ -167,16 +171,16 @@ def _rows_of(path: Path) -> list[Row]:
         return []
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    return rows if all(tuple(row) == Verdict._fields for row in rows) else []
+    return rows if all(tuple(row) == ClaimVerdict._fields for row in rows) else []
 
 
-def _write_runs(path: Path, figure: Figure, flights: MeasuredRuns) -> None:
+def _write_runs(path: Path, figure: PaperFigure, by_setting: MeasuredRuns) -> None:
     """Every run behind a figure."""
     rows = [
-        {"setting": setting.text, "seed": flight.result.seed, **figure.row(flight.result)}
-        for setting, runs in flights.items()
-        for flight in runs
-        if flight.result is not None
+        {"setting": setting.text, "seed": run.result.seed, **figure.row(run.result)}
+        for setting, runs in by_setting.items()
+        for run in runs
+        if run.result is not None
     ]
     write_csv(path, list(rows[0]), rows)
 
@@ -192,7 +196,7 @@ def _print_table(table: ResultTable) -> None:
     console.print(printed)
 
 
-def _print(verdicts: Sequence[Verdict]) -> None:
+def _print(verdicts: Sequence[ClaimVerdict]) -> None:
     console = table_console()
     table = Printed(box=None, pad_edge=False, header_style="bold")
     for name in ("figure", "claim", "published", "faithful reading", "ours", "verdict"):
@@ -210,7 +214,7 @@ def _print(verdicts: Sequence[Verdict]) -> None:
         console.print(f"  {figure}, {which}: {why}", highlight=False)
 
 
-def _reasons(verdicts: Sequence[Verdict]) -> dict[tuple[str, str], list[str]]:
+def _reasons(verdicts: Sequence[ClaimVerdict]) -> dict[tuple[str, str], list[str]]:
     """Figures and reasons, with the claims that they stand beside."""
     claims: dict[tuple[str, str], list[str]] = {}
     for line in verdicts:

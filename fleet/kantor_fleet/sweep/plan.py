@@ -25,7 +25,7 @@ class SweepError(ScenarioError):
     """A sweep that cannot be run; the message is one line with the place and the remedy."""
 
 
-class Key(NamedTuple):
+class RunKey(NamedTuple):
     """What a run is known by, whatever sweep asked for it."""
 
     scenario: str
@@ -65,11 +65,11 @@ class SweepPlan(NamedTuple):
         """The scenario's."""
         return self.variants[0].scenario.name
 
-    def key(self, variant: Variant, seed: int) -> Key:
+    def key(self, variant: Variant, seed: int) -> RunKey:
         """What the journal has a run under."""
-        return Key(variant.digest, code(), seed, self.exact)
+        return RunKey(variant.digest, code(), seed, self.exact)
 
-    def cases(self) -> Iterator[tuple[Key, Case]]:
+    def cases(self) -> Iterator[tuple[RunKey, Case]]:
         """All runs, seed by seed: a sweep that is cut short has every variant with the same seeds."""
         for seed in self.seeds:
             for variant in self.variants:

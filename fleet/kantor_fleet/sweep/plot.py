@@ -16,8 +16,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from kantor_fleet.report.style import FAINT, INK, TEXT_PT, TITLE_PT, add_caption, team_colours, tidy
 from kantor_fleet.sweep.plan import SweepPlan, Variant
-from kantor_fleet.sweep.summary import Line
-from kantor_fleet.sweep.table import Run, measures, replace
+from kantor_fleet.sweep.summary import SummaryRow
+from kantor_fleet.sweep.table import SweepRun, measures, replace
 
 SIZE_IN = (8.0, 5.0)
 DPI = 110
@@ -46,7 +46,7 @@ _NAMES = {
 
 
 def draw(
-    plan: SweepPlan, runs: Sequence[Run], lines: Sequence[Line], measure: str, path: Path
+    plan: SweepPlan, runs: Sequence[SweepRun], lines: Sequence[SummaryRow], measure: str, path: Path
 ) -> None:
     """Write the picture of a measure as PNG; no file if no run has it."""
     ours = [line for line in lines if line.measure == measure and line.runs.n]
@@ -77,9 +77,9 @@ def _axis(plan: SweepPlan) -> int | None:
     return None
 
 
-def _draw_lines(axes: Axes, plan: SweepPlan, lines: Sequence[Line], axis: int) -> None:
+def _draw_lines(axes: Axes, plan: SweepPlan, lines: Sequence[SummaryRow], axis: int) -> None:
     places = _place_values(axes, sorted({_number(line.variant, axis) for line in lines}))
-    groups: dict[str, list[Line]] = {}
+    groups: dict[str, list[SummaryRow]] = {}
     for line in lines:
         groups.setdefault(_label(plan, line.variant, axis), []).append(line)
     for (label, group), colour in zip(groups.items(), team_colours(len(groups)), strict=True):
@@ -115,7 +115,9 @@ def _number(variant: Variant, axis: int) -> float:
     return float(variant.values[axis])
 
 
-def _draw_boxes(axes: Axes, plan: SweepPlan, runs: Sequence[Run], lines: Sequence[Line]) -> None:
+def _draw_boxes(
+    axes: Axes, plan: SweepPlan, runs: Sequence[SweepRun], lines: Sequence[SummaryRow]
+) -> None:
     measure = lines[0].measure
     scale = _scale(measure)
     for place, (line, colour) in enumerate(zip(lines, team_colours(len(lines)), strict=True)):
@@ -150,7 +152,9 @@ def _label(plan: SweepPlan, variant: Variant, axis: int | None) -> str:
     return _GAP.join(words)
 
 
-def _write_title(place: SubFigure, plan: SweepPlan, runs: Sequence[Run], *, lines: bool) -> None:
+def _write_title(
+    place: SubFigure, plan: SweepPlan, runs: Sequence[SweepRun], *, lines: bool
+) -> None:
     """What was run, and what the marks are."""
     seeds = len({run.seed for run in runs})
     marks = "median of the runs, in a band of their quartiles" if lines else "every dot a run"

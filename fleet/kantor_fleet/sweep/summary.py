@@ -14,7 +14,7 @@ from rich.table import Table
 from scipy.stats import bootstrap
 
 from kantor_fleet.sweep.plan import SweepPlan, Variant
-from kantor_fleet.sweep.table import MEASURES, Row, Run, applies, measures
+from kantor_fleet.sweep.table import MEASURES, Row, SweepRun, applies, measures
 
 MAIN = (
     *("detection_rate", "finished_tick", "w_ub_paper", "w1_exact", "mass_left"),
@@ -28,7 +28,7 @@ _LEVEL = 0.95
 Numbers = npt.NDArray[np.float64]
 
 
-class Spread(NamedTuple):
+class Distribution(NamedTuple):
     """How numbers lie; None where there are too few."""
 
     n: int
@@ -40,7 +40,7 @@ class Spread(NamedTuple):
     high: float | None = None
 
     @classmethod
-    def of(cls, numbers: Numbers) -> "Spread":
+    def of(cls, numbers: Numbers) -> "Distribution":
         """The same numbers give the same interval: its draws are seeded."""
         if not numbers.size:
             return cls(0)
@@ -48,19 +48,19 @@ class Spread(NamedTuple):
         return cls(numbers.size, median, first, third, *_interval(numbers))
 
 
-class Line(NamedTuple):
+class SummaryRow(NamedTuple):
     """One measure of one variant."""
 
     variant: Variant
     measure: str
     failed: int
     """Runs without a result."""
-    runs: Spread
-    difference: Spread
+    runs: Distribution
+    difference: Distribution
     """Of the runs to those of the first variant with the same seeds."""
 
 
-def summarize(plan: SweepPlan, runs: Iterable[Run]) -> list[Line]:
+def summarize(plan: SweepPlan, runs: Iterable[SweepRun]) -> list[SummaryRow]:
     """A line for every variant and measure."""
     by_variant: dict[str, dict[int, Row]] = {variant.digest: {} for variant in plan.variants}
     for run in runs:
@@ -74,7 +74,7 @@ def summarize(plan: SweepPlan, runs: Iterable[Run]) -> list[Line]:
     ]
 
 
-def rows(plan: SweepPlan, lines: Iterable[Line]) -> list[Row]:
+def rows(plan: SweepPlan, lines: Iterable[SummaryRow]) -> list[Row]:
     """summary.csv."""
     return [
         dict(zip(plan.keys, line.variant.values, strict=True))
@@ -87,17 +87,17 @@ def rows(plan: SweepPlan, lines: Iterable[Line]) -> list[Row]:
 
 def columns(plan: SweepPlan) -> list[str]:
     """Of summary.csv."""
-    differences = [f"difference_{name}" for name in Spread._fields]
-    return [*plan.keys, "measure", "failed", *Spread._fields, *differences]
+    differences = [f"difference_{name}" for name in Distribution._fields]
+    return [*plan.keys, "measure", "failed", *Distribution._fields, *differences]
 
 
-def varying(runs: Iterable[Run], names: Sequence[str]) -> list[str]:
+def varying(runs: Iterable[SweepRun], names: Sequence[str]) -> list[str]:
     """Those measures that are not the same in all runs."""
     found = [measures(run.outcome.result) for run in runs]
     return [name for name in names if len({row[name] for row in found if row} - {None}) > 1]
 
 
-def table_of(plan: SweepPlan, lines: Iterable[Line], measure: str) -> Table:
+def table_of(plan: SweepPlan, lines: Iterable[SummaryRow], measure: str) -> Table:
     """One measure for a person; in brackets 95 % intervals."""
     table = Table(
         title=measure,
@@ -124,7 +124,7 @@ def _shown(value: float | None) -> str:
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
-def _cells(plan: SweepPlan, line: Line) -> list[str]:
+def _cells(plan: SweepPlan, line: SummaryRow) -> list[str]:
     first = line.variant is plan.variants[0]
     return [
         *line.variant.settings(plan.keys).values(),
@@ -135,22 +135,24 @@ def _cells(plan: SweepPlan, line: Line) -> list[str]:
     ]
 
 
-def _told(spread: Spread) -> str:
+def _told(spread: Distribution) -> str:
     if spread.low is None:
         return _shown(spread.median)
     return f"{_shown(spread.median)} [{_shown(spread.low)}, {_shown(spread.high)}]"
 
 
-def _line(variant: Variant, name: str, mine: Mapping[int, Row], first: Mapping[int, Row]) -> Line:
+def _line(
+    variant: Variant, name: str, mine: Mapping[int, Row], first: Mapping[int, Row]
+) -> SummaryRow:
     values = {seed: row[name] for seed, row in mine.items() if row.get(name) is not None}
     others = {seed: row[name] for seed, row in first.items() if row.get(name) is not None}
     differences = [value - others[seed] for seed, value in values.items() if seed in others]
-    return Line(
+    return SummaryRow(
         variant,
         name,
         sum(not row for row in mine.values()),
-        Spread.of(np.array([*values.values()], dtype=np.float64)),
-        Spread.of(np.array(differences, dtype=np.float64)),
+        Distribution.of(np.array([*values.values()], dtype=np.float64)),
+        Distribution.of(np.array(differences, dtype=np.float64)),
     )
 
 

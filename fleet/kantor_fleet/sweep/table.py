@@ -13,14 +13,14 @@ from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 import msgspec
 
 from kantor_fleet.execution.experiment import Outcome
-from kantor_fleet.sweep.plan import Key, SweepPlan, Value, Variant, text_of
+from kantor_fleet.sweep.plan import RunKey, SweepPlan, Value, Variant, text_of
 from kantor_worldsim.observers.metrics.result import Result
 
 Row = dict[str, Any]
 """A value for each column, None where there is none."""
 
 
-class Run(NamedTuple):
+class SweepRun(NamedTuple):
     """A finished run in its place in the plan."""
 
     variant: Variant
@@ -28,10 +28,10 @@ class Run(NamedTuple):
     outcome: Outcome
 
 
-def finished(plan: SweepPlan, outcomes: Mapping[Key, Outcome]) -> list[Run]:
+def finished(plan: SweepPlan, outcomes: Mapping[RunKey, Outcome]) -> list[SweepRun]:
     """What is there of a plan, in its order."""
     return [
-        Run(variant, seed, outcomes[plan.key(variant, seed)])
+        SweepRun(variant, seed, outcomes[plan.key(variant, seed)])
         for variant in plan.variants
         for seed in plan.seeds
         if plan.key(variant, seed) in outcomes
@@ -75,7 +75,7 @@ def columns(plan: SweepPlan) -> dict[str, type]:
     return {**varied, "seed": int, **found, "failed": str}
 
 
-def rows(plan: SweepPlan, runs: Iterable[Run]) -> list[Row]:
+def rows(plan: SweepPlan, runs: Iterable[SweepRun]) -> list[Row]:
     """The table's."""
     blank = dict.fromkeys(columns(plan))
     return [
@@ -95,7 +95,7 @@ def measures(result: Result | None) -> Row:
     return {name: flat.get(name) for name in RESULT}
 
 
-def timings(plan: SweepPlan, runs: Iterable[Run]) -> list[Row]:
+def timings(plan: SweepPlan, runs: Iterable[SweepRun]) -> list[Row]:
     """Who ran what, and for how long."""
     return [
         dict(zip(plan.keys, run.variant.values, strict=True))
