@@ -21,7 +21,7 @@ from kantor_fleet.reproduce import burgard, explored, kabir_lee, kme, papers
 from kantor_fleet.reproduce.claims import (
     MISS,
     OK,
-    TOLD,
+    REPORTED,
     UNMATCHED,
     GeometricMeanRatio,
     IdenticalRuns,
@@ -31,7 +31,7 @@ from kantor_fleet.reproduce.claims import (
     geometric,
     mean_ratio,
     paired_ratios,
-    times,
+    text_of_ratio,
 )
 from kantor_fleet.reproduce.figure import PaperFigure
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, Moment, Setting
@@ -72,7 +72,7 @@ def test_a_ratio_of_means_must_lie_in_its_band_and_needs_none() -> None:
     assert verdict(2, 4.1, high=0.75) == MISS
     assert verdict(2, 4, low=0.8, high=1.2) == MISS
     assert verdict(6, 2, low=0.8, high=1.2, why="it depends") == UNMATCHED
-    assert verdict(6, 60) == TOLD
+    assert verdict(6, 60) == REPORTED
 
 
 def test_a_ratio_of_means_comes_with_its_interval() -> None:
@@ -113,7 +113,7 @@ def test_what_must_be_the_same_is_so_in_every_run() -> None:
         (5, 9, ("there",), OK),
         (5, 1, ("there",), UNMATCHED),  # the reading does not have it below the third
         (1, 9, ("there",), MISS),
-        (1, 9, (), TOLD),
+        (1, 9, (), REPORTED),
     ],
 )
 def test_the_lowest_lies_below_those_that_a_reading_has_above(
@@ -137,9 +137,9 @@ def test_geometric_ratios_take_the_runs_that_there_are() -> None:
 
     assert (line.verdict, line.ours) == (OK, "0.50 x÷ 1.00 (n = 2)")
     assert claim._replace(most=0.4).judge("fig0", found).verdict == MISS
-    assert claim._replace(most=math.inf).judge("fig0", found).verdict == TOLD
+    assert claim._replace(most=math.inf).judge("fig0", found).verdict == REPORTED
     assert claim.judge("fig0", {}).ours == "no runs"
-    assert times(*geometric([2.0])) == "2.00"
+    assert text_of_ratio(*geometric([2.0])) == "2.00"
 
 
 @given(st.lists(POSITIVE, min_size=2, max_size=20))
@@ -439,7 +439,7 @@ def test_a_run_that_broke_a_rule_counts_and_is_told(
     code = reproduce({"a": simple_figure()}, None, pool_of(good, bad), tmp_path)
 
     assert code == Exit.NOT_MET
-    assert "1 runs broke a rule, and count all the same: too fast" in capsys.readouterr().out
+    assert "1 runs broke a rule and are counted nevertheless: too fast" in capsys.readouterr().out
     assert len(rows_of(tmp_path / "a.csv")) == 2
     nothing = pool_of()  # both are kept
     assert reproduce({"a": simple_figure()}, None, nothing, tmp_path) == Exit.NOT_MET

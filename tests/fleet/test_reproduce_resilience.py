@@ -9,7 +9,7 @@ import pytest
 
 from kantor_fleet.execution.experiment import Case
 from kantor_fleet.reproduce import papers
-from kantor_fleet.reproduce.claims import MISS, OK, TOLD
+from kantor_fleet.reproduce.claims import MISS, OK, REPORTED
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, run_measured
 from kantor_fleet.reproduce.resilience import (
     DETECTION,
@@ -147,7 +147,7 @@ def test_what_is_worse_in_one_degree_is_missed(objective: Objective) -> None:
 def test_a_price_is_told() -> None:
     verdict = CostOfFault("min", FINISHING, DROPPING).judge("resilience", made_up(plain))
 
-    assert verdict.verdict == TOLD
+    assert verdict.verdict == REPORTED
     assert verdict.ours == "+60.0 [+60.0, +60.0] ticks"
 
 

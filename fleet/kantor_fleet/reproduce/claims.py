@@ -1,4 +1,7 @@
-"""Claims of a paper: what it publishes, what a faithful reading gives, what we measure, a verdict."""
+"""Claims of a paper: each compares a published value, that of a faithful reading, and measured runs.
+
+A *faithful reading* is an independent simulator that follows the paper.
+"""
 
 import math
 import statistics
@@ -14,19 +17,19 @@ Measure = Callable[[MeasuredRun], float]
 
 OK, MISS = "ok", "MISS"
 UNMATCHED = "ok, not the paper's"
-"""Ours agrees with the faithful reading, which cannot give what was published."""
-TOLD = "told"
-"""Neither the paper nor a reading of it says what it has to be."""
+"""The measured value agrees with the faithful reading, and no faithful reading can give the published one."""
+REPORTED = "reported"
+"""Reported, not judged: neither the paper nor a reading of it gives a bound."""
 
 
 class ClaimVerdict(NamedTuple):
-    """One line of the table."""
+    """A row of the table of verdicts."""
 
     figure: str
     claim: str
     published: str
     reading: str
-    """What a faithful reading gives: a band, or a relation."""
+    """The value of a faithful reading: a band, or a relation."""
     ours: str
     verdict: str
     why: str = ""
@@ -34,15 +37,15 @@ class ClaimVerdict(NamedTuple):
 
 
 class Claim(Protocol):
-    """Something that a figure says."""
+    """A statement of a figure that runs can confirm or miss."""
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """The settings that it needs run."""
+        """The settings whose runs it needs."""
         ...
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """The line of the table."""
+        """The row of the table of verdicts."""
         ...
 
 
@@ -61,7 +64,7 @@ class MedianInBand(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """One."""
+        """The one setting."""
         return (self.setting,)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
@@ -98,7 +101,7 @@ class NarrowestSpread(NamedTuple):
         return (self.narrow, *self.others)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """Interquartile ranges."""
+        """The interquartile ranges."""
         ranges = []
         for setting in self.settings:
             first, _, third = quartiles([self.measure(run) for run in measured[setting]])
@@ -112,7 +115,7 @@ class NarrowestSpread(NamedTuple):
 
 
 class PairedLead(NamedTuple):
-    """One setting lies above another, seed by seed and, where asked, with intervals apart."""
+    """One setting lies above another, seed by seed and, if `apart`, with separate intervals."""
 
     text: str
     upper: Setting
@@ -122,13 +125,13 @@ class PairedLead(NamedTuple):
     measure: Measure
     unit: str
     apart: bool = False
-    """Also the 95 % intervals of the two means must not overlap."""
+    """The 95 % intervals of the two means must not overlap either."""
     sure: bool = True
-    """The reading itself is significant; if not, any sign is in order."""
+    """The reading itself is significant; if it is not, either sign meets the claim."""
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Upper, lower."""
+        """The upper and the lower setting."""
         return (self.upper, self.lower)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
@@ -151,18 +154,18 @@ class PairedLead(NamedTuple):
 
 
 class WideRange(NamedTuple):
-    """One run of each of several settings that hardly differ: how far apart the outcomes lie."""
+    """One run of each of several settings that hardly differ: the outcomes lie at least so far apart."""
 
     text: str
     settings: tuple[Setting, ...]
     published: str
     least: float
-    """How far apart, at least."""
+    """The least distance from the lowest to the highest outcome."""
     measure: Measure
     unit: str
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """From the lowest to the highest."""
+        """The lowest and the highest outcome."""
         values = [self.measure(measured[setting][0]) for setting in self.settings]
         low, high = min(values), max(values)
         ours = f"{low:.1f} to {high:.1f}{self.unit} over {len(values)} starts"
@@ -172,7 +175,7 @@ class WideRange(NamedTuple):
 
 
 class MedianRatio(NamedTuple):
-    """The ratio of two settings' medians, told and not judged: it depends on the implementation."""
+    """The ratio of two settings' medians, reported and not judged: it depends on the implementation."""
 
     text: str
     over: Setting
@@ -183,11 +186,11 @@ class MedianRatio(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Over, under."""
+        """The settings over and under."""
         return (self.over, self.under)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """Medians, and one over the other."""
+        """Both medians and their ratio."""
         over, under = (
             statistics.median(self.measure(run) for run in measured[setting])
             for setting in self.settings
@@ -207,11 +210,11 @@ class RareShare(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """One."""
+        """The one setting."""
         return (self.setting,)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """Runs among all."""
+        """The number of runs in which it happens, among all."""
         runs = measured[self.setting]
         count = sum(self.happens(run) for run in runs)
         verdict = OK if count <= self.most * len(runs) else MISS
@@ -235,11 +238,11 @@ class MeanRatio(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Over, under."""
+        """The settings over and under."""
         return (self.over, self.under)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """The ratio with its 95 % bootstrap interval, whole starts drawn again."""
+        """The ratio with its 95 % bootstrap interval; whole starts are resampled."""
         over, under = (
             [self.measure(run) for run in measured[setting]] for setting in self.settings
         )
@@ -254,11 +257,11 @@ class MeanRatio(NamedTuple):
             return MISS
         if self.why:
             return UNMATCHED
-        return TOLD if math.isinf(self.low) and math.isinf(self.high) else OK
+        return REPORTED if math.isinf(self.low) and math.isinf(self.high) else OK
 
 
 class IdenticalRuns(NamedTuple):
-    """Two settings come to the same in every run."""
+    """Two settings give equal measures in every run."""
 
     text: str
     one: Setting
@@ -268,11 +271,11 @@ class IdenticalRuns(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Both."""
+        """Both settings."""
         return (self.one, self.other)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """Runs that agree in every measure, among all."""
+        """The number of runs that agree in every measure, among all."""
         pairs = list(zip(*(measured[setting] for setting in self.settings), strict=True))
         same = sum(
             all(measure(one) == measure(other) for measure in self.measures) for one, other in pairs
@@ -290,9 +293,9 @@ class LowestMean(NamedTuple):
     published: str
     measure: Measure
     above: tuple[str, ...] = ()
-    """Which ones a faithful reading has above the first; none: it is told, not judged."""
+    """The names that a faithful reading has above the first; with none the claim is reported, not judged."""
     why: str = ""
-    """Why a faithful reading does not have it below the others too."""
+    """Why a faithful reading does not have the first below the others too."""
 
     @property
     def settings(self) -> tuple[Setting, ...]:
@@ -300,7 +303,7 @@ class LowestMean(NamedTuple):
         return tuple(setting for _, setting in self.named)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """The means in order."""
+        """All means in order."""
         means = {
             name: statistics.fmean(self.measure(run) for run in measured[setting])
             for name, setting in self.named
@@ -312,7 +315,7 @@ class LowestMean(NamedTuple):
         reading = f"below {' and '.join(self.above)}" if self.above else "either"
         lowest = first == min(means.values())
         if not self.above:
-            verdict = TOLD
+            verdict = REPORTED
         elif any(first >= means[name] for name in self.above):
             verdict = MISS
         else:
@@ -331,17 +334,17 @@ class GeometricMeanRatio(NamedTuple):
     text: str
     over: Group
     under: Group
-    """Each beside the one of `over` that has the same place."""
+    """Compared with the setting of `over` at the same place."""
     published: str
     reading: str
     measure: Measure
     most: float = math.inf
-    """Infinite: it is told, not judged."""
+    """Infinite: the claim is reported, not judged."""
     why: str = ""
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """All of over, all of under."""
+        """The settings over and under."""
         return (*self.over, *self.under)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
@@ -350,38 +353,38 @@ class GeometricMeanRatio(NamedTuple):
         if not ratios:
             ours = "no runs"
             return ClaimVerdict(
-                figure, self.text, self.published, self.reading, ours, TOLD, self.why
+                figure, self.text, self.published, self.reading, ours, REPORTED, self.why
             )
         mean, factor = geometric(ratios)
-        verdict = TOLD if math.isinf(self.most) else OK if mean <= self.most else MISS
-        ours = f"{times(mean, factor)} (n = {len(ratios)})"
+        verdict = REPORTED if math.isinf(self.most) else OK if mean <= self.most else MISS
+        ours = f"{text_of_ratio(mean, factor)} (n = {len(ratios)})"
         return ClaimVerdict(
             figure, self.text, self.published, self.reading, ours, verdict, self.why
         )
 
 
 class LowerThroughout(NamedTuple):
-    """Of several pairs of groups the first lies below the second, setting by setting."""
+    """In each of several pairs of groups, the first lies below the second, setting by setting."""
 
     text: str
-    named: tuple[tuple[str, Group, Group], ...]
-    """Name, lower, upper; in both groups the same place stands for the same thing."""
+    pairs: tuple[tuple[str, Group, Group], ...]
+    """Name, lower, upper; settings at the same place of both groups are compared."""
     published: str
     measure: Measure
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Of all pairs."""
-        return tuple(s for _, lower, upper in self.named for s in (*lower, *upper))
+        """The settings of all pairs."""
+        return tuple(s for _, lower, upper in self.pairs for s in (*lower, *upper))
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """Lower over upper; missed if one lies above, beyond its interval if it has one."""
+        """The ratios lower over upper; missed if one lies above 1, beyond its interval if it has one."""
         ratios = {
             name: geometric(found)
-            for name, lower, upper in self.named
+            for name, lower, upper in self.pairs
             if (found := list(self._ratios(measured, lower, upper)))
         }
-        ours = ", ".join(f"{name} {times(*ratio)}" for name, ratio in ratios.items())
+        ours = ", ".join(f"{name} {text_of_ratio(*ratio)}" for name, ratio in ratios.items())
         missed = any(
             mean > (factor if math.isfinite(factor) else 1.0) for mean, factor in ratios.values()
         )
@@ -391,7 +394,7 @@ class LowerThroughout(NamedTuple):
         )
 
     def _ratios(self, measured: MeasuredRuns, lower: Group, upper: Group) -> Iterator[float]:
-        """Of geometric means, of settings that have runs: their starts are not the same ones."""
+        """Ratios of geometric means, for settings with runs; their starts differ, so that runs cannot be paired."""
         for one, other in zip(lower, upper, strict=True):
             if measured.get(one) and measured.get(other):
                 low, high = (
@@ -403,7 +406,7 @@ class LowerThroughout(NamedTuple):
 def mean_ratio(
     over: Sequence[float], under: Sequence[float], resamples: int = 10_000
 ) -> tuple[float, float, float]:
-    """Ratio of means and its 95 % percentile interval; pairs are drawn together, the same every time."""
+    """Ratio of means and its 95 % percentile interval; pairs are resampled together, with a fixed seed."""
     pairs = np.array([over, under], dtype=np.float64)
     drawn = np.random.default_rng(0).integers(0, pairs.shape[1], (resamples, pairs.shape[1]))
     means = pairs[:, drawn].mean(axis=2)
@@ -415,7 +418,7 @@ def mean_ratio(
 def paired_ratios(
     measured: MeasuredRuns, over: Group, under: Group, measure: Measure
 ) -> Iterator[float]:
-    """Of all runs that both of a pair of settings have, and whose measures are above 0."""
+    """Ratios of the runs that both of a pair of settings have, where both measures are above 0."""
     for one, other in zip(over, under, strict=True):
         for upper, lower in zip(measured.get(one, ()), measured.get(other, ()), strict=True):
             if measure(upper) > 0.0 and measure(lower) > 0.0:
@@ -428,8 +431,8 @@ def geometric(values: Iterable[float]) -> tuple[float, float]:
     return math.exp(mean), math.exp(half)
 
 
-def times(mean: float, factor: float) -> str:
-    """A geometric mean and its factor, for a person."""
+def text_of_ratio(mean: float, factor: float) -> str:
+    """A geometric mean and its factor, for printing."""
     return f"{mean:.2f} x÷ {factor:.2f}" if math.isfinite(factor) else f"{mean:.2f}"
 
 

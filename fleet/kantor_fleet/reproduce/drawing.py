@@ -1,4 +1,4 @@
-"""The paper's figures, drawn from records and rows. A run that is drawn has seed 0 unless told."""
+"""The figures of papers on densities, drawn from records and rows of runs, by default of seed 0."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -35,7 +35,7 @@ from kantor_worldsim.observers.metrics.density import DensityRow
 from kantor_worldsim.record.records import Batch, Opening
 
 _MAP_IN = 4.4
-"""Width of one map."""
+"""Width of one map, inches."""
 
 
 def centralized(setting: Setting, run: MeasuredRun) -> Figure:
@@ -79,7 +79,7 @@ def trajectories(settings: Mapping[str, Setting]) -> Figure:
 
 
 def moving(settings: Mapping[str, Setting]) -> Figure:
-    """Figure 8: three moments of each, one above the other."""
+    """Figure 8: snapshots of two settings at three ticks, one setting above the other."""
     figure, axes = _panels(2, 3)
     for row, (name, setting) in enumerate(settings.items()):
         places = axes[3 * row : 3 * row + 3]
@@ -143,20 +143,20 @@ def diffusion(
     return figure
 
 
-class Course(NamedTuple):
-    """A line of means."""
+class Curve(NamedTuple):
+    """A line of means with their intervals."""
 
     x: Sequence[float]
     estimates: Sequence[tuple[float, float, float]]
-    """Mean, and the ends of its interval."""
+    """The mean and the ends of its interval, for each x."""
 
 
 class Panel(NamedTuple):
-    """A diagram of lines."""
+    """A diagram of curves."""
 
     x_label: str
     y_label: str
-    courses: Mapping[str, Course]
+    curves: Mapping[str, Curve]
 
 
 def resilience(panels: Sequence[Panel], columns: int) -> Figure:
@@ -166,11 +166,11 @@ def resilience(panels: Sequence[Panel], columns: int) -> Figure:
     )
     places = figure.subplots(len(panels) // columns, columns, squeeze=False, sharey="row")
     for letter, axes, panel in zip("abcdefgh", places.flat, panels, strict=False):
-        for (name, course), colour in zip(panel.courses.items(), (SECOND, THIRD), strict=False):
-            mean, low, high = np.array(course.estimates).T
-            axes.fill_between(course.x, low, high, color=colour, alpha=0.22, lw=0.0)
-            axes.plot(course.x, mean, color=colour, marker="o", ms=4.0, lw=1.6, label=name)
-        axes.set_xticks(panel.courses[next(iter(panel.courses))].x)
+        for (name, curve), colour in zip(panel.curves.items(), (SECOND, THIRD), strict=False):
+            mean, low, high = np.array(curve.estimates).T
+            axes.fill_between(curve.x, low, high, color=colour, alpha=0.22, lw=0.0)
+            axes.plot(curve.x, mean, color=colour, marker="o", ms=4.0, lw=1.6, label=name)
+        axes.set_xticks(panel.curves[next(iter(panel.curves))].x)
         tidy(axes, panel.x_label, panel.y_label if axes in places[:, 0] else "")
         write_title(axes, f"({letter})")
     for row in places:
@@ -186,7 +186,7 @@ def _panels(rows: int, columns: int) -> tuple[Figure, list[Axes]]:
 
 
 def new_layout() -> ConstrainedLayoutEngine:
-    """Of a picture of several diagrams."""
+    """The layout of a picture of several diagrams."""
     return ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
 
 
@@ -209,13 +209,13 @@ def _snapshots(
 
 
 def _runs_at(setting: Setting, ticks: Sequence[int], seed: int = 0) -> Iterator[RunHistory]:
-    """The run at each of some ticks; it goes on when the next one is asked for."""
+    """The history of a run up to each of some ticks: one object, which advances with the iterator."""
     records = iter(records_of(setting, seed))
     opening = next(records)
     assert isinstance(opening, Opening)
     run, waiting = RunHistory(opening), next(records, None)
     for tick in ticks:
-        until_ns = (tick + 1) * run.scenario.period_ns  # robots act at any phase of a period
+        until_ns = (tick + 1) * run.scenario.period_ns  # robots step at any phase of a period
         while isinstance(waiting, Batch) and waiting.now_ns < until_ns:
             run.follow(waiting)
             waiting = next(records, None)
@@ -234,12 +234,12 @@ def _map(axes: Axes, run: RunHistory) -> None:
 
 
 def write_title(axes: Axes, text: str) -> None:
-    """Above a diagram."""
+    """Write a title above a diagram."""
     axes.set_title(text, size=TEXT_PT + 0.5, color=INK, loc="left")
 
 
 def legend_below(figure: FigureBase, axes: Axes) -> None:
-    """One legend for all diagrams, below them. axes: one that has all there is."""
+    """Add one legend for all diagrams, below them. axes: a diagram that has every label."""
     handles, labels = axes.get_legend_handles_labels()
     known = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
     if not set(labels) - known:
@@ -278,7 +278,7 @@ def _bounds(axes: Axes, run: MeasuredRun) -> None:
 
 
 def _boxes(axes: Axes, groups: Mapping[str, Sequence[float]]) -> None:
-    """Boxes with every run beside them."""
+    """Draw boxes with every run beside them."""
     plot = axes.boxplot(
         list(groups.values()),
         tick_labels=list(groups),
@@ -290,5 +290,7 @@ def _boxes(axes: Axes, groups: Mapping[str, Sequence[float]]) -> None:
     for box, colour in zip(plot["boxes"], TEAM, strict=False):
         box.set(facecolor=colour, alpha=0.75, edgecolor=INK, linewidth=0.8)
     for place, values in enumerate(groups.values(), 1):
-        shift = 0.12 * np.sin(2.4 * np.arange(len(values)))  # apart, the same every time
+        shift = 0.12 * np.sin(
+            2.4 * np.arange(len(values))
+        )  # spread over the box, the same every time
         axes.scatter(place + shift, values, s=7.0, c=INK, alpha=0.35, linewidths=0.0, zorder=3.0)

@@ -1,4 +1,4 @@
-"""A figure of a paper: what it needs run, what it claims, how it is drawn and told."""
+"""A figure of a paper: the runs that it needs, its claims, its drawing and its table."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -11,17 +11,17 @@ from kantor_fleet.sweep.table import Row
 from kantor_worldsim.observers.metrics.result import Result
 
 RunRequests = Mapping[Setting, Sequence[int]]
-"""The seeds that each setting is run with."""
+"""The seeds to run of each setting."""
 
 
 class ResultTable(NamedTuple):
-    """Numbers that a figure tells beside its claims."""
+    """Numbers that a figure prints beside its claims."""
 
     title: str
     rows: list[Row]
-    """As in the CSV."""
+    """The rows of the CSV file."""
     shown: list[Row]
-    """For a person, a text in every column."""
+    """The rows that are printed, with a text in every column."""
 
 
 class PaperFigure(NamedTuple):
@@ -29,18 +29,18 @@ class PaperFigure(NamedTuple):
 
     title: str
     runs: int
-    """For each setting, as in the paper where it says so."""
+    """Runs of each setting, as in the paper where it gives a number."""
     claims: tuple[Claim, ...]
     draw: Callable[[MeasuredRuns], Picture]
     row: Callable[[Result], Row]
-    """What the CSV says of a run."""
+    """The columns of a run in the CSV file."""
     drawn: tuple[Setting, ...] = ()
-    """Settings that are drawn, though nothing is claimed of them."""
+    """Settings that are drawn without a claim about them."""
     select: Callable[[int], RunRequests] | None = None
-    """What is flown if `runs` counts something else than the runs for each setting."""
+    """The runs that it needs, where `runs` counts something else than the runs of each setting."""
     table: Callable[[MeasuredRuns], ResultTable] | None = None
     kept: bool = False
-    """Finished runs are kept in the folder, so that the same command goes on from there."""
+    """Finished runs are kept in the folder, so that the same command resumes from there."""
 
     def requests(self) -> RunRequests:
         """What it needs run."""

@@ -1,4 +1,4 @@
-"""Kabir & Lee, section VI: figures 4 to 9, what they claim, and what a faithful reading gives.
+"""Kabir & Lee, section VI: figures 4 to 9, their claims, and the values of a faithful reading.
 
 The readings (bands) are those of an independent simulator that follows the paper, not of this code:
 robots one after another within a tick, a step of 10 m, three samples in a plan.
@@ -25,7 +25,7 @@ _CONCURRENT = ("clock.order=concurrent",)
 _LEDGER = ("merge=ledger", "claims=true")
 _MINIMUM = ("merge=min", "claims=false")
 _FEW_ROWS = ("metrics.every=1000",)
-"""For settings of which only the outcome counts."""
+"""For settings whose curves are not drawn."""
 _ANYWHERE = ("starts.random=true", *_FEW_ROWS)
 
 
@@ -34,7 +34,7 @@ def _spectral(modes: int) -> tuple[str, ...]:
 
 
 def _moved(number: int) -> str:
-    """Section VI-A's starts, each moved by up to 2 mm, another way for every number."""
+    """Section VI-A's starts, each moved by up to 2 mm, in another direction for every number."""
     starts_m = ((1000, 1200), (1600, 800), (1400, 1300), (300, 800), (600, 1200))
     moved_m = [
         [x + 0.001 * ((number + i) % 5 - 2), y + 0.001 * ((number // 5 + i) % 5 - 2)]
@@ -50,7 +50,7 @@ A_SPECTRAL = Setting("paper-centralized", _spectral(15))
 A_NEARBY = tuple(
     Setting("paper-centralized", (*_spectral(15), *_FEW_ROWS, _moved(i)), most=1) for i in range(24)
 )
-"""The same from starts that are moved by a millimetre or two."""
+"""The same mission from starts that are moved by up to 2 mm."""
 A_MINIMUM = Setting("paper-centralized-concurrent", _FEW_ROWS)
 A_LEDGER = Setting("paper-centralized-concurrent", _LEDGER + _FEW_ROWS)
 
@@ -65,7 +65,7 @@ FLEET_MINIMUM = Setting("fleet", _MINIMUM + _FEW_ROWS)
 FLEET_LEDGER = Setting("fleet", _FEW_ROWS)
 
 DIFFUSIONS_M = (1, 3, 5, 7, 9, 12, 15)
-"""The paper does not list its v; these span its plot."""
+"""Diffusion rates v in m a tick. The paper does not list its v; these span its plot."""
 D_VARYING = {
     v: Setting(
         "paper-timevarying", (f"targets.diffusion_m={v}", f"samples.diffusion_m={v}", *_FEW_ROWS)
@@ -88,7 +88,7 @@ _D_READING = {
 
 
 def detected(run: MeasuredRun) -> float:
-    """Per cent of the targets."""
+    """Targets detected, per cent."""
     assert run.result is not None
     return 100.0 * (run.result.detection_rate or 0.0)
 
@@ -101,7 +101,7 @@ def first_contact(run: MeasuredRun) -> float:
 
 
 def drop_at_contact(run: MeasuredRun) -> float:
-    """Fall of the bound's current part from before the first contact until both have heard, per cent.
+    """Fall of the bound's current part, from before the first contact until both robots have heard, per cent.
 
     The paper merges both vectors in one tick; here each robot's message takes its own step.
     """
@@ -113,7 +113,7 @@ def drop_at_contact(run: MeasuredRun) -> float:
 
 
 def loosest(run: MeasuredRun) -> float:
-    """The tight bound over the exact distance, at its loosest over the mission."""
+    """The largest ratio of the tight bound to the exact distance in a mission."""
     return max(
         row.w_ub_tight / row.w1_exact
         for row in run.rows
@@ -177,10 +177,10 @@ FIG_4 = PaperFigure(
         ),
         MedianInBand("VI-A: tight W_UB over exact W_1, loosest", A_EXACT, "", 1.0, 1.8, loosest, 2),
         MedianInBand(
-            "VI-A, everybody at once, minimum: detected", A_MINIMUM, "", 64, 73, detected, 1, " %"
+            "VI-A, all robots at once, minimum: detected", A_MINIMUM, "", 64, 73, detected, 1, " %"
         ),
         MedianInBand(
-            "VI-A, everybody at once, ledger and claims: detected",
+            "VI-A, all robots at once, ledger and claims: detected",
             A_LEDGER,
             "",
             86.5,

@@ -1,10 +1,10 @@
-"""Puig, Garcia, Wu: exploration of regions by K-means (KME) beside three other ways: figures 6 to 8.
+"""Puig, Garcia, Wu: exploration of regions by K-means (KME) compared with three other planners: figures 6 to 8.
 
-KME beside Yamauchi's nearest frontier, Burgard et al.'s coordinated frontiers and Zlot et al.'s market,
-by how evenly eight regions of a map are explored. Configurations are 3 maps x 2 kinds of starts x 2 to 8
+KME is compared with Yamauchi's nearest frontier, Burgard et al.'s coordinated frontiers and Zlot et al.'s
+market, by how evenly eight regions of a map are explored. Configurations are 3 maps x 2 kinds of starts x 2 to 8
 robots x 15 spots. Neither the maps, nor the sensor, nor how Zlot's robots propose goals are in the paper;
 readings are those of an independent simulator on maps of these kinds with goals by quadtree. All four
-choose anew whenever a robot arrives, and a way costs its length.
+choose new targets whenever a robot arrives, and a way costs its length.
 """
 
 import functools
@@ -23,7 +23,7 @@ from kantor_fleet.reproduce.claims import (
     Measure,
     geometric,
     paired_ratios,
-    times,
+    text_of_ratio,
 )
 from kantor_fleet.reproduce.figure import PaperFigure, ResultTable, RunRequests
 from kantor_fleet.reproduce.measured_runs import MeasuredRuns, Setting
@@ -57,26 +57,26 @@ _BY_GOALS = (
 
 
 class Configuration(NamedTuple):
-    """What all planners are compared under."""
+    """The conditions under which all planners are compared."""
 
     map: str
     starts: str
     robots: int
     spot: int
-    """Also the seed: of robots that start together it is the number of their spot."""
+    """The seed too: for robots that start together it is the number of their spot."""
 
 
 def setting(planner: str, place: str, starts: str, robots: int) -> Setting:
-    """A map explored by a planner."""
+    """The exploration of a map by a planner."""
     overrides = (f"starts.spread={starts}", f"robots.count={robots}", *_PLANNERS[planner])
     return Setting(place, overrides)
 
 
 @functools.cache
 def configurations() -> tuple[Configuration, ...]:
-    """All 630, in an order whose beginnings are even.
+    """All 630 configurations, in an order of which every beginning is balanced.
 
-    The first n are what `--runs n` takes. Any 6 in a row have every map with every kind of starts, any
+    `--runs n` takes the first n. Any 6 in a row have every map with every kind of starts, any
     7 every number of robots, any 42 all of these together; 42 later the same come with another spot.
     """
     return tuple(
@@ -91,7 +91,7 @@ def configurations() -> tuple[Configuration, ...]:
 
 
 def requests(runs: int) -> RunRequests:
-    """The first configurations, under all four planners."""
+    """The first configurations, each with all four planners."""
     requested: dict[Setting, list[int]] = {}
     for place, starts, robots, spot in configurations()[:runs]:
         for planner in PLANNERS:
@@ -137,13 +137,13 @@ _MOST = {
 def _over_all() -> Iterator[Claim]:
     for (name, measure), other in itertools.product(MEASURES.items(), OTHERS):
         most = _MOST.get((name, other), math.inf)
-        told = f"4, 8 robots: {_READING[name, other]}"
+        reading = f"4, 8 robots: {_READING[name, other]}"
         yield GeometricMeanRatio(
             f"4 to 8 robots, {name}: KME over {other}",
             group(KME),
             group(other),
             "" if name == "completion" else "lowest",
-            told if math.isinf(most) else f"≤ {most} ({told})",
+            reading if math.isinf(most) else f"≤ {most} ({reading})",
             measure,
             most,
             _BY_GOALS if (name, other) == ("final WTV", ZLOT) else "",
@@ -191,7 +191,7 @@ def _more_robots(starts: str) -> LowerThroughout:
 def _curves(
     title: str, starts: str, curve: str, planners: tuple[str, ...], *claims: Claim
 ) -> PaperFigure:
-    """A panel for every team, a line for every planner."""
+    """A figure with a panel for every size of team and a line for every planner."""
     panels = {
         robots: {name: setting(name, "unstructured", starts, robots) for name in planners}
         for robots in _PLOTTED
@@ -235,7 +235,7 @@ def _ratio_rows(measured: MeasuredRuns) -> Iterator[Row]:
                     "factor_95": factor,
                     "kme_lowest": None,
                 }
-        lows = list(_lows(measured, team, measure))
+        lows = list(_kme_lowest(measured, team, measure))
         if lows:
             yield {
                 "measure": name,
@@ -248,7 +248,7 @@ def _ratio_rows(measured: MeasuredRuns) -> Iterator[Row]:
             }
 
 
-def _lows(measured: MeasuredRuns, team: tuple[int, ...], measure: Measure) -> Iterator[bool]:
+def _kme_lowest(measured: MeasuredRuns, team: tuple[int, ...], measure: Measure) -> Iterator[bool]:
     """Whether KME is below all others, configuration by configuration."""
     for settings in zip(*(group(planner, team) for planner in PLANNERS), strict=True):
         for runs in zip(*(measured.get(one, ()) for one in settings), strict=True):
@@ -257,7 +257,7 @@ def _lows(measured: MeasuredRuns, team: tuple[int, ...], measure: Measure) -> It
 
 
 def ratios(measured: MeasuredRuns) -> ResultTable:
-    """KME beside the others, by number of robots."""
+    """The table of KME over the others, by number of robots."""
     rows = list(_ratio_rows(measured))
     columns = [*map(str, TEAMS), "4 to 8"]
     shown: dict[tuple[str, str], Row] = {}
@@ -269,7 +269,7 @@ def ratios(measured: MeasuredRuns) -> ResultTable:
         line[row["robots"]] = (
             f"{100.0 * row['kme_lowest']:.0f} %"
             if row["ratio"] is None
-            else times(row["ratio"], row["factor_95"])
+            else text_of_ratio(row["ratio"], row["factor_95"])
         )
         if row["ratio"] is None:
             line["KME over"] = "lowest of four"

@@ -1,4 +1,4 @@
-"""What is read off a run, and what the CSV says of one that explored a map."""
+"""Measures of a run, and the CSV columns of a run on a map."""
 
 import msgspec
 
@@ -8,21 +8,21 @@ from kantor_worldsim.observers.metrics.result import MapResult, Result
 
 
 def finished(run: MeasuredRun) -> float:
-    """The tick at which the team finished; the last one for a run that was cut."""
+    """The tick at which the team finished; the last tick of a run that was cut."""
     assert run.result is not None
     done = run.result.finished_tick
     return float(run.result.ticks if done is None else done)
 
 
 def map_result_of(run: MeasuredRun) -> MapResult:
-    """What a run over a map came to."""
+    """The result of a run on a map."""
     assert run.result is not None
     assert run.result.map is not None
     return run.result.map
 
 
 def distance_m(run: MeasuredRun) -> float:
-    """Driven by all robots together."""
+    """Distance driven by all robots together, m."""
     return map_result_of(run).distance_m
 
 
@@ -32,17 +32,17 @@ def wtv_final(run: MeasuredRun) -> float:
 
 
 def wtv_mean(run: MeasuredRun) -> float:
-    """The same over the run, with the waits that are expected of unknown cells."""
+    """The same variance, averaged over the run, with the expected waits of unknown cells."""
     return map_result_of(run).wtv_mean.r8
 
 
 def epv_mean(run: MeasuredRun) -> float:
-    """Variance of the explored share of eight regions over the run, squared per cent."""
+    """Variance of the explored shares of eight regions, averaged over the run, squared per cent."""
     return map_result_of(run).epv_mean.r8
 
 
 def map_row(result: Result) -> Row:
-    """A run over a map: ticks, and all that was measured of the map."""
+    """The columns of a run on a map: ticks, and all measures of the map."""
     assert result.map is not None
     measured: Row = {}
     for name, value in msgspec.to_builtins(result.map).items():

@@ -7,5 +7,5 @@ FIGURES = kabir_lee.FIGURES | burgard.FIGURES | kme.FIGURES | resilience.FIGURES
 
 
 def figures(name: str) -> dict[str, PaperFigure]:
-    """One, or `all` of the first paper: the others take long and are asked for by name."""
+    """The figure of this name, or with `all` those of the first paper: the others take long."""
     return kabir_lee.FIGURES if name == "all" else {name: FIGURES[name]}

@@ -1,10 +1,10 @@
-"""Quality under loss: what faults cost a team, by the paper's minimum and by the ledger with claims.
+"""Quality under loss: what faults cost a team with the paper's minimum merge, and with the ledger and claims.
 
-No paper's figure: its claims are ours. Ten robots of the default mission, all in range of one another, with
+This is no figure of a paper: its claims are kantor's. Ten robots of the default mission, all in range of one another, with
 random starts. Detection is measured where energy is scarce: every robot has 5 % more than its share of the
 M points, which suffices while nothing fails. Finishing is measured where energy is plenty: then it says
 how long a team works that does not know what is done. Every seed has the same starts and targets
-under all conditions, so that differences are taken in pairs.
+under all conditions, so that differences are paired.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,8 +15,8 @@ import numpy.typing as npt
 from matplotlib.figure import Figure as Picture
 
 from kantor_fleet.reproduce import drawing
-from kantor_fleet.reproduce.claims import MISS, OK, TOLD, ClaimVerdict, Measure
-from kantor_fleet.reproduce.drawing import Course, Panel
+from kantor_fleet.reproduce.claims import MISS, OK, REPORTED, ClaimVerdict, Measure
+from kantor_fleet.reproduce.drawing import Curve, Panel
 from kantor_fleet.reproduce.figure import PaperFigure, ResultTable, RunRequests
 from kantor_fleet.reproduce.kabir_lee import detected
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, Setting
@@ -48,11 +48,11 @@ class GradedFault(NamedTuple):
     name: str
     unit: str
     degrees: tuple[float, ...]
-    """The first one is none."""
+    """The first is 0: no fault."""
     faults: Callable[[float, int], list[str]]
-    """Entries of a scenario's list for a degree above 0 and a seed."""
+    """Entries of a scenario's `faults`, for a degree above 0 and a seed."""
     seeded: bool = False
-    """They differ from seed to seed."""
+    """The faults differ from seed to seed."""
 
 
 def _dropping(percent: float, _seed: int) -> list[str]:
@@ -66,7 +66,7 @@ def _parted(percent: float, _seed: int) -> list[str]:
 
 
 def _losing(robots: float, seed: int) -> list[str]:
-    """The same robots at the same times for every number, one more each."""
+    """Robots killed for good: one degree higher kills one more, and the others at the same times."""
     draws = np.random.default_rng(seed)
     lost, times_s = draws.permutation(ROBOTS) + 1, draws.uniform(0.0, SHARE_S, ROBOTS)
     return [
@@ -82,12 +82,13 @@ GRADED_FAULTS = (
 
 
 class Objective(NamedTuple):
-    """Something that is measured, and with how many points for each robot."""
+    """A measure of quality, and the energy with which it is measured."""
 
     name: str
     unit: str
     measure: Measure
     steps: int
+    """Points of each robot."""
 
 
 DETECTION = Objective("detected", " points", detected, _SCARCE)
@@ -98,7 +99,7 @@ OBJECTIVES = (DETECTION, FINISHING)
 def setting(
     merge: str, objective: Objective, graded: GradedFault, degree: float, seed: int
 ) -> Setting:
-    """What is each with a seed."""
+    """The setting that is run with a seed."""
     faults = ", ".join(graded.faults(degree, seed)) if degree else ""
     return Setting(
         "fleet",
@@ -107,27 +108,27 @@ def setting(
 
 
 def requests(runs: int) -> RunRequests:
-    """Every condition with every seed."""
+    """All conditions with all seeds."""
     requested: dict[Setting, set[int]] = {}
     for objective in OBJECTIVES:
         for graded in GRADED_FAULTS:
             for degree in graded.degrees:
                 for merge in MERGES:
                     for seed in range(runs):
-                        each = setting(merge, objective, graded, degree, seed)
-                        requested.setdefault(each, set()).add(seed)
-    return {each: sorted(seeds) for each, seeds in requested.items()}
+                        condition = setting(merge, objective, graded, degree, seed)
+                        requested.setdefault(condition, set()).add(seed)
+    return {condition: sorted(seeds) for condition, seeds in requested.items()}
 
 
 def values(
     measured: MeasuredRuns, merge: str, objective: Objective, graded: GradedFault, degree: float
 ) -> npt.NDArray[np.float64]:
-    """(runs,) what was measured, in the order of the seeds."""
+    """(runs,) measures in the order of the seeds."""
     runs = len(measured[setting(merge, objective, graded, 0, 0)])
     found: list[MeasuredRun] = []
     for seed in range(runs):
-        each = measured[setting(merge, objective, graded, degree, seed)]
-        found.append(each[0 if graded.seeded and degree else seed])
+        runs_there = measured[setting(merge, objective, graded, degree, seed)]
+        found.append(runs_there[0 if graded.seeded and degree else seed])
     return np.array([objective.measure(run) for run in found])
 
 
@@ -140,31 +141,31 @@ class Estimate(NamedTuple):
 
     @classmethod
     def of(cls, sample: npt.NDArray[np.float64]) -> "Estimate":
-        """The same every time."""
+        """The estimate of a sample; its resampling is seeded, so that it is the same every time."""
         drawn = np.random.default_rng(0).integers(0, sample.size, (_RESAMPLES, sample.size))
         low, high = np.quantile(sample[drawn].mean(axis=1), (0.025, 0.975)).tolist()
         return cls(float(sample.mean()), low, high)
 
     def text(self, sign: str = "") -> str:
-        """For a person."""
+        """The estimate for printing."""
         digits = 0 if abs(self.mean) >= 100.0 else 1
         mean, low, high = (f"{value:{sign}.{digits}f}" for value in self)
         return f"{mean} [{low}, {high}]"
 
 
 class LedgerLead(NamedTuple):
-    """The ledger is better than the minimum in every degree of a graded, seed by seed."""
+    """The ledger is better than the minimum merge in every degree of a fault, seed by seed."""
 
     objective: Objective
     graded: GradedFault
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Of no fault; the figure knows the others."""
+        """The settings without faults; the figure adds the others."""
         return tuple(setting(merge, self.objective, self.graded, 0, 0) for merge in MERGES)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """The smallest gap, with its interval; ahead if every interval lies above 0."""
+        """The smallest lead, with its interval; met if every interval lies above 0."""
         sign = 1.0 if self.objective is DETECTION else -1.0
         gaps = {
             degree: Estimate.of(sign * (self._values(measured, "ledger", degree) - self._values(measured, "min", degree)))
@@ -172,10 +173,10 @@ class LedgerLead(NamedTuple):
         }  # fmt: skip
         degree, least = min(gaps.items(), key=lambda item: item[1].low)
         met = all(gap.low > 0.0 for gap in gaps.values())
-        what = "more detected" if self.objective is DETECTION else "sooner finished"
+        lead = "more detected" if self.objective is DETECTION else "sooner finished"
         return ClaimVerdict(
             figure,
-            f"{self.graded.name}: ledger over min, {what}, in every degree",
+            f"{self.graded.name}: ledger over min, {lead}, in every degree",
             "",
             "above 0",
             f"least {least.text('+')}{self.objective.unit} at {degree:g} {self.graded.unit}",
@@ -187,7 +188,7 @@ class LedgerLead(NamedTuple):
 
 
 class CostOfFault(NamedTuple):
-    """What the worst degree of a graded costs; told as measured."""
+    """The cost of the highest degree of a fault: reported, not judged."""
 
     merge: str
     objective: Objective
@@ -195,11 +196,11 @@ class CostOfFault(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Of no fault; the figure knows the others."""
+        """The settings without faults; the figure adds the others."""
         return (setting(self.merge, self.objective, self.graded, 0, 0),)
 
     def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
-        """The paired change."""
+        """The paired change from no fault to the highest degree."""
         worst = self.graded.degrees[-1]
         none, much = (
             values(measured, self.merge, self.objective, self.graded, degree)
@@ -207,7 +208,7 @@ class CostOfFault(NamedTuple):
         )
         text = f"{self.graded.name}: {self.merge}, {self.objective.name}, {worst:g} {self.graded.unit} against none"
         ours = f"{Estimate.of(much - none).text('+')}{self.objective.unit}"
-        return ClaimVerdict(figure, text, "", "as measured", ours, TOLD)
+        return ClaimVerdict(figure, text, "", "as measured", ours, REPORTED)
 
 
 def _estimates(
@@ -225,7 +226,7 @@ def _draw(measured: MeasuredRuns) -> Picture:
             if objective is DETECTION
             else "finished, tick (energy plenty)",
             {
-                merge: Course(graded.degrees, tuple(_estimates(measured, merge, objective, graded)))
+                merge: Curve(graded.degrees, tuple(_estimates(measured, merge, objective, graded)))
                 for merge in MERGES
             },
         )

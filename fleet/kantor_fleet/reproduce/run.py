@@ -1,4 +1,4 @@
-"""`kantor reproduce`: a paper's figures anew, with a verdict beside each published number."""
+"""`kantor reproduce`: run, draw and judge figures, with a verdict beside each published number."""
 
 import csv
 import sys
@@ -23,12 +23,12 @@ from kantor_fleet.sweep.table import Row, write_csv
 from kantor_worldsim.observers.metrics.wasserstein_exact import available
 
 RUNS = "runs.jsonl"
-"""Where the runs of figures that take long are kept, whichever figure asked for them."""
+"""The journal of figures that take long; every such figure uses the runs of all."""
 
 _OURS = "  ours: median [quartiles], mean ± 95 %, ratio of means [95 %] or geometric mean x÷ 95 % over the runs"
 
 RunsBySetting = Mapping[tuple[Setting, int], MeasuredRun]
-"""By setting and seed."""
+"""Runs by setting and seed."""
 
 
 def reproduce(
@@ -37,19 +37,23 @@ def reproduce(
     start: Callable[[Iterable[Case]], Pool],
     out: Path,
 ) -> Exit:
-    """Fly, judge, draw and tell. start: a pool that flies. Raises SweepError, OSError."""
-    started = time.monotonic()
+    """Run what the figures need, draw them, and print a verdict for each claim; the exit code.
+
+    runs: for each setting; by default as many as each figure says. start: the pool that runs the cases.
+    Raises SweepError, OSError.
+    """
+    started_s = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     figures = {name: _affordable(figure, runs) for name, figure in figures.items()}
-    requested = _requests(figures.values())
+    requests = _requests(figures.values())
     with ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
         kept = any(figure.kept for figure in figures.values())
         journal = stack.enter_context(RunsJournal(out / RUNS, MeasuredRun)) if kept else None
-        measured = _run_all(requested, start, interrupts, journal)
+        measured = _run_all(requests, start, interrupts, journal)
         if interrupts.code is not None:
             print(
-                f"kantor: interrupted; {_left_off(requested, measured, journal)}", file=sys.stderr
+                f"kantor: interrupted; {_resumable(requests, measured, journal)}", file=sys.stderr
             )
             return interrupts.code
     broken = [run for run in measured.values() if run.failed is not None]
@@ -64,17 +68,17 @@ def reproduce(
     _write_verdicts(out / "verdicts.csv", verdicts)
     _print(verdicts)
     if broken:
-        print(f"  {len(broken)} runs broke a rule, and count all the same: {broken[0].failed}")
-    print(f"  {out}/  (figures, numbers and verdicts; {time.monotonic() - started:.0f} s)")
+        print(f"  {len(broken)} runs broke a rule and are counted nevertheless: {broken[0].failed}")
+    print(f"  {out}/  (figures, numbers and verdicts; {time.monotonic() - started_s:.0f} s)")
     missed = any(verdict.verdict == MISS for verdict in verdicts)
     return Exit.NOT_MET if missed or broken else Exit.DONE
 
 
-def _left_off(requested: RunRequests, measured: RunsBySetting, journal: RunsJournal | None) -> str:
-    """What there is of an interrupted figure."""
+def _resumable(requests: RunRequests, measured: RunsBySetting, journal: RunsJournal | None) -> str:
+    """How much of interrupted figures is kept."""
     if journal is None:
         return "nothing was written"
-    total = sum(map(len, requested.values()))
+    total = sum(map(len, requests.values()))
     return f"{len(measured)} of {total} runs are done; the same command goes on from there"
 
 
@@ -109,7 +113,7 @@ def _affordable(figure: PaperFigure, runs: int | None) -> PaperFigure:
 
 
 def _requests(figures: Iterable[PaperFigure]) -> RunRequests:
-    """All seeds that some figure wants of a setting; the long settings first."""
+    """All seeds that any figure needs of a setting; the long settings first."""
     wanted: dict[Setting, set[int]] = {}
     for figure in figures:
         for setting, seeds in figure.requests().items():
@@ -121,15 +125,15 @@ def _requests(figures: Iterable[PaperFigure]) -> RunRequests:
 
 
 def _run_all(
-    requested: RunRequests,
+    requests: RunRequests,
     start: Callable[[Iterable[Case]], Pool],
     interrupts: Interrupts,
     journal: RunsJournal | None,
 ) -> RunsBySetting:
-    """What is not kept yet is measured, and kept if there is a journal."""
+    """Runs of the journal, and new ones for the rest, which are added to the journal if there is one."""
     measured: dict[tuple[Setting, int], MeasuredRun] = {}
     left: dict[Case, tuple[Setting, RunKey]] = {}
-    for setting, seeds in requested.items():
+    for setting, seeds in requests.items():
         for key, case in setting.cases(seeds):
             known = journal.outcomes.get(key) if journal is not None else None
             if isinstance(known, MeasuredRun) and known.result is not None:
@@ -153,20 +157,20 @@ def _run_all(
 
 
 def _measured(outcome: Outcome) -> MeasuredRun:
-    """What a worker made of a case, or, if it died, why there is nothing."""
+    """The outcome of a worker; of a worker that died it has only the reason."""
     return outcome if isinstance(outcome, MeasuredRun) else MeasuredRun(failed=outcome.failed)
 
 
 def _write_verdicts(path: Path, verdicts: Sequence[ClaimVerdict]) -> None:
-    """Beside those of other figures that were drawn into the same folder before."""
-    anew = {line.figure for line in verdicts}
+    """Write verdicts, and keep those of other figures that are in the file already."""
+    judged = {line.figure for line in verdicts}
     before = _rows_of(path)
-    kept = [row for row in before if row["figure"] not in anew]
+    kept = [row for row in before if row["figure"] not in judged]
     write_csv(path, ClaimVerdict._fields, [*kept, *(line._asdict() for line in verdicts)])
 
 
 def _rows_of(path: Path) -> list[Row]:
-    """A table of verdicts, if there is one."""
+    """The rows of a table of verdicts; none if there is no such file."""
     if not path.exists():
         return []
     with path.open(encoding="utf-8", newline="") as file:
@@ -175,7 +179,7 @@ def _rows_of(path: Path) -> list[Row]:
 
 
 def _write_runs(path: Path, figure: PaperFigure, by_setting: MeasuredRuns) -> None:
-    """Every run behind a figure."""
+    """Write a row for every run behind a figure."""
     rows = [
         {"setting": setting.text, "seed": run.result.seed, **figure.row(run.result)}
         for setting, runs in by_setting.items()
@@ -215,7 +219,7 @@ def _print(verdicts: Sequence[ClaimVerdict]) -> None:
 
 
 def _reasons(verdicts: Sequence[ClaimVerdict]) -> dict[tuple[str, str], list[str]]:
-    """Figures and reasons, with the claims that they stand beside."""
+    """The claims by figure and reason."""
     claims: dict[tuple[str, str], list[str]] = {}
     for line in verdicts:
         if line.why:
