@@ -211,7 +211,7 @@ def test_verify_tells_of_an_opening_that_is_no_use(kantor: "Kantor") -> None:
 
     finished = kantor("verify", folder)
     assert (finished.code, finished.err) == (1, "")
-    assert "FAIL  run.mcap: its opening is no use" in finished.out
+    assert "FAIL  run.mcap: no run can start from its opening" in finished.out
 
 
 def test_ctrl_c_leaves_a_valid_partial_record(kantor: "Kantor") -> None:

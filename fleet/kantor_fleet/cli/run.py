@@ -21,7 +21,7 @@ def run(
     chaos: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002  the flag is --set
 ) -> int:
-    """Run a mission, with live progress, and leave its record and its picture.
+    """Run a mission with live progress, and leave its record and its picture.
 
     Args:
         scenario: A packaged name (see `kantor scenarios`) or a TOML file.
@@ -29,7 +29,7 @@ def run(
         exchange: in-process: one process, as fast as possible. lockstep: a process each, the same
             result. realtime: a process each, every robot on its own clock; wall is accepted for it.
         speed: Realtime only: simulated seconds in a real second.
-        out: Where the run folder is made.
+        out: Folder in which the run folder is made.
         exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
         exact_every: Periods from one exact distance to the next, seconds of work each; not in realtime.
         chaos: A TOML file of [[faults]] that are added to the scenario's own.

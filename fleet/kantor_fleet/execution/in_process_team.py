@@ -1,4 +1,4 @@
-"""The participants of a scenario as objects, and a mission of theirs inside one process."""
+"""The participants of a scenario as objects, and their mission inside one process."""
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -18,7 +18,7 @@ from kantor_worldsim.world.world import WorldSetup
 
 
 def team(scenario: Scenario, seed: int, site: WorldSetup) -> dict[ParticipantId, StateMachine]:
-    """Everybody in the roster; whom the scenario has killed can be killed."""
+    """All participants of the roster; those that the scenario kills are killable."""
     killed = {name for fault in scenario.faults if isinstance(fault, Kill) for name in fault.who}
     made: dict[ParticipantId, StateMachine] = {}
     for name, pose in site.poses(scenario).items():
@@ -30,7 +30,7 @@ def team(scenario: Scenario, seed: int, site: WorldSetup) -> dict[ParticipantId,
 def participant(
     name: ParticipantId, scenario: Scenario, seed: int, site: WorldSetup, body: Body
 ) -> StateMachine:
-    """One participant as it takes over a body."""
+    """A participant that takes over a body."""
     frame = site.ground.frame if site.ground is not None else None
     if name == SUPERVISOR:
         if frame is not None:
@@ -50,6 +50,6 @@ def play(
     machines: Mapping[ParticipantId, StateMachine] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> str:
-    """A mission in this process; why it ended. machines: the team, unless others take its place."""
+    """Run a mission in this process; why it ended. machines: by default the team of the scenario."""
     simulation = Simulation(scenario, seed, site, observers)
     return simulate(simulation, in_process(machines or team(scenario, seed, site)), seed, stopped)

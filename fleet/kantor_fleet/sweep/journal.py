@@ -1,7 +1,7 @@
-"""runs.jsonl: every finished run of a sweep, kept as soon as it is finished.
+"""runs.jsonl: every finished run of a sweep, written as soon as it is finished.
 
-The first line tells who wrote the file; every other line is a run. Lines are only ever added. A line
-that was torn, because the machine went down, is as if it had not been written.
+The first line names the format and the version of kantor; every other line is a run. Lines are only ever added.
+A line that was torn, because the machine went down, is dropped.
 """
 
 import fcntl
@@ -33,13 +33,13 @@ class _RunLine(msgspec.Struct, frozen=True):
 
 
 class RunsJournal:
-    """What is known of runs, in memory and on disk; one sweep writes at a time."""
+    """Outcomes of runs, in memory and on disk; one process writes at a time."""
 
     def __init__(self, path: Path, kind: type[Outcome] = Outcome) -> None:
-        """Read what is there, or begin. kind: of the outcomes. Raises SweepError, OSError."""
+        """Read the file, or begin one. kind: the type of the outcomes. Raises SweepError, OSError."""
         self._kind = kind
         self.outcomes: dict[RunKey, Outcome] = {}
-        """The last one that was added under each key."""
+        """The outcome that was added last under each key."""
         self._path = path
         self._header = _Header(_FORMAT, version("kantor"))
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -63,7 +63,7 @@ class RunsJournal:
         self._file.close()
 
     def add(self, key: RunKey, outcome: Outcome) -> None:
-        """Keep a run. The operating system has it when this returns."""
+        """Add a run. It has been handed to the operating system when this returns."""
         self._write(_RunLine(*key, msgspec.Raw(msgspec.json.encode(outcome))))
         self.outcomes[key] = outcome
 

@@ -1,4 +1,4 @@
-"""`kantor sweep`: from a plan to a table, and on from where it was left."""
+"""`kantor sweep`: runs the plan, resumes where it was stopped, and writes the tables."""
 
 import difflib
 import importlib.util
@@ -33,7 +33,7 @@ Format = Literal["csv", "parquet"]
 
 
 class SweepConfig(NamedTuple):
-    """A sweep, and what is wanted of it."""
+    """A sweep and the form of its results."""
 
     plan: SweepPlan
     folder: Path
@@ -44,9 +44,9 @@ class SweepConfig(NamedTuple):
 
 
 def sweep(config: SweepConfig, start: Callable[[Iterable[Case]], Pool]) -> Exit:
-    """Run what is not yet done, write what there is; the exit code.
+    """Run what is missing in the journal and write the tables; the exit code.
 
-    start: the pool. Raises SweepError before anything is written; OSError.
+    start: the pool that runs the cases. Raises SweepError before anything is written; OSError.
     """
     _check(config)
     plan = config.plan
@@ -119,7 +119,7 @@ def _conclude(config: SweepConfig, runs: Sequence[SweepRun]) -> None:
     console = table_console()
     for measure in shown:
         console.print(summary.table_of(plan, lines, measure), markup=False)
-    _complain(runs)
+    _print_failures(runs)
     draw(plan, runs, lines, shown[0], folder / PLOT)
     print(f"  {folder}/  ({', '.join(sorted(path.name for path in folder.iterdir()))})")
 
@@ -141,7 +141,7 @@ def _write_tables(
 
 
 def _write_plan(config: SweepConfig) -> None:
-    """What was asked for, every scenario resolved."""
+    """Write the plan, with every scenario resolved."""
     plan = config.plan
     tree = {
         "seeds": plan.seeds,
@@ -159,8 +159,8 @@ def _write_plan(config: SweepConfig) -> None:
     table.replace(config.folder / PLAN, lambda draft: draft.write_bytes(text + b"\n"))
 
 
-def _complain(runs: Iterable[SweepRun]) -> None:
-    """Why runs failed, each reason once, and which rules were broken."""
+def _print_failures(runs: Iterable[SweepRun]) -> None:
+    """Print the reasons of failed runs, each once, and the number of runs that broke a rule."""
     reasons = Counter(run.outcome.failed for run in runs if run.outcome.failed is not None)
     for reason, times in reasons.most_common():
         print(f"  {times} failed: {printable(reason)}")

@@ -1,4 +1,4 @@
-"""What the runs of a sweep amount to: each variant by itself, and beside the first one.
+"""Statistics of a sweep: each variant by itself, and compared with the first one.
 
 Runs of the same seed share samples, targets, starts and draws, so variants are compared run by run:
 the differences scatter less than the runs do.
@@ -20,7 +20,7 @@ MAIN = (
     *("detection_rate", "finished_tick", "w_ub_paper", "w1_exact", "mass_left"),
     *("map_completed_tick", "map_distance_m", "map_wtv_final_r8", "map_epv_mean_r8"),
 )
-"""What is printed, and the first of them drawn, where it varies."""
+"""The measures that are printed if they vary; the first of them is drawn."""
 
 _RESAMPLES = 2_000
 _LEVEL = 0.95
@@ -29,19 +29,19 @@ Numbers = npt.NDArray[np.float64]
 
 
 class Distribution(NamedTuple):
-    """How numbers lie; None where there are too few."""
+    """Median, quartiles and interval of numbers; None where there are too few."""
 
     n: int
     median: float | None = None
     quartile_1: float | None = None
     quartile_3: float | None = None
     low: float | None = None
-    """Of the 95 % bootstrap interval of the median."""
+    """The lower end of the 95 % bootstrap interval of the median."""
     high: float | None = None
 
     @classmethod
     def of(cls, numbers: Numbers) -> "Distribution":
-        """The same numbers give the same interval: its draws are seeded."""
+        """The distribution of numbers; the resampling is seeded, so that it is the same every time."""
         if not numbers.size:
             return cls(0)
         first, median, third = np.quantile(numbers, (0.25, 0.5, 0.75)).tolist()
@@ -57,17 +57,17 @@ class SummaryRow(NamedTuple):
     """Runs without a result."""
     runs: Distribution
     difference: Distribution
-    """Of the runs to those of the first variant with the same seeds."""
+    """Differences of the runs to those of the first variant with the same seeds."""
 
 
 def summarize(plan: SweepPlan, runs: Iterable[SweepRun]) -> list[SummaryRow]:
-    """A line for every variant and measure."""
+    """A row for every variant and measure."""
     by_variant: dict[str, dict[int, Row]] = {variant.digest: {} for variant in plan.variants}
     for run in runs:
         by_variant[run.variant.digest][run.seed] = measures(run.outcome.result)
     first = by_variant[plan.variants[0].digest]
     return [
-        _line(variant, name, by_variant[variant.digest], first)
+        _summary_row(variant, name, by_variant[variant.digest], first)
         for variant in plan.variants
         for name in MEASURES
         if applies(plan, name)
@@ -75,7 +75,7 @@ def summarize(plan: SweepPlan, runs: Iterable[SweepRun]) -> list[SummaryRow]:
 
 
 def rows(plan: SweepPlan, lines: Iterable[SummaryRow]) -> list[Row]:
-    """summary.csv."""
+    """The rows of summary.csv."""
     return [
         dict(zip(plan.keys, line.variant.values, strict=True))
         | {"measure": line.measure, "failed": line.failed}
@@ -86,19 +86,19 @@ def rows(plan: SweepPlan, lines: Iterable[SummaryRow]) -> list[Row]:
 
 
 def columns(plan: SweepPlan) -> list[str]:
-    """Of summary.csv."""
+    """The columns of summary.csv."""
     differences = [f"difference_{name}" for name in Distribution._fields]
     return [*plan.keys, "measure", "failed", *Distribution._fields, *differences]
 
 
 def varying(runs: Iterable[SweepRun], names: Sequence[str]) -> list[str]:
-    """Those measures that are not the same in all runs."""
+    """The measures that differ between runs."""
     found = [measures(run.outcome.result) for run in runs]
     return [name for name in names if len({row[name] for row in found if row} - {None}) > 1]
 
 
 def table_of(plan: SweepPlan, lines: Iterable[SummaryRow], measure: str) -> Table:
-    """One measure for a person; in brackets 95 % intervals."""
+    """A printed table of one measure; 95 % intervals are in brackets."""
     table = Table(
         title=measure,
         title_style="bold",
@@ -118,7 +118,7 @@ def table_of(plan: SweepPlan, lines: Iterable[SummaryRow], measure: str) -> Tabl
 
 
 def _shown(value: float | None) -> str:
-    """A number for a person."""
+    """A number for printing."""
     if value is None:
         return "-"
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
@@ -129,28 +129,28 @@ def _cells(plan: SweepPlan, line: SummaryRow) -> list[str]:
     return [
         *line.variant.settings(plan.keys).values(),
         f"{line.runs.n}, {line.failed} failed" if line.failed else f"{line.runs.n}",
-        _told(line.runs),
+        _median_of(line.runs),
         f"{_shown(line.runs.quartile_1)} to {_shown(line.runs.quartile_3)}",
-        "" if first else _told(line.difference),
+        "" if first else _median_of(line.difference),
     ]
 
 
-def _told(spread: Distribution) -> str:
-    if spread.low is None:
-        return _shown(spread.median)
-    return f"{_shown(spread.median)} [{_shown(spread.low)}, {_shown(spread.high)}]"
+def _median_of(numbers: Distribution) -> str:
+    if numbers.low is None:
+        return _shown(numbers.median)
+    return f"{_shown(numbers.median)} [{_shown(numbers.low)}, {_shown(numbers.high)}]"
 
 
-def _line(
-    variant: Variant, name: str, mine: Mapping[int, Row], first: Mapping[int, Row]
+def _summary_row(
+    variant: Variant, name: str, own: Mapping[int, Row], first: Mapping[int, Row]
 ) -> SummaryRow:
-    values = {seed: row[name] for seed, row in mine.items() if row.get(name) is not None}
+    values = {seed: row[name] for seed, row in own.items() if row.get(name) is not None}
     others = {seed: row[name] for seed, row in first.items() if row.get(name) is not None}
     differences = [value - others[seed] for seed, value in values.items() if seed in others]
     return SummaryRow(
         variant,
         name,
-        sum(not row for row in mine.values()),
+        sum(not row for row in own.values()),
         Distribution.of(np.array([*values.values()], dtype=np.float64)),
         Distribution.of(np.array(differences, dtype=np.float64)),
     )
