@@ -13,7 +13,7 @@ import pytest
 
 from containers.engine import BASE, IMAGE, Fleet, call, resident_mb
 from kantor_fleet.execution.in_process_team import play
-from kantor_fleet.execution.verify import verdicts
+from kantor_fleet.execution.verify import findings
 from kantor_fleet.processes.compose import ComposeConfig
 from kantor_fleet.scenarios.catalog import find
 from kantor_worldsim.observers.recording import Recording
@@ -44,7 +44,7 @@ def rate_in_process(*overrides: str) -> float:
 def check_record(fleet: Fleet) -> dict[str, object]:
     """The run folder on the host is whole, keeps the rules, and can be executed again."""
     folder = fleet.run_folder()
-    assert [line for held, line in verdicts(folder) if not held] == []
+    assert [line for held, line in findings(folder) if not held] == []
     assert (folder / "report.png").exists()
     result = result_of(folder)
     assert result["ended"] == "done"

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from kantor_fleet.execution.in_process_team import team
-from kantor_fleet.report.picture import Run, Trail
+from kantor_fleet.report.picture import RunHistory, Trail
 from kantor_fleet.report.report import draw
 from kantor_fleet.report.style import team_colours
 from kantor_protocol.base.counter_rng import Purpose
@@ -74,9 +74,9 @@ def play(*overrides: str, seed: int = 1) -> list[Record]:
     return records
 
 
-def followed(records: list[Record]) -> Run:
+def followed(records: list[Record]) -> RunHistory:
     """What the picture knows of a run."""
-    run = Run.of(records)
+    run = RunHistory.of(records)
     assert run is not None
     return run
 

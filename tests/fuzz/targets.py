@@ -21,8 +21,8 @@ from fuzz import corpora
 from fuzz.mutations import unframe
 from kantor_fleet.execution.experiment import Outcome
 from kantor_fleet.execution.in_process_team import participant
-from kantor_fleet.sweep.journal import Journal as RunsJournal
-from kantor_fleet.sweep.plan import Key, SweepError
+from kantor_fleet.sweep.journal import RunsJournal
+from kantor_fleet.sweep.plan import RunKey, SweepError
 from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN
 from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Pose, StateMachine
 from kantor_protocol.base.varint import Pairs, pack_pairs, sum_pairs
@@ -594,7 +594,7 @@ def runs_of_sweeps() -> Sequence[bytes]:
         path = Path(folder) / "runs.jsonl"
         with RunsJournal(path) as journal:
             for seed in range(2):
-                journal.add(Key("ab", "cd", seed, False), Outcome(failed="nothing", wall_s=0.5))
+                journal.add(RunKey("ab", "cd", seed, False), Outcome(failed="nothing", wall_s=0.5))
         content = path.read_bytes()
     return (content, content[:-9])
 

@@ -345,7 +345,7 @@ def test_what_cannot_be_is_refused_with_a_line(kantor: "Kantor") -> None:
     (kantor.folder / "file").write_text("")
     refused = kantor("worldsim", "fleet", "--chaos", "kill.toml")
     assert (refused.code, refused.err) == (
-        2, "kantor: faults[0]: kill: nobody here can do that to processes; use `kantor run`\n",
+        2, "kantor: faults[0]: kill: needs control over the processes of participants; use `kantor run`\n",
     )  # fmt: skip
 
     endpoint = free_endpoint()

@@ -32,7 +32,7 @@ from kantor_fleet.campaign.run import commit
 from kantor_fleet.execution.experiment import code
 from kantor_fleet.execution.in_process_team import play
 from kantor_fleet.execution.preload import warm_up
-from kantor_fleet.execution.verify import verdicts
+from kantor_fleet.execution.verify import findings
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.processes.local import Fleet, FleetConfig, local_fleet, watch_progress
@@ -228,7 +228,7 @@ def _judged(config: FleetConfig, failures: list[str]) -> ProcessMission:
     complaints = [*failures, *result.complaints]
     if result.ended != "done" or result.record != "whole":
         complaints.append(f"end: {result.ended}; record {result.record}")
-    complaints += [f"verify: {line}" for held, line in verdicts(folder, journal) if not held]
+    complaints += [f"verify: {line}" for held, line in findings(folder, journal) if not held]
     complaints += liveness.complaints
     complaints += [f"{i.who}: let in" for i in _incidents(records) if i.kind == "let in"]
     rejoined_s: tuple[float, ...] = ()

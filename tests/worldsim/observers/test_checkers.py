@@ -792,7 +792,7 @@ def test_no_complaint_whatever_befalls_processes(
 def befell(records: Records, what: str = "") -> list[ProcessEvent]:
     """The incidents of a kind, or all but those of links."""
     found = [record for record in records if isinstance(record, ProcessEvent)]
-    return [each for each in found if what in {"", each.what}] or [
+    return [each for each in found if what in {"", each.kind}] or [
         ProcessEvent(0, "record", "injected") for batch in batches(records) if batch.injected
     ]
 

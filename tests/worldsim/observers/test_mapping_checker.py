@@ -498,7 +498,7 @@ def test_robot_that_goes_on_with_its_old_log_is_named() -> None:
     """Two incarnations never share a log."""
     fault = "{kind='kill', who=['r2'], from_s=0.75, until_s=1.5}"
     records = explored(f"faults=[{fault}]")
-    start = next(r for r in records if isinstance(r, ProcessEvent) and r.what == "start")
+    start = next(r for r in records if isinstance(r, ProcessEvent) and r.kind == "start")
     reborn = msgspec.structs.replace(start, incarnation=1)
     told = [reborn if record is start else record for record in records]
 
