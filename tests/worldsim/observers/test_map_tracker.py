@@ -25,7 +25,7 @@ from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.in_process import in_process
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
-from kantor_worldsim.observers.metrics.map_tracker_kernels import KIND, AS_SENT
+from kantor_worldsim.observers.metrics.map_tracker_kernels import AS_SENT, KIND
 from kantor_worldsim.record.columnar import ColumnarDecoder
 from kantor_worldsim.record.records import Batch, Opening, Record, StepRecord
 from kantor_worldsim.world.maps import Ground, parts
