@@ -324,8 +324,3 @@ def _count_walls_but_the_first(
 @mutant("the first wall on a line of sight is not counted", walled)
 def first_wall_not_counted(patch: Patch) -> None:
     replace_kernel(patch, sensors, "walls_between", _count_walls_but_the_first)
-
-
-@mutant("a wall takes nine tenths of the range that it should", walled)
-def wall_loss_too_small(patch: Patch) -> None:
-    _with_radio(patch, lambda s: _changed(s, radio={"wall_loss_m": 0.9 * s.radio.wall_loss_m}))
