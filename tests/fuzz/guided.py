@@ -15,7 +15,10 @@ import atheris
 sys.path[0] = str(Path(__file__).resolve().parents[1])
 
 _DECODERS = [
-    *(f"kantor_protocol.{name}" for name in ("scenario", "transport.credentials", "wire", "node.wal")),
+    *(
+        f"kantor_protocol.{name}"
+        for name in ("scenario", "transport.credentials", "wire", "node.wal")
+    ),
     *(f"kantor_worldsim.{name}" for name in ("world.maps", "world.density", "record.journal")),
     *("kantor_fleet.sweep", "tomllib", "mcap"),
 ]
