@@ -22,11 +22,16 @@ TIERS = ("unit", "processes", "papers", "campaign", "containers", "fuzz")
 TIER_OF_PLACE = {
     **dict.fromkeys(("agent", "fleet", "protocol", "supervisor", "worldsim"), "unit"),
     **{tier: tier for tier in TIERS[1:]},
+    "fleet/test_report.py": "processes",
+    "fleet/test_report_of_maps.py": "processes",
+    "fleet/test_reproduce.py": "papers",
+    "fleet/test_reproduce_maps.py": "papers",
+    "fleet/test_reproduce_resilience.py": "papers",
     "test_digests.py": "processes",
-    "test_readme.py": "unit",
+    "test_readme.py": "processes",
     "test_tiers.py": "unit",
 }
-"""The tier of a folder or file of this folder; a test with a mark of its own has that."""
+"""The tier of a folder or file of this folder; the longest path counts, and a mark of the test above all."""
 LONGEST_FIRST = ("containers", "papers", "processes", "campaign", "fuzz", "unit")
 """Tiers in the order in which they start: a long test that starts last leaves the other worker idle."""
 
@@ -43,10 +48,11 @@ def tier_of(item: pytest.Item) -> str:
         raise pytest.UsageError(f"{item.nodeid}: several tiers: {', '.join(own)}; keep one")
     if own:
         return own[0]
-    place = item.path.relative_to(TESTS).parts[0]
-    if place not in TIER_OF_PLACE:
-        raise pytest.UsageError(f"{item.nodeid}: no tier; add {place} to tests/conftest.py")
-    tier = TIER_OF_PLACE[place]
+    path = item.path.relative_to(TESTS)
+    places = [place.as_posix() for place in (path, *path.parents)]
+    tier = next((TIER_OF_PLACE[place] for place in places if place in TIER_OF_PLACE), None)
+    if tier is None:
+        raise pytest.UsageError(f"{item.nodeid}: no tier; add {path} to tests/conftest.py")
     return "processes" if tier == "unit" and "kantor" in item.fixturenames else tier
 
 

@@ -14,7 +14,7 @@ def test_every_test_has_exactly_one_tier(request: pytest.FixtureRequest) -> None
 def test_two_tiers_are_refused(request: pytest.FixtureRequest) -> None:
     request.node.add_marker("papers")
 
-    with pytest.raises(pytest.UsageError, match="several tiers: .*; keep one"):
+    with pytest.raises(pytest.UsageError, match=r"several tiers: .*; keep one"):
         tier_of(request.node)
 
 
@@ -30,6 +30,6 @@ def test_a_folder_without_a_tier_is_refused(
 
 @pytest.mark.xdist_group("together")
 def test_a_group_stays_on_one_worker(request: pytest.FixtureRequest) -> None:
-    """xdist recognizes the tests of a group by the end of their id."""
+    """The scheduler of xdist recognizes the tests of a group by the end of their id."""
     alone = not hasattr(request.config, "workerinput")
     assert alone or request.node.nodeid.endswith("@together")
