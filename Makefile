@@ -21,7 +21,7 @@ help:
 	@echo "make fuzz       a million inputs for every decoder"
 
 demo: $(VENV)/.installed $(VENV)/.kernels
-	$(KANTOR) run fleet --exchange wall --speed 4
+	$(KANTOR) run fleet --exchange realtime --speed 4
 
 test: $(VENV)/.developing $(VENV)/.kernels
 	$(PYTEST)

@@ -20,7 +20,7 @@ from kantor_protocol.scenario.load import from_tree
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.metrics.result import Result
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.world.world import WorldSetup
@@ -152,7 +152,7 @@ def _run(setting: Setting, site: WorldSetup, *, recorded: bool) -> Cost:
     scenario = setting.scenario
     recording = Recording(scenario, 0, "in-process") if recorded else None
     simulation = Simulation(scenario, 0, site, [recording.observe] if recording else [])
-    exchange = in_process(team(scenario, 0, site))
+    exchange = InProcessExchange(team(scenario, 0, site))
     start_s = time.process_time()
     simulate(simulation, exchange, 0, lambda: False)
     cpu_s = time.process_time() - start_s

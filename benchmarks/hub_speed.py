@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 from tables import Table
 
 from kantor_agent.robots.density import DensityRobot
-from kantor_fleet.execution.preload import warm_up
+from kantor_fleet.execution.fork_server import await_fork_server
 from kantor_fleet.processes.local import _LIGHT_RUNTIME
 from kantor_fleet.scenarios.catalog import find
 from kantor_fleet.security import authority
@@ -131,8 +131,7 @@ class Pace(NamedTuple):
 
 def measure(*, quick: bool) -> Table:
     """For each number of robots the highest rate that is carried, and what a robot-tick costs there."""
-    warm_up()
-    get_context("forkserver").set_forkserver_preload(["kantor_fleet.execution.preloaded"])
+    await_fork_server()
     rows = []
     for link in LINKS:
         for count in COUNTS_QUICK if quick else COUNTS:

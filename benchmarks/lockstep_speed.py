@@ -23,7 +23,7 @@ from typing import NamedTuple
 import zenoh
 from tables import Table
 
-from kantor_fleet.execution.preload import warm_up
+from kantor_fleet.execution.fork_server import await_fork_server
 from kantor_fleet.processes.local import _LIGHT_RUNTIME, FleetConfig, local_fleet, watch_progress
 from kantor_fleet.scenarios.catalog import find
 from kantor_protocol.scenario.schema import Scenario
@@ -48,9 +48,7 @@ class Pace(NamedTuple):
 
 def measure(*, quick: bool) -> Table:
     """Ticks and rounds a second; the median of the repetitions, taken in turn."""
-    warm_up()
-    # The fork server starts with the first child, which is not kantor's here.
-    get_context("forkserver").set_forkserver_preload(["kantor_fleet.execution.preloaded"])
+    await_fork_server()
     seconds, repeats = (3.0, 1) if quick else (6.0, 3)
     rows = []
     for count in COUNTS_QUICK if quick else COUNTS:

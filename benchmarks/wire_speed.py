@@ -10,7 +10,7 @@ from kantor_fleet.execution.in_process_team import team
 from kantor_fleet.scenarios.catalog import find
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.world.world import WorldSetup
 
@@ -35,7 +35,7 @@ def measure(*, quick: bool) -> Table:
         site = WorldSetup.of(scenario, 0)
         recording = Recording(scenario, 0, "in-process")
         simulation = Simulation(scenario, 0, site, [recording.observe])
-        simulate(simulation, in_process(team(scenario, 0, site)), 0, lambda: False)
+        simulate(simulation, InProcessExchange(team(scenario, 0, site)), 0, lambda: False)
         wire = recording.finish().bytes_per_robot_tick
         whole = 8 * site.samples_m.shape[0]
         reached = wire.weights <= WEIGHTS_MAX

@@ -11,11 +11,15 @@ from kantor_protocol.wire.messages import Mission
 
 
 def run(
-    connect: str, identity: Identity, patience_s: float, say: Callable[[str], None], state: Path
+    connect: str,
+    identity: Identity,
+    connect_timeout_s: float,
+    say: Callable[[str], None],
+    state: Path,
 ) -> str:
-    """Be the robot of this identity until the mission is over; why it ended.
+    """Play the robot of this identity until the mission is over; returns why it ended.
 
-    state: folder of its diary. Raises BusError, NotWantedError and StateError.
+    state: folder of its write-ahead log. Raises BusError, RejectedError and StateError.
     """
 
     def build(mission: Mission, body: Body) -> StateMachine:
@@ -26,4 +30,4 @@ def run(
             return MappingRobot(me, scenario, seed, body, mission.frame)
         return DensityRobot(me, scenario, seed, body, mission.samples.open("<f8", 2))
 
-    return participate(connect, identity, build, patience_s, say, state)
+    return participate(connect, identity, build, connect_timeout_s, say, state)

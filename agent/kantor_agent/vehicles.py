@@ -1,18 +1,34 @@
 """Vehicles: how a pose moves towards a goal in one step. The planner never knows which one drives.
 
-Every vehicle keeps its end point within speed * dt of where it began, which world-sim checks. Plain
-floats throughout: a step costs about a microsecond.
+Every vehicle ends a step within speed * dt of where it began, which world-sim checks. Plain floats
+throughout: a step costs about a microsecond.
 """
 
 import math
 from collections.abc import Callable
 from typing import Protocol
 
-from kantor_protocol.base.machine import Pose
+from kantor_protocol.base.machine import Body, Pose
 from kantor_protocol.scenario.schema import VehicleOptions as Parameters
 
-LATER_NS = 1 << 62
-"""A last step later than any: since then no time has passed, as on a clock that was set back."""
+_LATER_NS = 1 << 62
+"""A time of the last step that is later than any: no time has passed since, as on a clock that was set back."""
+
+
+class StepTimer:
+    """The time from one step of a robot to the next, in which its vehicle drives."""
+
+    def __init__(self, period_ns: int, body: Body) -> None:
+        """body: the one that the robot takes over."""
+        self._period_ns = period_ns
+        # An incarnation that takes over a body on its way does not know when that moved last: it holds for a step.
+        self._last_ns = 0 if body.step == 0 else _LATER_NS
+
+    def elapsed_s(self, now_ns: int) -> float:
+        """Seconds since the call before: between 0 and a period, whatever the clock says."""
+        elapsed_ns = max(0, min(now_ns - self._last_ns, self._period_ns))
+        self._last_ns = now_ns
+        return elapsed_ns * 1e-9
 
 
 class Vehicle(Protocol):
@@ -32,7 +48,7 @@ def _clamped(value: float, bound: float) -> float:
 
 
 def _stopping(distance_m: float, acceleration_m_s2: float, dt_s: float) -> float:
-    """The speed from which braking over steps of dt stops within v^2 / 2a + v dt / 2, solved for v."""
+    """The speed from which braking in steps of dt stops within the distance: v^2 / 2a + v dt / 2, solved for v."""
     half = acceleration_m_s2 * dt_s / 2.0
     return math.sqrt(half * half + 2.0 * acceleration_m_s2 * distance_m) - half
 
@@ -59,8 +75,8 @@ class FirstOrder:
 class SecondOrder:
     """A double integrator: bounded acceleration and speed, in any direction.
 
-    It steers its velocity to the one that would just stop at the goal under the bound. Its heading
-    is the direction of its velocity.
+    It steers its velocity to the one from which it would just stop at the goal under the bound. Its
+    heading is the direction of its velocity.
     """
 
     def __init__(self, parameters: Parameters) -> None:
@@ -100,7 +116,7 @@ class Unicycle:
         self._turn_rate_rad_s = parameters.turn_rate_rad_s
 
     def drive(self, pose: Pose, x_m: float, y_m: float, dt_s: float, /) -> Pose:
-        """Turn towards the goal, then roll; slower the further the goal is off the nose."""
+        """Turn towards the goal, then drive; slower the further the heading is off the goal."""
         if dt_s <= 0.0:
             return pose
         dx, dy = x_m - pose.x_m, y_m - pose.y_m
@@ -110,8 +126,8 @@ class Unicycle:
         heading = _wrapped(pose.heading_rad + turn)
         braking = _stopping(distance, self._acceleration_m_s2, dt_s)
         wanted = min(self._speed_m_s, braking, distance / dt_s) * max(0.0, math.cos(error - turn))
-        # On a circle through the goal the bearing turns at 2 v sin(error) / distance; faster than the
-        # vehicle can turn, it would orbit the goal for ever.
+        # On a circle through the goal the bearing turns at 2 v sin(error) / distance. If that is faster than
+        # the vehicle can turn, it would orbit the goal for ever.
         off = 2.0 * abs(math.sin(error - turn))
         if off * wanted > self._turn_rate_rad_s * distance:
             wanted = self._turn_rate_rad_s * distance / off
@@ -127,7 +143,7 @@ class Unicycle:
 
 
 class Dubins:
-    """Always at full speed, never tighter than its turn radius, as a fixed-wing aircraft.
+    """Drives at full speed always and turns no tighter than its turn radius, as a fixed-wing aircraft.
 
     A goal within either turning circle cannot be reached by turning to it, so the vehicle first goes
     straight until it lies outside (the first leg of the shortest path has the same effect).
@@ -165,3 +181,4 @@ VEHICLES: dict[str, Callable[[Parameters], Vehicle]] = {
     "unicycle": Unicycle,
     "dubins": Dubins,
 }
+"""Makes a vehicle from its options, by name."""

@@ -40,7 +40,7 @@ VERBS: dict[str, Callable[..., int]] = {
 
 
 def main() -> None:
-    """Entry point: one verb, one exit code, no traceback for what a user can mend."""
+    """Entry point: one verb, one exit code, and one line instead of a traceback for a user's mistake."""
     from kantor_protocol.scenario.errors import ScenarioError  # noqa: PLC0415
     from kantor_protocol.transport.credentials import CredentialsError  # noqa: PLC0415
     from kantor_protocol.transport.session import BusError  # noqa: PLC0415

@@ -7,27 +7,27 @@ from typing import NoReturn
 
 
 class Exit(enum.IntEnum):
-    """What a process of kantor ends with."""
+    """The exit code of a kantor command."""
 
     DONE = 0
     NOT_MET = 1
-    """The mission was not met, or a checker found a fault."""
+    """The mission was not met, or a checker found a violation."""
     USAGE = 2
     """Bad usage or scenario."""
     PROCESS_FAILED = 3
     UNREACHABLE = 4
-    """The bus cannot be reached or refuses us."""
+    """The bus cannot be reached, or it refuses this process."""
     INTERRUPTED = 130
     TERMINATED = 143
 
 
 def fail(code: Exit, message: str) -> NoReturn:
-    """One line to standard error, and out."""
+    """Print one line to standard error and exit."""
     print(f"kantor: {message}", file=sys.stderr)
     sys.exit(code)
 
 
 def warn(messages: Iterable[str]) -> None:
-    """A line each to standard error, and on."""
+    """Print a line for each warning to standard error."""
     for message in messages:
         print(f"kantor: warning: {message}", file=sys.stderr)

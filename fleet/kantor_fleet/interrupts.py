@@ -1,4 +1,4 @@
-"""Signals as a value to ask for, instead of an exception anywhere."""
+"""Signals as a value to poll, instead of an exception at any point."""
 
 import signal
 from types import FrameType
@@ -8,13 +8,13 @@ from kantor_fleet.exits import Exit
 
 
 class Interrupts:
-    """Notes SIGINT and SIGTERM while the context is open; the second SIGINT interrupts for good."""
+    """Notes SIGINT and SIGTERM while the context is open; a second SIGINT raises KeyboardInterrupt."""
 
     def __init__(self, *, patient: bool = False) -> None:
-        """patient: no number of signals interrupts; somebody else sees to it that this ends."""
+        """patient: no signal raises, for a process that its parent ends, or that is about to end."""
         self._patient = patient
         self.code: Exit | None = None
-        """What to exit with, once a signal has come."""
+        """The exit code, once a signal has arrived."""
 
     def __enter__(self) -> Self:
         self._before = {
@@ -27,7 +27,7 @@ class Interrupts:
             signal.signal(number, handler)
 
     def __call__(self) -> bool:
-        """Whether a signal has come."""
+        """Whether a signal has arrived."""
         return self.code is not None
 
     def _note(self, number: int, _frame: FrameType | None) -> None:

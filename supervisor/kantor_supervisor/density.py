@@ -1,7 +1,7 @@
-"""The supervisor of the centralized variant (Kabir & Lee, Algorithm 2): one more participant.
+"""The supervisor of a mission on a density (Kabir & Lee, Algorithm 2): one more participant.
 
-It hears every robot, merges what they know by the mission's rule (eq. 8), and tells all of them
-(eq. 9). It is a relay with a place of its own; a robot cannot tell its word from a neighbour's.
+It hears every robot, merges what they know by the mission's rule (eq. 8), and sends the result to all of
+them (eq. 9). It is a relay with a place of its own; a robot treats its messages as those of a neighbour.
 """
 
 from kantor_protocol.base.machine import Body, Inputs, Outputs, ParticipantId, State
@@ -11,13 +11,13 @@ from kantor_protocol.wire.weights import Units, WeightsPublisher
 
 
 class DensitySupervisor:
-    """The supervisor of a scenario. `step` is its only entrance."""
+    """The supervisor of a scenario with a density. `step` is its only entrance."""
 
     def __init__(self, me: ParticipantId, scenario: Scenario, body: Body, samples: int) -> None:
-        """body: what it takes over. samples: N."""
+        """body: the one that the supervisor takes over. samples: N."""
         units = Units.of(scenario.energy.points, samples)
         self._replica = build_replica(me, scenario, units, samples, body.incarnation)
-        self._radio = Gossip(me, scenario, body.incarnation)
+        self._gossip = Gossip(me, scenario, body.incarnation)
         self._publisher = WeightsPublisher(
             self._replica.weights,
             scenario.publish.weights_every,
@@ -26,18 +26,22 @@ class DensitySupervisor:
         self._step, self._pose = body.step, body.pose
 
     def step(self, inputs: Inputs, /) -> Outputs:
-        """Take in what the robots sent, tell everybody what they lack."""
+        """Take in what the robots sent, send every robot what it lacks."""
         self._step += 1
-        self._radio.hear(inputs.inbox, self._replica.learn)
+        self._gossip.receive(inputs.inbox, self._replica.merge)
         finished = self._replica.empty
         outputs = Outputs(
             step=self._step,
             pose=self._pose,
             lowered=self._replica.packed_lowered(),
             weights=self._publisher.step(self._replica.lowered(), last=finished),
-            outbox=(self._radio.say(self._replica, self._step, self._pose),),
+            outbox=(self._gossip.compose(self._replica, self._step, self._pose),),
             state=State.FINISHED if finished else State.EXPLORING,
-            refused=self._radio.refused,
+            refused=self._gossip.refused,
         )
         self._replica.end_step()
         return outputs
+
+    def validate(self) -> None:
+        """Assert what its parts say of themselves; true between two steps."""
+        assert self._replica.empty == (not self._replica.weights.any())

@@ -11,11 +11,15 @@ from kantor_supervisor.density import DensitySupervisor
 
 
 def run(
-    connect: str, identity: Identity, patience_s: float, say: Callable[[str], None], state: Path
+    connect: str,
+    identity: Identity,
+    connect_timeout_s: float,
+    say: Callable[[str], None],
+    state: Path,
 ) -> str:
-    """Be the supervisor until the mission is over; why it ended.
+    """Play the supervisor until the mission is over; returns why it ended.
 
-    state: folder of its diary. Raises BusError, NotWantedError and StateError.
+    state: folder of its write-ahead log. Raises BusError, RejectedError and StateError.
     """
 
     def build(mission: Mission, body: Body) -> StateMachine:
@@ -26,4 +30,4 @@ def run(
             return MappingSupervisor(me, scenario, mission.seed, body, mission.frame)
         return DensitySupervisor(me, scenario, body, mission.samples.shape[0])
 
-    return participate(connect, identity, build, patience_s, say, state)
+    return participate(connect, identity, build, connect_timeout_s, say, state)

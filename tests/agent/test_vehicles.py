@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent.vehicles import VEHICLES, Vehicle
-from kantor_protocol.base.machine import Pose
+from kantor_agent.vehicles import VEHICLES, StepTimer, Vehicle
+from kantor_protocol.base.machine import Body, Pose
 from kantor_protocol.scenario.schema import VehicleOptions as Parameters
 from support.strategies import ANGLES, FINITE, METRES, examples
 
@@ -80,7 +80,7 @@ def test_step_is_finite_and_within_the_speed(
 @NAMES
 @examples(60)
 @given(data=st.data(), parameters=PARAMETERS, dt_s=PERIODS_S)
-def test_goal_where_the_vehicle_is_does_no_harm(
+def test_goal_at_the_vehicle_itself_keeps_every_bound(
     name: str, data: st.DataObject, parameters: Parameters, dt_s: float
 ) -> None:
     """Eq. 16 is 0/0 on the goal; a vehicle is not."""
@@ -92,7 +92,7 @@ def test_goal_where_the_vehicle_is_does_no_harm(
 
 
 @NAMES
-def test_no_time_no_way(name: str) -> None:
+def test_without_elapsed_time_the_pose_stays(name: str) -> None:
     """In dt = 0 nobody moves."""
     pose = Pose(1.0, 2.0, 0.5, 3.0)
     after = VEHICLES[name](Parameters()).drive(pose, 100.0, 100.0, 0.0)
@@ -264,3 +264,22 @@ def test_dubins_goes_straight_while_the_goal_is_inside_a_circle(
     assert (turns[0] == 0.0) == straight
     assert any(turn != 0.0 for turn in turns)
     assert min(math.hypot(pose.x_m, pose.y_m - beside_m) for pose in way[1:]) < 6.0
+
+
+# The time of a step.
+
+
+def test_elapsed_time_is_between_nothing_and_a_period() -> None:
+    """On a clock that runs, is late, stands still, or is set back."""
+    timer = StepTimer(100_000_000, Body(Pose(0.0, 0.0)))
+    times_s = [0.05, 0.15, 9.0, 9.0, 1.0, 1.02]
+
+    elapsed_s = [timer.elapsed_s(round(now_s * 1e9)) for now_s in times_s]
+    assert elapsed_s == pytest.approx([0.05, 0.1, 0.1, 0.0, 0.0, 0.02])
+
+
+def test_no_time_has_passed_for_a_body_that_was_taken_over() -> None:
+    """When it moved last is not known; the next step is timed as usual."""
+    timer = StepTimer(100_000_000, Body(Pose(0.0, 0.0), step=7))
+
+    assert [timer.elapsed_s(3 * 10**9), timer.elapsed_s(3 * 10**9 + 5 * 10**7)] == [0.0, 0.05]

@@ -189,7 +189,7 @@ def _merging(
 
         return learnt
 
-    _wrap(patch, Replica, "learn", make)
+    _wrap(patch, Replica, "merge", make)
 
 
 # Merging.
@@ -294,7 +294,7 @@ def inventing_acknowledgements(patch: Patch) -> None:
     def make(compose: Any) -> Any:
         def composed(self: Replica, target: int = -1) -> tuple[bytes, bytes, bytes]:
             told: tuple[bytes, bytes, bytes] = compose(self, target)
-            slots = self.slots
+            slots = self.origins
             self.store.known[:, :slots] = np.maximum(self.store.known[:, :slots], self.store.length)
             return told
 
@@ -307,7 +307,7 @@ def inventing_acknowledgements(patch: Patch) -> None:
 def forgetting_to_forward(patch: Patch) -> None:
     def make(compose: Any) -> Any:
         def composed(self: Replica, target: int = -1) -> tuple[bytes, bytes, bytes]:
-            slots, me = self.slots, self.config.me
+            slots, me = self.origins, self.config.me
             foreign = np.arange(slots) != me
             known = self.store.known[:, :slots]
             known[:, foreign] = np.maximum(known[:, foreign], self.store.length[foreign])
@@ -446,7 +446,7 @@ def hostile_message_taken_in(patch: Patch) -> None:
 
         return heard
 
-    _wrap(patch, Gossip, "hear", make)
+    _wrap(patch, Gossip, "receive", make)
 
 
 @mutant("sound messages are refused now and then")
@@ -459,7 +459,7 @@ def sound_message_refused(patch: Patch) -> None:
 
         return heard
 
-    _wrap(patch, Gossip, "hear", make)
+    _wrap(patch, Gossip, "receive", make)
 
 
 @mutant("a new incarnation counts its messages from 1 again", _has(Kill, disk=("torn", "lost")))
@@ -472,7 +472,7 @@ def sequences_used_again(patch: Patch) -> None:
 
         return said
 
-    _wrap(patch, Gossip, "say", make)
+    _wrap(patch, Gossip, "compose", make)
 
 
 @mutant("a robot that has lost its supervisor talks to it for ever", _supervised)
@@ -484,7 +484,7 @@ def supervisor_never_given_up(patch: Patch) -> None:
 
         return said
 
-    _wrap(patch, Gossip, "say", make)
+    _wrap(patch, Gossip, "compose", make)
 
 
 @mutant("a robot that has given its supervisor up never returns to it", _supervised)
@@ -499,7 +499,7 @@ def supervisor_never_heard_again(patch: Patch) -> None:
 
         return said
 
-    _wrap(patch, Gossip, "say", make)
+    _wrap(patch, Gossip, "compose", make)
 
 
 # Energy, motion and goals.
@@ -596,7 +596,7 @@ def weight_that_rises(patch: Patch) -> None:
 
         return learnt
 
-    _wrap(patch, Replica, "learn", make)
+    _wrap(patch, Replica, "merge", make)
 
 
 @mutant("what is published misses an entry now and then", _density)

@@ -23,7 +23,7 @@ def test_deeds_come_in_order_and_ends_before_beginnings() -> None:
         )
     )
 
-    assert [(deed.at_s, deed.who, deed.what) for deed in deeds] == [
+    assert [(deed.at_s, deed.who, deed.action) for deed in deeds] == [
         (3, "r1", "cut"),
         (5, "worldsim", "kill"),
         (6, "worldsim", "start"),
@@ -32,7 +32,7 @@ def test_deeds_come_in_order_and_ends_before_beginnings() -> None:
         (10, "r2", "kill"),
         (12, "r1", "unpause"),
     ]
-    assert deeds[0] == ContainerCommand(3.0, ends=False, what="cut", who="r1", fault=1)
+    assert deeds[0] == ContainerCommand(3.0, undoes=False, action="cut", who="r1", fault=1)
 
 
 @pytest.mark.parametrize(

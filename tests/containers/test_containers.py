@@ -13,7 +13,7 @@ import pytest
 
 from containers.engine import BASE, IMAGE, Fleet, call, resident_mb
 from kantor_fleet.execution.in_process_team import play
-from kantor_fleet.execution.verify import verdicts
+from kantor_fleet.execution.verify import findings
 from kantor_fleet.processes.compose import ComposeConfig
 from kantor_fleet.scenarios.catalog import find
 from kantor_worldsim.observers.recording import Recording
@@ -44,7 +44,7 @@ def rate_in_process(*overrides: str) -> float:
 def check_record(fleet: Fleet) -> dict[str, object]:
     """The run folder on the host is whole, keeps the rules, and can be executed again."""
     folder = fleet.run_folder()
-    assert [line for held, line in verdicts(folder) if not held] == []
+    assert [line for held, line in findings(folder) if not held] == []
     assert (folder / "report.png").exists()
     result = result_of(folder)
     assert result["ended"] == "done"
@@ -118,7 +118,7 @@ def test_a_storm_over_containers(fleet_of: MakeFleet, kantor: "Kantor") -> None:
     result = result_of(fleet.run_folder())  # chaos has verified the rest
     assert (result["ended"], result["violations"]) == ("done", 0)
     assert float(str(result["detection_rate"])) >= 0.8
-    seen = {(incident.who, incident.what) for incident in incidents_of(fleet.run_folder())}
+    seen = {(incident.who, incident.kind) for incident in incidents_of(fleet.run_folder())}
     assert seen >= {(who, what) for who in ("r2", "r3", "r4") for what in ("leave", "join")}
     assert fleet.inspect("worldsim")["State"]["ExitCode"] == 0
 
@@ -143,7 +143,7 @@ def test_world_sim_killed_goes_on_by_itself(fleet_of: MakeFleet) -> None:
     assert fleet.inspect("worldsim")["State"]["ExitCode"] == 0
     check_record(fleet)
     assert json.loads((fleet.run_folder() / "manifest.json").read_text())["resumed"] == 1
-    of_world = [i.what for i in incidents_of(fleet.run_folder()) if i.who == "worldsim"]
+    of_world = [i.kind for i in incidents_of(fleet.run_folder()) if i.who == "worldsim"]
     assert of_world == ["leave", "join"]
 
 

@@ -1,4 +1,4 @@
-"""A fleet's authority: what it issues, what it keeps, and what it refuses to do."""
+"""A fleet's authority: the certificates that it issues, its member list, and the requests that it refuses."""
 
 import re
 from contextlib import suppress
@@ -26,14 +26,14 @@ NOW = datetime(2026, 11, 23, 12, tzinfo=UTC)
 
 
 def identity(folder: Path, user: str) -> Certificate:
-    """Whose certificate is in a folder."""
+    """The identity of a member in a folder."""
     found = credentials.find(folder, user)
     assert isinstance(found, Certificate)
     return found
 
 
-def register(folder: Path) -> Authority:
-    """What the authority holds."""
+def authority_in(folder: Path) -> Authority:
+    """The authority of a folder."""
     found = credentials.read(folder / "authority.toml", Authority)
     assert found is not None
     return found
@@ -53,7 +53,7 @@ def purposes(certificate: x509.Certificate) -> set[str]:
     return {purpose.dotted_string for purpose in usage}
 
 
-def test_everybody_gets_one_file(tmp_path: Path) -> None:
+def test_every_member_gets_one_file(tmp_path: Path) -> None:
     """For its owner alone; the authority's key is in none of them; only routers can serve."""
     folder = tmp_path / "keys"
     issue(
@@ -65,7 +65,7 @@ def test_everybody_gets_one_file(tmp_path: Path) -> None:
         f"{name}.toml" for name in ("authority", *users)
     )
     assert folder.stat().st_mode & 0o777 == 0o700
-    own = register(folder)
+    own = authority_in(folder)
     root = x509.load_pem_x509_certificate(own.certificate.encode())
     for user in users:
         found = identity(folder, user)
@@ -127,7 +127,7 @@ def test_renewed_and_revoked(tmp_path: Path) -> None:
     assert router.objection(old["r3"], team) == ""
 
     issue(tmp_path, Wanted("demo", 3), NOW)
-    assert "r2" not in register(tmp_path).members
+    assert "r2" not in identity(tmp_path, "worldsim").members
     issue(tmp_path, Wanted("demo", renew=("r2",)), NOW)
     router = identity(tmp_path, "worldsim")
     assert router.objection(identity(tmp_path, "r2").name, team) == ""
@@ -162,7 +162,9 @@ def test_sites_carry_a_register_of_their_own(tmp_path: Path) -> None:
     assert [line.partition(":")[0].rpartition("/")[2] for line in lines] == [
         "r2", "worldsim.toml", "site-north.toml",
     ]  # fmt: skip
-    with pytest.raises(CredentialsError, match=r"site-south.toml: not here .* --renew site-south"):
+    with pytest.raises(
+        CredentialsError, match=r"site-south.toml: missing or not usable, .* --renew site-south"
+    ):
         issue(tmp_path, Wanted("demo", sites=("south=r1,r3",)), NOW)
     issue(tmp_path, Wanted("demo", sites=("south=r1,r3",), renew=("site-south",)), NOW)
     assert set(identity(tmp_path, "site-south").members) == {"worldsim", "r1", "r3"}
@@ -188,7 +190,7 @@ def test_sites_carry_a_register_of_their_own(tmp_path: Path) -> None:
             Wanted("demo", sites=("north=r9",)),
             "--site north: the register has no r9; add --robots 9",
         ),
-        (Wanted("demo", sites=("north=r1", "south=r1")), "r1 stands behind one site only"),
+        (Wanted("demo", sites=("north=r1", "south=r1")), "r1 can be behind one site only"),
         (Wanted("demo", renew=("r9",)), "--renew r9: is not in the register"),
         (Wanted("demo", renew=("../r1",)), "--renew ../r1: is not in the register"),
         (Wanted("demo", renew=("site-x",)), "--renew site-x: no such site"),
@@ -266,13 +268,13 @@ def test_what_was_interrupted_is_made_good_by_running_it_again(
                 done = True
         if not done:
             revoked = (
-                "r2" not in register(folder).members
+                "r2" not in authority_in(folder).members
             )  # then that is done, and refused a second time
             again = Wanted(
                 "demo", wanted.robots, renew=wanted.renew, revoke=() if revoked else wanted.revoke
             )
             issue(folder, again, NOW)
-        own, router = register(folder), identity(folder, "worldsim")
+        own, router = authority_in(folder), identity(folder, "worldsim")
         assert router.members == own.members
         assert router.revoked == own.revoked
         for user, member in own.members.items():
@@ -310,7 +312,7 @@ def test_the_register_counts_one_certificate_for_each(
     for wanted in (Wanted("demo", 1), *orders):
         with suppress(CredentialsError):
             issue(folder, wanted, NOW)
-        own = register(folder)
+        own = authority_in(folder)
         ever |= {member.name for member in own.members.values()}
         router = identity(folder, "worldsim")
         assert (router.members, router.sites, router.revoked) == (

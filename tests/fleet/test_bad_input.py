@@ -144,14 +144,15 @@ def test_an_override_without_a_value_is_refused(kantor: "Kantor") -> None:
     ("flags", "says"),
     [
         (("--exact-every", "-1"), "--exact-every -1: give a number of periods"),
-        (("--exact-every", "9", "--exchange", "wall"), "not on the wall"),
+        (("--exact-every", "9", "--exchange", "realtime"), "not in realtime"),
+        (("--exact-every", "9", "--exchange", "wall"), "not in realtime"),
         (("--exact", "--set", "samples.count=90000"), "--exact: too many points and samples"),
     ],
 )
 def test_an_exact_distance_out_of_reach_is_refused(
     kantor: "Kantor", flags: tuple[str, ...], says: str
 ) -> None:
-    """It takes seconds and memory, which the wall does not wait for."""
+    """It takes seconds and memory, and a realtime mission does not wait."""
     code, line = refused(kantor, "run", "fleet", *flags)
 
     assert code == 2

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from kantor_fleet.execution.in_process_team import team
-from kantor_fleet.report.picture import Run, Trail
+from kantor_fleet.report.picture import RunHistory, Trail
 from kantor_fleet.report.report import draw
 from kantor_fleet.report.style import team_colours
 from kantor_protocol.base.counter_rng import Purpose
@@ -22,7 +22,7 @@ from kantor_protocol.base.machine import Observation, Outputs, Pose, State
 from kantor_protocol.scenario.load import parse
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record, StepRecord
 from kantor_worldsim.world.world import StepVerdict, WorldSetup
 
@@ -70,13 +70,13 @@ def play(*overrides: str, seed: int = 1) -> list[Record]:
     site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
     simulation = Simulation(scenario, seed, site, [records.append])
-    simulate(simulation, in_process(team(scenario, seed, site)), seed, lambda: False)
+    simulate(simulation, InProcessExchange(team(scenario, seed, site)), seed, lambda: False)
     return records
 
 
-def followed(records: list[Record]) -> Run:
+def followed(records: list[Record]) -> RunHistory:
     """What the picture knows of a run."""
-    run = Run.of(records)
+    run = RunHistory.of(records)
     assert run is not None
     return run
 

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
-from kantor_fleet.report.picture import Run, draw_bumps, draw_known
+from kantor_fleet.report.picture import RunHistory, draw_bumps, draw_known
 from kantor_fleet.report.report import draw
 from kantor_fleet.report.summary import summary
 from kantor_protocol.base.grid import Frame
@@ -31,8 +31,8 @@ def picture(records: Records, path: Path) -> Image.Image:
         return image
 
 
-def followed(records: Records) -> tuple[Run, MapMetrics]:
-    run = Run.of(records)
+def followed(records: Records) -> tuple[RunHistory, MapMetrics]:
+    run = RunHistory.of(records)
     assert run is not None
     assert isinstance(run.metrics, MapMetrics)
     return run, run.metrics

@@ -1,6 +1,5 @@
 """`kantor reproduce`: verdicts that can fail, and figures, numbers and a table from one command."""
 
-import csv
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -12,18 +11,20 @@ from kantor_fleet.reproduce.claims import (
     MISS,
     OK,
     UNMATCHED,
-    Ahead,
-    Median,
-    Range,
-    Ratio,
-    Share,
-    Spread,
+    MedianInBand,
+    MedianRatio,
+    NarrowestSpread,
+    PairedLead,
+    RareShare,
+    WideRange,
     interval,
     quartiles,
 )
 from kantor_fleet.reproduce.kabir_lee import FIGURES, drop_at_contact, loosest
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, Setting
 from kantor_worldsim.observers.metrics.density import DensityRow
+from support.claims import number, runs_of
+from support.files import rows_of
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -31,21 +32,12 @@ if TYPE_CHECKING:
 HERE, THERE = Setting("here"), Setting("there")
 
 
-def flights(*robots_s: float) -> list[MeasuredRun]:
-    """Flights that stand for one number each."""
-    return [MeasuredRun(robots_s=value) for value in robots_s]
-
-
-def number(flight: MeasuredRun) -> float:
-    return flight.robots_s
-
-
 def test_a_median_must_lie_in_its_band() -> None:
     """Its ends belong to it; one run outside the band does not matter, the middle one does."""
 
     def verdict(*values: float, why: str = "") -> str:
-        claim = Median("it", HERE, "2", 1.0, 3.0, number, why=why)
-        return claim.judge("fig0", {HERE: flights(*values)}).verdict
+        claim = MedianInBand("it", HERE, "2", 1.0, 3.0, number, why=why)
+        return claim.judge("fig0", {HERE: runs_of(*values)}).verdict
 
     assert [verdict(*values) for values in ((1, 3, 99), (3, 3, 3), (1, 1, 1))] == [OK] * 3
     assert [verdict(*values) for values in ((0, 0.9, 3), (1, 3.1, 99))] == [MISS] * 2
@@ -54,17 +46,17 @@ def test_a_median_must_lie_in_its_band() -> None:
 
 
 def test_a_median_is_told_with_its_quartiles_and_its_band() -> None:
-    line = Median("it", HERE, "2", 1.0, math.inf, number, 1, " %").judge(
-        "fig0", {HERE: flights(1, 2, 3, 4, 5)}
+    line = MedianInBand("it", HERE, "2", 1.0, math.inf, number, 1, " %").judge(
+        "fig0", {HERE: runs_of(1, 2, 3, 4, 5)}
     )
 
     assert (line.ours, line.reading) == ("3.0 [2.0, 4.0] %", "≥ 1 %")
 
 
 def test_the_narrowest_spread_must_be_the_narrowest() -> None:
-    claim = Spread("it", HERE, (THERE,), "narrower", number, "")
+    claim = NarrowestSpread("it", HERE, (THERE,), "narrower", number, "")
 
-    wide, narrow = flights(0, 10, 20), flights(100, 101, 102)
+    wide, narrow = runs_of(0, 10, 20), runs_of(100, 101, 102)
     assert claim.judge("fig0", {HERE: narrow, THERE: wide}).verdict == OK
     assert claim.judge("fig0", {HERE: wide, THERE: narrow}).verdict == MISS
 
@@ -82,41 +74,41 @@ def test_the_narrowest_spread_must_be_the_narrowest() -> None:
 def test_being_ahead_takes_pairs_and_where_asked_intervals_apart(
     upper: Sequence[float], lower: Sequence[float], *, apart: bool, verdict: str
 ) -> None:
-    claim = Ahead("it", HERE, THERE, "ahead", "", number, "", apart=apart)
+    claim = PairedLead("it", HERE, THERE, "ahead", "", number, "", apart=apart)
 
-    line = claim.judge("fig0", {HERE: flights(*upper), THERE: flights(*lower)})
+    line = claim.judge("fig0", {HERE: runs_of(*upper), THERE: runs_of(*lower)})
 
     assert line.verdict == verdict
 
 
 def test_an_unsure_reading_takes_any_sign() -> None:
-    claim = Ahead("it", HERE, THERE, "ahead", "", number, "", sure=False)
+    claim = PairedLead("it", HERE, THERE, "ahead", "", number, "", sure=False)
 
-    assert claim.judge("fig0", {HERE: flights(1, 2), THERE: flights(2, 1)}).verdict == OK
+    assert claim.judge("fig0", {HERE: runs_of(1, 2), THERE: runs_of(2, 1)}).verdict == OK
 
 
 def test_a_ratio_is_told_and_not_judged() -> None:
-    claim = Ratio("it", HERE, THERE, "much less", number, "it depends")
+    claim = MedianRatio("it", HERE, THERE, "much less", number, "it depends")
 
-    line = claim.judge("fig0", {HERE: flights(1, 1), THERE: flights(2, 2)})
+    line = claim.judge("fig0", {HERE: runs_of(1, 1), THERE: runs_of(2, 2)})
 
     assert (line.verdict, line.why) == (UNMATCHED, "it depends")
     assert "0.50 times" in line.ours
 
 
 def test_a_range_goes_from_the_lowest_to_the_highest() -> None:
-    claim = Range("it", (HERE, THERE), "", 5.0, number, " %")
+    claim = WideRange("it", (HERE, THERE), "", 5.0, number, " %")
 
-    far = claim.judge("fig0", {HERE: flights(70), THERE: flights(75)})
+    far = claim.judge("fig0", {HERE: runs_of(70), THERE: runs_of(75)})
     assert (far.verdict, far.ours) == (OK, "70.0 to 75.0 % over 2 starts")
-    assert claim.judge("fig0", {HERE: flights(70), THERE: flights(74.9)}).verdict == MISS
+    assert claim.judge("fig0", {HERE: runs_of(70), THERE: runs_of(74.9)}).verdict == MISS
 
 
 def test_a_share_counts_runs() -> None:
-    claim = Share("it", HERE, "", 0.25, lambda flight: flight.robots_s > 10)
+    claim = RareShare("it", HERE, "", 0.25, lambda run: run.robots_s > 10)
 
-    assert claim.judge("fig0", {HERE: flights(1, 2, 3, 11)}).verdict == OK
-    assert claim.judge("fig0", {HERE: flights(1, 2, 11, 11)}).verdict == MISS
+    assert claim.judge("fig0", {HERE: runs_of(1, 2, 3, 11)}).verdict == OK
+    assert claim.judge("fig0", {HERE: runs_of(1, 2, 11, 11)}).verdict == MISS
 
 
 def test_an_interval_is_students() -> None:
@@ -170,12 +162,10 @@ def test_a_figure_comes_with_its_numbers_and_its_verdicts(kantor: "Kantor") -> N
     with Image.open(folder / "fig8.png") as image:
         assert image.width > 1000
     assert (folder / "fig8.pdf").read_bytes().startswith(b"%PDF")
-    with (folder / "fig8.csv").open(encoding="utf-8", newline="") as file:
-        runs = list(csv.DictReader(file))
+    runs = rows_of(folder / "fig8.csv")
     assert [int(run["seed"]) for run in runs] == [0, 1, 0, 1]
     assert all(0 < int(run["detected"]) <= 500 for run in runs)
-    with (folder / "verdicts.csv").open(encoding="utf-8", newline="") as file:
-        verdicts = list(csv.DictReader(file))
+    verdicts = rows_of(folder / "verdicts.csv")
     assert {line["figure"] for line in verdicts} == {"fig8"}
     assert done.code == (1 if any(line["verdict"] == MISS for line in verdicts) else 0)
     for line in verdicts:

@@ -1,10 +1,8 @@
 """`kantor reproduce` of papers that explore a map: ratios, even parts, kept runs, pictures."""
 
-import csv
 import itertools
 import math
 import signal
-import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,24 +21,24 @@ from kantor_fleet.reproduce import burgard, explored, kabir_lee, kme, papers
 from kantor_fleet.reproduce.claims import (
     MISS,
     OK,
-    TOLD,
+    REPORTED,
     UNMATCHED,
-    GeometricRatio,
-    Lower,
-    Lowest,
+    GeometricMeanRatio,
+    IdenticalRuns,
+    LowerThroughout,
+    LowestMean,
     MeanRatio,
-    Same,
     geometric,
     mean_ratio,
     paired_ratios,
-    times,
+    text_of_ratio,
 )
-from kantor_fleet.reproduce.figure import Figure
+from kantor_fleet.reproduce.figure import PaperFigure
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, Moment, Setting
 from kantor_fleet.reproduce.measures import finished, map_row, wtv_final
 from kantor_fleet.reproduce.run import reproduce
-from kantor_fleet.sweep.journal import Journal
-from kantor_fleet.sweep.plan import Key
+from kantor_fleet.sweep.journal import RunsJournal
+from kantor_fleet.sweep.plan import RunKey
 from kantor_protocol.scenario.schema import MAP_PLANNERS
 from kantor_worldsim.observers.metrics.result import (
     Bounds,
@@ -49,6 +47,8 @@ from kantor_worldsim.observers.metrics.result import (
     MapResult,
     Result,
 )
+from support.claims import number, runs_of
+from support.files import rows_of, wait_until
 from support.strategies import examples
 
 if TYPE_CHECKING:
@@ -56,15 +56,6 @@ if TYPE_CHECKING:
 
 HERE, THERE, FAR = Setting("here"), Setting("there"), Setting("far")
 POSITIVE = st.floats(min_value=1e-3, max_value=1e6)
-
-
-def flights(*robots_s: float) -> list[MeasuredRun]:
-    """Flights that stand for one number each."""
-    return [MeasuredRun(robots_s=value) for value in robots_s]
-
-
-def number(flight: MeasuredRun) -> float:
-    return flight.robots_s
 
 
 # Claims
@@ -75,20 +66,20 @@ def test_a_ratio_of_means_must_lie_in_its_band_and_needs_none() -> None:
 
     def verdict(*over: float, low: float = -math.inf, high: float = math.inf, why: str = "") -> str:
         claim = MeanRatio("it", HERE, THERE, "", "", number, low, high, why)
-        return claim.judge("fig0", {HERE: flights(*over), THERE: flights(2, 6)}).verdict
+        return claim.judge("fig0", {HERE: runs_of(*over), THERE: runs_of(2, 6)}).verdict
 
     assert verdict(2, 4, high=0.75) == OK
     assert verdict(2, 4.1, high=0.75) == MISS
     assert verdict(2, 4, low=0.8, high=1.2) == MISS
     assert verdict(6, 2, low=0.8, high=1.2, why="it depends") == UNMATCHED
-    assert verdict(6, 60) == TOLD
+    assert verdict(6, 60) == REPORTED
 
 
 def test_a_ratio_of_means_comes_with_its_interval() -> None:
     """Whole starts are drawn again, so that what both share does not widen the interval."""
     claim = MeanRatio("it", HERE, THERE, "", "≤ 1", number, high=1.0)
 
-    line = claim.judge("fig0", {HERE: flights(1, 10, 100), THERE: flights(2, 20, 200)})
+    line = claim.judge("fig0", {HERE: runs_of(1, 10, 100), THERE: runs_of(2, 20, 200)})
 
     assert (line.ours, line.verdict) == ("0.50 [0.50, 0.50]", OK)
 
@@ -109,10 +100,10 @@ def test_an_interval_of_a_ratio_scales_with_it(
 
 
 def test_what_must_be_the_same_is_so_in_every_run() -> None:
-    claim = Same("it", HERE, THERE, "", (number,))
+    claim = IdenticalRuns("it", HERE, THERE, "", (number,))
 
-    assert claim.judge("", {HERE: flights(1, 2), THERE: flights(1, 2)}).verdict == OK
-    line = claim.judge("", {HERE: flights(1, 2), THERE: flights(1, 2.5)})
+    assert claim.judge("", {HERE: runs_of(1, 2), THERE: runs_of(1, 2)}).verdict == OK
+    line = claim.judge("", {HERE: runs_of(1, 2), THERE: runs_of(1, 2.5)})
     assert (line.verdict, line.ours) == (MISS, "1 of 2 runs the same")
 
 
@@ -122,16 +113,16 @@ def test_what_must_be_the_same_is_so_in_every_run() -> None:
         (5, 9, ("there",), OK),
         (5, 1, ("there",), UNMATCHED),  # the reading does not have it below the third
         (1, 9, ("there",), MISS),
-        (1, 9, (), TOLD),
+        (1, 9, (), REPORTED),
     ],
 )
 def test_the_lowest_lies_below_those_that_a_reading_has_above(
     there: float, far: float, above: tuple[str, ...], verdict: str
 ) -> None:
     named = (("here", HERE), ("there", THERE), ("far", FAR))
-    claim = Lowest("it", named, "", number, above, "it depends")
+    claim = LowestMean("it", named, "", number, above, "it depends")
 
-    line = claim.judge("fig0", {HERE: flights(2, 4), THERE: flights(there), FAR: flights(far)})
+    line = claim.judge("fig0", {HERE: runs_of(2, 4), THERE: runs_of(there), FAR: runs_of(far)})
 
     assert line.verdict == verdict
     assert line.why == ("" if min(there, far) > 3 else "it depends")
@@ -139,16 +130,16 @@ def test_the_lowest_lies_below_those_that_a_reading_has_above(
 
 def test_geometric_ratios_take_the_runs_that_there_are() -> None:
     """A part of the configurations has no runs of some settings; with one run there is no interval."""
-    claim = GeometricRatio("it", (HERE, FAR), (THERE, FAR), "", "", number, 0.5)
-    found = {HERE: flights(1, 4), THERE: flights(2, 8)}
+    claim = GeometricMeanRatio("it", (HERE, FAR), (THERE, FAR), "", "", number, 0.5)
+    found = {HERE: runs_of(1, 4), THERE: runs_of(2, 8)}
 
     line = claim.judge("fig0", found)
 
     assert (line.verdict, line.ours) == (OK, "0.50 x÷ 1.00 (n = 2)")
     assert claim._replace(most=0.4).judge("fig0", found).verdict == MISS
-    assert claim._replace(most=math.inf).judge("fig0", found).verdict == TOLD
+    assert claim._replace(most=math.inf).judge("fig0", found).verdict == REPORTED
     assert claim.judge("fig0", {}).ours == "no runs"
-    assert times(*geometric([2.0])) == "2.00"
+    assert text_of_ratio(*geometric([2.0])) == "2.00"
 
 
 @given(st.lists(POSITIVE, min_size=2, max_size=20))
@@ -163,14 +154,14 @@ def test_a_geometric_mean_of_ratios_turns_over_with_them(values: list[float]) ->
 
 
 def test_lower_is_judged_setting_by_setting_and_beyond_chance() -> None:
-    claim = Lower("it", (("one", (HERE, FAR), (THERE, FAR)),), "", number)
+    claim = LowerThroughout("it", (("one", (HERE, FAR), (THERE, FAR)),), "", number)
 
     def verdict(here: Iterable[float], there: Iterable[float]) -> str:
-        return claim.judge("", {HERE: flights(*here), THERE: flights(*there)}).verdict
+        return claim.judge("", {HERE: runs_of(*here), THERE: runs_of(*there)}).verdict
 
     assert verdict((1, 2, 3), (4,)) == OK
     assert verdict((5,), (1, 2, 3)) == MISS
-    both = {HERE: flights(5, 6), THERE: flights(5, 5.5), FAR: flights(2)}
+    both = {HERE: runs_of(5, 6), THERE: runs_of(5, 5.5), FAR: runs_of(2)}
     assert claim.judge("", both).verdict == OK  # above, but within its interval
 
 
@@ -199,15 +190,15 @@ def test_any_beginning_of_the_configurations_is_even(first: int) -> None:
 
 
 def test_a_part_has_every_planner_under_the_same_conditions() -> None:
-    orders = kme.part(24)
+    requested = kme.requests(24)
 
-    assert sum(map(len, orders.values())) == 4 * 24
+    assert sum(map(len, requested.values())) == 4 * 24
     for place, starts, robots, spot in kme.configurations()[:24]:
         for planner in kme.PLANNERS:
-            assert spot in orders[kme.setting(planner, place, starts, robots)]
-    wider = kme.part(120)
-    assert all(set(seeds) <= set(wider[setting]) for setting, seeds in orders.items())
-    assert sum(map(len, kme.part(10_000).values())) == 4 * 630
+            assert spot in requested[kme.setting(planner, place, starts, robots)]
+    wider = kme.requests(120)
+    assert all(set(seeds) <= set(wider[setting]) for setting, seeds in requested.items())
+    assert sum(map(len, kme.requests(10_000).values())) == 4 * 630
 
 
 def test_robots_that_start_together_start_at_every_spot() -> None:
@@ -215,16 +206,16 @@ def test_robots_that_start_together_start_at_every_spot() -> None:
     setting = kme.setting(kme.KME, "unstructured", "together", 4)
 
     assert setting.find().starts.spots == kme.SPOTS
-    assert kme.part(630)[setting] == list(range(kme.SPOTS))
+    assert kme.requests(630)[setting] == list(range(kme.SPOTS))
 
 
 @pytest.mark.parametrize("name", [*burgard.FIGURES, *kme.FIGURES])
 def test_every_setting_of_a_figure_is_a_map_that_can_be_run(name: str) -> None:
     figure = papers.FIGURES[name]
-    orders = figure.orders()
+    requested = figure.requests()
 
-    assert {setting for claim in figure.claims for setting in claim.settings} <= orders.keys()
-    scenarios = [setting.find() for setting in orders]
+    assert {setting for claim in figure.claims for setting in claim.settings} <= requested.keys()
+    scenarios = [setting.find() for setting in requested]
     assert {scenario.planner.name for scenario in scenarios} <= MAP_PLANNERS
     assert len(set(scenarios)) == len(scenarios)  # runs are told apart by their scenarios
 
@@ -246,7 +237,7 @@ def test_readings_differ_in_what_the_paper_leaves_open() -> None:
     assert len({burgard.READINGS[i].setting(2, coordinated=False) for i in range(4)}) == 4
 
 
-# Pictures, from made-up flights
+# Pictures, from made-up runs
 
 
 def map_result(**numbers: float) -> MapResult:
@@ -282,7 +273,7 @@ def drawn() -> Callable[[str], tuple[MeasuredRuns, Picture]]:
         figure = papers.FIGURES[name]._replace(runs=42 if name == "kme-all" else 3)
         found = {
             setting: [made_up(setting, seed) for seed in seeds]
-            for setting, seeds in figure.orders().items()
+            for setting, seeds in figure.requests().items()
         }
         return found, figure.draw(found)
 
@@ -400,11 +391,6 @@ def finished_run(seed: int = 0, tick: int = 7, regions: float = 3.0) -> Result:
 # The command
 
 
-def rows_of(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def kept(folder: Path) -> int:
     """Runs in the journal."""
     try:
@@ -414,30 +400,30 @@ def kept(folder: Path) -> int:
 
 
 def test_kept_flights_read_back_as_they_were(tmp_path: Path) -> None:
-    key, flight = Key("a", "b", 3, exact=False), MeasuredRun(course=(Moment(0, 1.5, 0.1),))
-    with Journal(tmp_path / "runs.jsonl", MeasuredRun) as journal:
-        journal.add(key, flight)
+    key, run = RunKey("a", "b", 3, exact=False), MeasuredRun(course=(Moment(0, 1.5, 0.1),))
+    with RunsJournal(tmp_path / "runs.jsonl", MeasuredRun) as journal:
+        journal.add(key, run)
 
-    with Journal(tmp_path / "runs.jsonl", MeasuredRun) as journal:
-        assert journal.outcomes == {key: flight}
-    with Journal(tmp_path / "runs.jsonl") as journal:  # a sweep reads what it knows
+    with RunsJournal(tmp_path / "runs.jsonl", MeasuredRun) as journal:
+        assert journal.outcomes == {key: run}
+    with RunsJournal(tmp_path / "runs.jsonl") as journal:  # a sweep reads what it knows
         assert journal.outcomes == {key: Outcome()}
 
 
-def simple_figure() -> Figure:
+def simple_figure() -> PaperFigure:
     """Two runs of one setting."""
     setting = kme.setting(kme.KME, "blank", "together", 2)
     claim = MeanRatio("it", setting, setting, "", "", finished)
-    return Figure("a figure", 2, (claim,), lambda _flights: Picture(), map_row, kept=True)
+    return PaperFigure("a figure", 2, (claim,), lambda _measured: Picture(), map_row, kept=True)
 
 
-def pool_of(*flights_by_seed: MeasuredRun) -> Callable[[Iterable[Case]], Pool]:
+def pool_of(*runs_by_seed: MeasuredRun) -> Callable[[Iterable[Case]], Pool]:
     """Flies nothing, and has the answers."""
 
     def start(cases: Iterable[Case]) -> Pool:
         for case in cases:
             yield None
-            yield case, flights_by_seed[case.seed]
+            yield case, runs_by_seed[case.seed]
 
     return start
 
@@ -453,7 +439,7 @@ def test_a_run_that_broke_a_rule_counts_and_is_told(
     code = reproduce({"a": simple_figure()}, None, pool_of(good, bad), tmp_path)
 
     assert code == Exit.NOT_MET
-    assert "1 runs broke a rule, and count all the same: too fast" in capsys.readouterr().out
+    assert "1 runs broke a rule and are counted nevertheless: too fast" in capsys.readouterr().out
     assert len(rows_of(tmp_path / "a.csv")) == 2
     nothing = pool_of()  # both are kept
     assert reproduce({"a": simple_figure()}, None, nothing, tmp_path) == Exit.NOT_MET
@@ -488,9 +474,7 @@ def test_interrupted_it_goes_on_where_it_was_stopped(kantor: "Kantor") -> None:
     folder = kantor.folder / "figures"
     order = ("reproduce", "kme-all", "--runs", 3, "--jobs", 1, "--out", "figures")
     running = kantor.start(*order)
-    give_up = time.monotonic() + 100.0
-    while kept(folder) < 2 and time.monotonic() < give_up:
-        time.sleep(0.05)  # a file has no event to wait for
+    wait_until(lambda: kept(folder) >= 2)
     running.send_signal(signal.SIGINT)
     _, told = running.communicate(timeout=60.0)
     before = kept(folder)

@@ -1,14 +1,17 @@
 """`kantor run`, `scenarios` and `verify` as a user runs them."""
 
-import csv
 import json
+import os
 import shutil
 import signal
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import psutil
 import pytest
+
+from support.files import rows_of, wait_until
+from support.fleets import result_of
 
 if TYPE_CHECKING:
     from conftest import Finished, Kantor
@@ -20,13 +23,6 @@ RESULT_NAMES = [
     "out_of_range_refused", "violations", "digest", "wall_s",
 ]  # fmt: skip
 SHORT = ("--set", "limit_s=5")
-
-
-def result_of(folder: Path) -> dict[str, object]:
-    """result.json of a run folder."""
-    tree = json.loads((folder / "result.json").read_text())
-    assert isinstance(tree, dict)
-    return tree
 
 
 def in_process(kantor: "Kantor", *arguments: object) -> "Finished":
@@ -130,11 +126,32 @@ def test_an_exact_distance_comes_when_asked_for_and_changes_nothing(
     before, after = (result_of(folder) for folder in kantor.runs())
     assert before["digest"] == after["digest"]
     assert before["w1_exact"] is None
-    with (kantor.runs()[1] / "metrics.csv").open(encoding="utf-8", newline="") as file:
-        exact = {int(row["tick"]): row["w1_exact"] for row in csv.DictReader(file)}
+    rows = rows_of(kantor.runs()[1] / "metrics.csv")
+    exact = {int(row["tick"]): row["w1_exact"] for row in rows}
     assert {tick for tick, value in exact.items() if value} == {0, 15, 30, 40}
     assert float(exact[40]) == after["w1_exact"]
     assert f"exact {after['w1_exact']:.4g}" in asked.out
+
+
+@pytest.mark.parametrize("spelling", ["realtime", "wall"])
+def test_a_realtime_run_is_recorded_as_wall(kantor: "Kantor", spelling: str) -> None:
+    """Both names of the exchange are accepted; records, manifest and result.json keep `wall`."""
+    finished = kantor("run", "fleet", "--exchange", spelling, "--speed", 20, *SHORT)
+
+    (folder,) = kantor.runs()
+    assert finished.code == 1, finished.err  # the limit cut it
+    assert result_of(folder)["exchange"] == "wall"
+    assert json.loads((folder / "manifest.json").read_text())["exchange"] == "wall"
+    assert kantor("verify", folder).code == 0
+
+
+@pytest.mark.parametrize("verb", ["run", "worldsim"])
+def test_help_names_the_realtime_exchange(kantor: "Kantor", verb: str) -> None:
+    """With its former name as an alias."""
+    shown = " ".join(kantor(verb, "--help").out.replace("│", " ").split())
+
+    assert "lockstep,realtime,wall}" in shown
+    assert "wall is accepted for it" in shown
 
 
 def test_the_scenario_in_the_folder_runs_again_to_the_same_digest(kantor: "Kantor") -> None:
@@ -194,7 +211,7 @@ def test_verify_tells_of_an_opening_that_is_no_use(kantor: "Kantor") -> None:
 
     finished = kantor("verify", folder)
     assert (finished.code, finished.err) == (1, "")
-    assert "FAIL  run.mcap: its opening is no use" in finished.out
+    assert "FAIL  run.mcap: no run can start from its opening" in finished.out
 
 
 def test_ctrl_c_leaves_a_valid_partial_record(kantor: "Kantor") -> None:
@@ -211,6 +228,20 @@ def test_ctrl_c_leaves_a_valid_partial_record(kantor: "Kantor") -> None:
     assert result_of(folder)["ended"] == "interrupted"
     assert (folder / "report.png").exists()
     assert kantor("verify", folder).code == 0
+
+
+def test_ctrl_c_while_kernels_are_compiled_ends_the_command_at_once(kantor: "Kantor") -> None:
+    """SIGINT to the whole group, as a terminal sends it: exit code 130 and no traceback."""
+    cache = kantor.folder / "kernels"
+    process = kantor.start("run", "fleet", NUMBA_CACHE_DIR=str(cache))
+    wait_until(lambda: any(cache.rglob("*.nbi")))
+    started = psutil.Process(process.pid).children(recursive=True)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert psutil.wait_procs(started, timeout=10)[1] == []
 
 
 def test_a_full_disk_cuts_the_record_and_not_the_mission(kantor: "Kantor") -> None:

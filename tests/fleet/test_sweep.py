@@ -1,11 +1,9 @@
 """`kantor sweep`: plans, journals, tables, and what happens to workers and to impatient users."""
 
-import csv
 import json
 import os
 import signal
 import statistics
-import time
 from collections.abc import Callable, Iterable
 from contextlib import closing
 from pathlib import Path
@@ -18,10 +16,11 @@ import pytest
 from kantor_fleet.execution.experiment import Case, Outcome, run_case
 from kantor_fleet.execution.pools import Pool, local
 from kantor_fleet.exits import Exit
-from kantor_fleet.sweep.journal import Journal
-from kantor_fleet.sweep.plan import Key, SweepError, parse_seeds, plan
+from kantor_fleet.sweep.journal import RunsJournal
+from kantor_fleet.sweep.plan import RunKey, SweepError, parse_seeds, plan
 from kantor_fleet.sweep.run import SweepConfig, sweep
-from kantor_fleet.sweep.summary import Spread
+from kantor_fleet.sweep.summary import Distribution
+from support.files import rows_of, wait_until
 from support.strategies import mission
 from support.workers import DEADLY_SEED, die_of_a_seed, fail_of_a_seed
 
@@ -36,26 +35,12 @@ RUNS = 24
 FULL = (*VARIED, "--seeds", "0:6", *SMALL)
 
 
-def rows_of(path: Path) -> list[dict[str, str]]:
-    """A table."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def journal_lines(folder: Path) -> list[bytes]:
     """The whole lines of a journal, without its header."""
     try:
         return (folder / "runs.jsonl").read_bytes().split(b"\n")[1:-1]
     except FileNotFoundError:
         return []
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    """A file has no event to wait for."""
-    give_up = time.monotonic() + 60.0
-    while not condition():
-        assert time.monotonic() < give_up
-        time.sleep(0.005)
 
 
 # Plans
@@ -196,19 +181,19 @@ def test_what_an_extra_is_needed_for_names_it(
 
 # The journal
 
-KEY, OUTCOME = Key("scenario", "code", 3, exact=False), Outcome(failed="thunder", wall_s=1.5)
+KEY, OUTCOME = RunKey("scenario", "code", 3, exact=False), Outcome(failed="thunder", wall_s=1.5)
 
 
 def test_a_journal_keeps_runs_and_forgets_a_torn_line(tmp_path: Path) -> None:
     """What was cut off is as if it had not been written, at whatever byte."""
     path = tmp_path / "runs.jsonl"
-    with Journal(path) as journal:
+    with RunsJournal(path) as journal:
         journal.add(KEY, OUTCOME)
     whole = path.read_bytes()
 
     for torn in range(1, len(whole) + 1):
         path.write_bytes(whole[:torn])
-        with Journal(path) as journal:
+        with RunsJournal(path) as journal:
             assert journal.outcomes == ({KEY: OUTCOME} if torn == len(whole) else {})
             journal.add(KEY, OUTCOME)
         assert path.read_bytes() == whole + whole.splitlines(keepends=True)[1] * (
@@ -230,7 +215,7 @@ def test_a_file_of_somebody_else_is_left_alone(tmp_path: Path, text: bytes, says
     path.write_bytes(text)
 
     with pytest.raises(SweepError, match=says):
-        Journal(path)
+        RunsJournal(path)
 
     assert path.read_bytes() == text
 
@@ -238,18 +223,21 @@ def test_a_file_of_somebody_else_is_left_alone(tmp_path: Path, text: bytes, says
 def test_a_line_that_is_no_run_is_named(tmp_path: Path) -> None:
     """It was not torn, so somebody wrote it."""
     path = tmp_path / "runs.jsonl"
-    with Journal(path):
+    with RunsJournal(path):
         pass
     path.write_bytes(path.read_bytes() + b'{"scenario":1}\n')
 
     with pytest.raises(SweepError, match=r"line 2 is no run .* remove it"):
-        Journal(path)
+        RunsJournal(path)
 
 
 def test_two_sweeps_do_not_write_into_one_journal(tmp_path: Path) -> None:
     """The second is told."""
-    with Journal(tmp_path / "runs.jsonl"), pytest.raises(SweepError, match="another sweep writes"):
-        Journal(tmp_path / "runs.jsonl")
+    with (
+        RunsJournal(tmp_path / "runs.jsonl"),
+        pytest.raises(SweepError, match="another sweep writes"),
+    ):
+        RunsJournal(tmp_path / "runs.jsonl")
 
 
 # Workers
@@ -306,16 +294,16 @@ def test_whatever_a_run_raises_is_its_outcome(tmp_path: Path) -> None:
 def test_a_spread_is_what_numpy_says_and_the_same_every_time() -> None:
     """Median and quartiles as `statistics` has them; the interval holds the median of its source."""
     draws = np.random.default_rng(1).normal(50.0, 5.0, (200, 25))
-    spreads = [Spread.of(row) for row in draws]
+    spreads = [Distribution.of(row) for row in draws]
     first, median, third = statistics.quantiles(draws[0].tolist(), n=4, method="inclusive")
 
     assert spreads[0][:4] == pytest.approx((25, median, first, third))
-    assert Spread.of(draws[0]) == spreads[0]
+    assert Distribution.of(draws[0]) == spreads[0]
     covered = sum(spread.low <= 50.0 <= spread.high for spread in spreads) / len(spreads)
     assert 0.90 <= covered <= 0.99
-    assert Spread.of(np.array([4.0])) == (1, 4.0, 4.0, 4.0, None, None)
-    assert Spread.of(np.array([])) == (0, None, None, None, None, None)
-    assert Spread.of(np.array([2.0, 2.0])) == (2, 2.0, 2.0, 2.0, 2.0, 2.0)
+    assert Distribution.of(np.array([4.0])) == (1, 4.0, 4.0, 4.0, None, None)
+    assert Distribution.of(np.array([])) == (0, None, None, None, None, None)
+    assert Distribution.of(np.array([2.0, 2.0])) == (2, 2.0, 2.0, 2.0, 2.0, 2.0)
 
 
 # The command

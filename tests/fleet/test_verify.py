@@ -13,7 +13,7 @@ from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.metrics.result import Result
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.record.run_folder import MANIFEST
@@ -77,7 +77,7 @@ def recorded(scenario: Scenario, folder: Path, machines: Exchange | None = None)
     recording = Recording(scenario, 1, "in-process", folder)
     site = WorldSetup.of(scenario, 1)
     simulation = Simulation(scenario, 1, site, [recording.observe])
-    simulate(simulation, machines or in_process(team(scenario, 1, site)), 1, lambda: False)
+    simulate(simulation, machines or InProcessExchange(team(scenario, 1, site)), 1, lambda: False)
     return recording.finish()
 
 
@@ -119,7 +119,7 @@ class Forgetful:
     """A crew in which r1 does not answer at times, as over a bus that is too slow."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._crew = in_process(team(scenario, 1, WorldSetup.of(scenario, 1)))
+        self._crew = InProcessExchange(team(scenario, 1, WorldSetup.of(scenario, 1)))
 
     def __call__(self, inputs: dict[ParticipantId, Inputs], /) -> dict[ParticipantId, Outputs]:
         asleep = {"r1"} if inputs["r1"].now_ns == 500_000_000 else set()

@@ -78,7 +78,7 @@ class Played:
         self.acted: list[str] = []
         for record in self.records:
             if isinstance(record, Batch):
-                mailbag.post(record)
+                mailbag.add(record)
         for record in self.records:
             for step_record in record.step_records if isinstance(record, Batch) else ():
                 if step_record.outputs is not None:

@@ -10,8 +10,8 @@ import pytest
 
 from kantor_fleet.reproduce.burgard import READINGS, Reading
 from kantor_fleet.reproduce.claims import mean_ratio
-from kantor_fleet.reproduce.measured_runs import MeasuredRun, run_all
-from kantor_fleet.reproduce.measures import distance_m, finished, surveyed
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, run_measured
+from kantor_fleet.reproduce.measures import distance_m, finished, map_result_of
 
 A, B, C, D = READINGS
 SEEDS = 5
@@ -24,7 +24,7 @@ def flown(letter: str, robots: int, *, coordinated: bool, seeds: int = SEEDS) ->
     """A reading over seeds 0, 1, …; no rule may be broken on the way."""
     reading = next(reading for reading in READINGS if reading.letter == letter)
     cases = reading.setting(robots, coordinated=coordinated).cases(range(seeds))
-    flights = [run_all(case) for _, case in cases]
+    flights = [run_measured(case) for _, case in cases]
     assert [flight.failed for flight in flights] == [None] * seeds
     return flights
 
@@ -44,7 +44,7 @@ def test_3_3_one_robot_needs_no_coordination(reading: Reading) -> None:
 
     for one, other in zip(alone, uncoordinated, strict=True):
         assert (finished(one), distance_m(one)) == (finished(other), distance_m(other))
-        assert surveyed(one) == surveyed(other)
+        assert map_result_of(one) == map_result_of(other)
 
 
 @section
@@ -53,7 +53,7 @@ def test_3_3_everything_is_explored() -> None:
     for flight in flown("B", 3, coordinated=True):
         assert flight.result is not None
         assert flight.result.ended == "done"
-        assert surveyed(flight).explored > 0.99
+        assert map_result_of(flight).explored > 0.99
 
 
 @section

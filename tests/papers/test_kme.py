@@ -10,8 +10,8 @@ import pytest
 
 from kantor_fleet.reproduce import kme
 from kantor_fleet.reproduce.claims import Measure, geometric, paired_ratios
-from kantor_fleet.reproduce.measured_runs import MeasuredRun, Setting, run_all
-from kantor_fleet.reproduce.measures import epv_mean, surveyed, wtv_final, wtv_mean
+from kantor_fleet.reproduce.measured_runs import MeasuredRun, Setting, run_measured
+from kantor_fleet.reproduce.measures import epv_mean, map_result_of, wtv_final, wtv_mean
 
 CONFIGURATIONS = 9
 """The first of the order in which parts are taken: every map, both kinds of starts, 8 to 2 robots."""
@@ -23,8 +23,8 @@ section_c = pytest.mark.xdist_group("kme")
 def flown() -> Mapping[Setting, Sequence[MeasuredRun]]:
     """Those configurations, with no rule broken on the way."""
     flights = {
-        setting: [run_all(case) for _, case in setting.cases(seeds)]
-        for setting, seeds in kme.part(CONFIGURATIONS).items()
+        setting: [run_measured(case) for _, case in setting.cases(seeds)]
+        for setting, seeds in kme.requests(CONFIGURATIONS).items()
     }
     failed = [flight.failed for runs in flights.values() for flight in runs]
     assert failed == [None] * 4 * CONFIGURATIONS
@@ -43,7 +43,7 @@ def test_v_b_the_final_variance_is_the_last_one() -> None:
     for runs in flown().values():
         for flight in runs:
             end = flight.course[-1]
-            assert surveyed(flight).explored > 0.98
+            assert map_result_of(flight).explored > 0.98
             assert end.wtv == pytest.approx(wtv_final(flight), rel=0.25)
             assert end.epv < 5.0
 

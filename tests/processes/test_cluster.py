@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 
 import psutil
 import pytest
-from support import workers
 
 from kantor_fleet.execution import pools
 from kantor_fleet.execution.experiment import Case
 from kantor_fleet.exits import Exit
 from kantor_fleet.sweep.plan import SweepPlan, plan
 from kantor_fleet.sweep.run import SweepConfig, sweep
+from support import workers
 from support.strategies import mission
 
 if TYPE_CHECKING:

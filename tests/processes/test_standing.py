@@ -29,7 +29,7 @@ def test_killed_it_goes_on_and_done_it_begins_anew(kantor: "Kantor") -> None:
     assert robot.wait(60) == 0
     (run,) = kantor.runs()
     assert result_of(run)["ended"] == "done"
-    assert [i.what for i in incidents_of(run) if i.who == "worldsim"] == ["leave", "join"]
+    assert [i.kind for i in incidents_of(run) if i.who == "worldsim"] == ["leave", "join"]
 
     third = kantor.start(*command)
     await_line(third, "t=", "waiting for r1")

@@ -130,7 +130,7 @@ def test_whatever_befalls_processes_the_record_is_the_same_over_the_bus(doomed: 
 
     alone, bus = doomed.runs()
     assert result_of(alone)["digest"] == result_of(bus)["digest"]
-    starts = [(i.who, i.incarnation) for i in incidents_of(bus) if i.what == "start"]
+    starts = [(i.who, i.incarnation) for i in incidents_of(bus) if i.kind == "start"]
     assert sorted(starts) == sorted(STARTS)
     log = (bus / "logs" / "worldsim.log").read_text()
     assert log.count("resumed") == 2
@@ -150,9 +150,9 @@ def test_whatever_befalls_processes_they_go_on_by_their_own_clocks(doomed: "Kant
     (folder,) = doomed.runs()
     assert "all rules held" in finished.out, finished.out + finished.err
     incidents = incidents_of(folder)
-    starts = [incident for incident in incidents if incident.what == "start"]
+    starts = [incident for incident in incidents if incident.kind == "start"]
     assert sorted((i.who, i.incarnation) for i in starts) == sorted(STARTS)
-    assert {i.what for i in incidents} >= {
+    assert {i.kind for i in incidents} >= {
         "kill", "start", "pause", "resume", "fill", "free", "slow", "quicken", "pretend",
     }  # fmt: skip
     assert not [i for i in incidents if i.fault < 0]
@@ -163,7 +163,7 @@ def test_whatever_befalls_processes_they_go_on_by_their_own_clocks(doomed: "Kant
     records = records_of(folder)
     assert nothing_happens_between(records, "kill", "start", "worldsim")
     assert nothing_happens_between(records, "pause", "resume", "worldsim")
-    full = [i.now_ns for i in incidents if i.what in {"fill", "free"}]
+    full = [i.now_ns for i in incidents if i.kind in {"fill", "free"}]
     starved = [a for a in acts_of(records, "r5") if full[0] + 1e8 < a.now_ns < full[1]]
     assert starved == []
     verified = doomed("verify", folder)
@@ -175,7 +175,7 @@ def nothing_happens_between(records: list[object], first: str, last: str, who: s
     inside = False
     for record in records:
         if isinstance(record, ProcessEvent) and record.who == who:
-            inside = record.what == first or (inside and record.what != last)
+            inside = record.kind == first or (inside and record.kind != last)
         elif isinstance(record, Batch) and inside:
             return False
     return True
@@ -226,7 +226,7 @@ def test_a_world_sim_that_somebody_kills_goes_on_from_its_record(
         kantor(*mission, "--exchange", "in-process")
         assert result_of(kantor.runs()[-1])["digest"] == result["digest"]
     else:
-        told = [(i.who, i.what) for i in incidents_of(folder) if i.who == "worldsim"]
+        told = [(i.who, i.kind) for i in incidents_of(folder) if i.who == "worldsim"]
         assert told == [("worldsim", "leave"), ("worldsim", "join")] * 2
         assert nothing_happens_between(records_of(folder), "leave", "join", "worldsim")
 
@@ -345,7 +345,7 @@ def test_what_cannot_be_is_refused_with_a_line(kantor: "Kantor") -> None:
     (kantor.folder / "file").write_text("")
     refused = kantor("worldsim", "fleet", "--chaos", "kill.toml")
     assert (refused.code, refused.err) == (
-        2, "kantor: faults[0]: kill: nobody here can do that to processes; use `kantor run`\n",
+        2, "kantor: faults[0]: kill: needs control over the processes of participants; use `kantor run`\n",
     )  # fmt: skip
 
     endpoint = free_endpoint()

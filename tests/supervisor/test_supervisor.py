@@ -19,7 +19,7 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import decode_gossip, decode_inputs, encode
 from kantor_protocol.wire.weights import Units, WeightsSubscriber
 from kantor_supervisor.density import DensitySupervisor
-from support.strategies import Transcript, cast, mission, rehearse, scattered
+from support.strategies import Transcript, build_team, mission, scattered, step_rounds
 
 N = 12
 SAMPLES_M = scattered(N)
@@ -35,7 +35,7 @@ EVERY_MISSION = pytest.mark.parametrize("name", list(MISSIONS))
 
 def transcripts(name: str, rounds: int = 30) -> dict[str, Transcript]:
     """What everybody took in and put out."""
-    return rehearse(cast(MISSIONS[name], SAMPLES_M), MISSIONS[name], rounds)
+    return step_rounds(build_team(MISSIONS[name], SAMPLES_M), MISSIONS[name], rounds)
 
 
 def supervisor(scenario: Scenario) -> DensitySupervisor:
@@ -66,7 +66,7 @@ def test_same_inputs_give_the_same_bytes(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "place"), [("ledger", (50.0, 50.0)), ("placed", (1.0, 2.0))])
-def test_supervisor_stands_and_ships_nothing(name: str, place: tuple[float, float]) -> None:
+def test_supervisor_stays_and_ships_nothing(name: str, place: tuple[float, float]) -> None:
     """It has a place and a radio, and no energy to spend."""
     for step, (_, outputs) in enumerate(transcripts(name)[SUPERVISOR], 1):
         news = decode_gossip(outputs.outbox[0].body)
@@ -78,7 +78,7 @@ def test_supervisor_stands_and_ships_nothing(name: str, place: tuple[float, floa
 
 
 @EVERY_MISSION
-def test_supervisor_speaks_to_everybody(name: str) -> None:
+def test_supervisor_sends_one_envelope_a_step_to_all_in_range(name: str) -> None:
     """Eq. 9: one word a step, for all robots."""
     for step, (_, outputs) in enumerate(transcripts(name)[SUPERVISOR], 1):
         (envelope,) = outputs.outbox
@@ -123,11 +123,11 @@ def test_sum_of_all_spending_is_broadcast() -> None:
     assert merged == [max(0, weight) for weight in expected]
 
 
-def test_robot_hears_of_another_only_through_the_supervisor() -> None:
+def test_robots_learn_of_one_another_only_through_the_supervisor() -> None:
     """centralized: without the supervisor's word, robots know nothing of each other."""
     scenario = MISSIONS["ledger"]
-    deaf = rehearse(
-        cast(scenario, SAMPLES_M), scenario, 10, lambda speaker, _: speaker != SUPERVISOR
+    deaf = step_rounds(
+        build_team(scenario, SAMPLES_M), scenario, 10, lambda speaker, _: speaker != SUPERVISOR
     )
     heard = [len(inputs.inbox) for inputs, _ in deaf["r1"]]
     lowered = [outputs.energy_spent for _, outputs in deaf["r1"]]
@@ -190,7 +190,7 @@ def test_repeated_and_late_messages_change_nothing() -> None:
     ]
 
 
-def test_first_word_of_a_supervisor_that_has_heard_nobody() -> None:
+def test_supervisor_that_has_received_nothing_sends_a_version_vector_of_zeros() -> None:
     """Before anybody spoke it holds nothing and says so: a version vector of zeros."""
     scenario = MISSIONS["ledger"]
     look = Observation(0, Pose(50.0, 50.0))

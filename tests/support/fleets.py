@@ -61,7 +61,7 @@ def await_incident(folder: Path, who: str, what: str, count: int = 1) -> Process
     """The incident of this kind, once it is on record."""
     give_up = time.monotonic() + PATIENCE_S
     while time.monotonic() < give_up:
-        found = [i for i in incidents_of(folder) if (i.who, i.what) == (who, what)]
+        found = [i for i in incidents_of(folder) if (i.who, i.kind) == (who, what)]
         if len(found) >= count:
             return found[count - 1]
         time.sleep(0.02)  # the record is a file, which tells nobody that it grows

@@ -1,4 +1,4 @@
-"""Floor plans for planners: a chart that is drawn, and robots on it."""
+"""Floor plans for tests of planners: a drawn map as a participant knows it, and robots on it."""
 
 from collections.abc import Sequence
 
@@ -10,6 +10,8 @@ from kantor_agent.mapping.cost_map import CostMap
 from kantor_agent.mapping.fused_map import FusedMap
 from kantor_agent.planners.map_base import Member, Situation, Task
 from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.replication.occupancy_log import dead_frontier, entries
+from kantor_protocol.replication.replica import Replica
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from support.strategies import SEEDS
@@ -26,15 +28,38 @@ _KINDS = {" ": UNKNOWN, ".": FREE, "#": OCCUPIED}
 
 
 class Floor:
-    """What is known of a map with cells of 1 m, and the scenario. Ways cost their length in cells."""
+    """The fused map and cost map of a participant, with cells of 1 m. Ways cost their length in cells."""
 
     def __init__(self, cells: npt.NDArray[np.uint8], *overrides: str) -> None:
-        """cells: (rows, columns)."""
+        """cells: (rows, columns), as one log says of them; the rest: overrides of the scenario."""
         self.scenario: Scenario = parse(_MISSION, "floor", overrides)
-        self.fused_map = FusedMap(Frame(1.0, (0.0, 0.0), *cells.shape), 8)
-        self.fused_map.cells[:] = cells.ravel()
-        self.fused_map.revision = 1
+        frame = Frame(1.0, (0.0, 0.0), *cells.shape)
+        self._replica = Replica(0, 1, entries(frame), None, ledger=True, claims=False)
+        self.fused_map = FusedMap(frame, 1)
         self.cost_map = CostMap(self.scenario, self.fused_map)
+        self.see(np.flatnonzero(cells == FREE), FREE)
+        self.see(np.flatnonzero(cells == OCCUPIED), OCCUPIED)
+
+    def see(self, cells: npt.ArrayLike, kind: int) -> None:
+        """Cells turn out to be free or occupied."""
+        self._log(2 * np.asarray(cells, dtype=np.int64) + (kind == OCCUPIED))
+
+    def find_dead(self, cell: int) -> None:
+        """A frontier turns out to be none."""
+        self._log(np.array([dead_frontier(self.fused_map.frame, cell)]))
+
+    def measure(self, *bins: int) -> None:
+        """Ranges are measured, each given by its bin."""
+        self._log(np.array(bins, dtype=np.int64) + 3 * self.fused_map.frame.cells)
+
+    def _log(self, entries: npt.NDArray[np.int64]) -> None:
+        self._replica.append(entries)
+        self.fused_map.fold(self._replica)
+
+    def validate(self) -> None:
+        """The map agrees with the log, and the costs with the map."""
+        self.fused_map.validate(self._replica)
+        self.cost_map.validate()
 
     def situation(
         self,
@@ -43,7 +68,7 @@ class Floor:
         absent: Sequence[int] = (),
         but: Sequence[int] = (),
     ) -> Situation:
-        """With all frontiers but some to choose from."""
+        """A situation with all frontiers but some to choose from."""
         frontiers = self.fused_map.frontiers
         frontiers = frontiers[~np.isin(frontiers, but)]
         return Situation(self.cost_map, frontiers, tuple(members), tuple(others), tuple(absent), 0)
@@ -55,17 +80,17 @@ def drawn(plan: Sequence[str], *overrides: str) -> Floor:
 
 
 def robot(place: int, cell: int, target: int = NOWHERE, *, arrived: bool = False) -> Member:
-    """A member."""
+    """A member of the visible team."""
     return Member(place, cell, Task(target), 0, arrived)
 
 
 @st.composite
 def crowded(draw: st.DrawFn, *overrides: str) -> tuple[Floor, Situation]:
     """Any floor, with up to six robots on it, and targets that are taken."""
-    dice = np.random.default_rng(draw(SEEDS))
+    draws = np.random.default_rng(draw(SEEDS))
     rows, columns = draw(st.integers(1, 12)), draw(st.integers(1, 12))
     walls, unseen = draw(st.sampled_from([0.0, 0.2, 0.4])), draw(st.sampled_from([0.1, 0.3]))
-    kinds = dice.choice(
+    kinds = draws.choice(
         [OCCUPIED, UNKNOWN, FREE], (rows, columns), p=[walls, unseen, 1 - walls - unseen]
     )
     floor = Floor(kinds.astype(np.uint8), *overrides)

@@ -30,7 +30,7 @@ from kantor_protocol.scenario.faults.links import (
     Replay,
 )
 from kantor_protocol.scenario.schema import Scenario
-from kantor_worldsim.radio.channel import DROPPED, LINK_WIDTH, Field, Ruled, Sent, hears
+from kantor_worldsim.radio.channel import DROPPED, LINK_WIDTH, Decisions, LinkGeometry, Sent, hears
 
 Row = tuple[int, int, int]
 """Receiver, row on the air, due_ns: a verdict."""
@@ -341,14 +341,14 @@ class PlainFaults:
         return min(reaches_m, default=self._whole_m(source, target))
 
     def interfere(
-        self, sent: Sequence[Sent], _rows: np.ndarray, ruled: Ruled, field: Field
-    ) -> tuple[Sequence[Sent], Ruled, int]:
+        self, sent: Sequence[Sent], _rows: np.ndarray, ruled: Decisions, field: LinkGeometry
+    ) -> tuple[Sequence[Sent], Decisions, int]:
         """As `Interference` has it."""
         rows = [(to, row, due_ns) for to, row, due_ns in ruled.rows[: ruled.size].tolist()]
         on_air, told, lost = self.rule(
             sent, rows, lambda one, other, range_m: bool(hears(field, one, other, range_m))
         )
-        return on_air, Ruled(np.array([*told, (0, 0, 0)], dtype=np.int64), len(told)), lost
+        return on_air, Decisions(np.array([*told, (0, 0, 0)], dtype=np.int64), len(told)), lost
 
     def rule(
         self, sent: Sequence[Sent], ruled: Iterable[Row], reaches: Reaches

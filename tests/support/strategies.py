@@ -1,11 +1,13 @@
-"""What the tests draw from and stand on: small missions, crowds of points, messages, TOML trees."""
+"""Strategies and small missions for tests: crowds of points, messages, TOML trees, teams that step by themselves."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
@@ -83,56 +85,85 @@ def scattered(count: int, seed: int = 1, extent_m: float = 100.0) -> Points:
     return generator(seed, Purpose.SAMPLES).random((count, 2)) * extent_m
 
 
-# Rehearsals: a mission played with a perfect radio and a world that accepts every move.
+# Teams: the participants of a mission with a perfect radio, and a world that accepts every move.
 
 Transcript = list[tuple[Inputs, Outputs]]
-Hears = Callable[[ParticipantId, ParticipantId], bool]
+"""The inputs and outputs of one participant, step by step."""
+InRange = Callable[[ParticipantId, ParticipantId], bool]
+"""Whether the second participant receives what the first sends."""
+
+VALIDATED_ROUNDS = 5
+"""Machines that a test steps round by round are validated after so many rounds."""
 
 
-def cast(scenario: Scenario, samples_m: Points, seed: int = 1) -> dict[ParticipantId, StateMachine]:
+@contextmanager
+def all_validated(*kinds: type) -> Iterator[None]:
+    """Validates every machine of these kinds that is built in the context, at its end."""
+    built: list[Any] = []
+
+    def noting(kind: Any) -> Callable[..., None]:
+        init = kind.__init__
+
+        def noted(self: Any, *arguments: Any, **options: Any) -> None:
+            init(self, *arguments, **options)
+            built.append(self)
+
+        return noted
+
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in kinds:
+            patch.setattr(kind, "__init__", noting(kind))
+        yield
+    for machine in built:
+        machine.validate()
+
+
+def build_team(
+    scenario: Scenario, samples_m: Points, seed: int = 1
+) -> dict[ParticipantId, StateMachine]:
     """All participants of a mission, robots first."""
-    made: dict[ParticipantId, StateMachine] = {}
+    machines: dict[ParticipantId, StateMachine] = {}
     for name, start_m in zip(scenario.robot_ids, scenario.starts.poses_m, strict=True):
-        made[name] = DensityRobot(name, scenario, seed, Body(Pose(*start_m)), samples_m)
+        machines[name] = DensityRobot(name, scenario, seed, Body(Pose(*start_m)), samples_m)
     if scenario.centralized:
-        made[SUPERVISOR] = DensitySupervisor(
+        machines[SUPERVISOR] = DensitySupervisor(
             SUPERVISOR, scenario, Body(Pose(*scenario.supervisor_m)), samples_m.shape[0]
         )
-    return made
+    return machines
 
 
-def starts(scenario: Scenario) -> dict[ParticipantId, Pose]:
-    """Where everybody stands at time 0."""
+def start_poses(scenario: Scenario) -> dict[ParticipantId, Pose]:
+    """The pose of every participant at time 0."""
     poses = zip(scenario.robot_ids, scenario.starts.poses_m, strict=True)
     placed = {name: Pose(*start_m) for name, start_m in poses}
     return {**placed, SUPERVISOR: Pose(*scenario.supervisor_m)}
 
 
-def everybody(_speaker: ParticipantId, _listener: ParticipantId) -> bool:
-    """A radio without a range."""
+def all_in_range(_source: ParticipantId, _receiver: ParticipantId) -> bool:
+    """A radio without a limit of range."""
     return True
 
 
-def in_a_row(speaker: ParticipantId, listener: ParticipantId) -> bool:
+def in_a_row(source: ParticipantId, receiver: ParticipantId) -> bool:
     """A radio by which r1 hears r2, r2 hears r1 and r3, and so on."""
-    return abs(int(speaker[1:]) - int(listener[1:])) == 1
+    return abs(int(source[1:]) - int(receiver[1:])) == 1
 
 
-def rehearse(
+def step_rounds(
     machines: Mapping[ParticipantId, StateMachine],
     scenario: Scenario,
     rounds: int,
-    hears: Hears = everybody,
+    in_range: InRange = all_in_range,
 ) -> dict[ParticipantId, Transcript]:
-    """Step everybody once a period. What is sent in one round arrives before the next."""
+    """Step every machine once a period. What is sent in one round arrives before the next."""
     inboxes: dict[ParticipantId, list[Envelope]] = {name: [] for name in machines}
-    places = starts(scenario)
+    places = start_poses(scenario)
     transcripts: dict[ParticipantId, Transcript] = {name: [] for name in machines}
     for step in range(1, rounds + 1):
         sent: list[Envelope] = []
         for name, machine in machines.items():
-            look = Observation(step=step - 1, pose=places[name])
-            inputs = Inputs(step * scenario.period_ns, look, tuple(inboxes[name]))
+            observation = Observation(step=step - 1, pose=places[name])
+            inputs = Inputs(step * scenario.period_ns, observation, tuple(inboxes[name]))
             outputs = machine.step(inputs)
             transcripts[name].append((inputs, outputs))
             places[name] = outputs.pose
@@ -140,10 +171,18 @@ def rehearse(
             sent += outputs.outbox
         for envelope in sent:
             for name in machines:
-                wanted = envelope.target in ("", name) and envelope.source != name
-                if wanted and hears(envelope.source, name):
+                addressed = envelope.target in ("", name) and envelope.source != name
+                if addressed and in_range(envelope.source, name):
                     inboxes[name].append(envelope)
+        if step % VALIDATED_ROUNDS == 0:
+            validate_all(machines.values())
     return transcripts
+
+
+def validate_all(machines: Iterable[StateMachine]) -> None:
+    """Validate robots and supervisors."""
+    for machine in machines:
+        machine.validate()  # type: ignore[attr-defined]
 
 
 # Numbers and places.
@@ -248,7 +287,7 @@ TOML_TREES: st.SearchStrategy[TomlTree] = st.dictionaries(TOML_KEYS, TOML_VALUES
 
 
 def paths_of(tree: Any) -> list[tuple[str | int, ...]]:
-    """Every place in a TOML tree, as the keys and positions that lead there."""
+    """All places in a TOML tree, each as the keys and positions that lead there."""
     inside: list[tuple[str | int, Any]] = []
     if isinstance(tree, dict):
         inside = list(tree.items())

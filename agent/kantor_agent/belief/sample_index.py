@@ -1,10 +1,10 @@
-"""Samples in space: the nearest ones that still have weight, found and used up in microseconds.
+"""Spatial index over samples: finds the nearest ones that still have weight, in microseconds.
 
 A bucket grid holds the samples of each cell, those with weight in front; above it a pyramid counts
-them, so that a search skips what is empty. A query begins in the cell of the point and climbs the
+them, so that a search skips empty nodes. A query begins in the cell of the point and climbs the
 pyramid: on every level it searches the three siblings, each from the nearest cell on, unless they are
-empty or further away than what it has, and it ends when nothing outside can be nearer. The cost stays
-flat in N and does not grow when most samples are used up.
+empty or further away than the k-th best so far, and it ends when nothing outside can be nearer. The
+cost stays flat in N and does not grow when most samples are used up.
 
 All orders are by (squared distance, index), which makes every answer unique: it equals a full scan.
 """
@@ -18,31 +18,60 @@ import numpy.typing as npt
 from kantor_protocol.base.kernels import kernel
 
 _PER_CELL = 2.0
-"""Samples in a cell on average."""
+"""Samples in a cell, on average."""
 _LEVELS_MAX = 11
 _SLACK = 1e-9
 """Share of the extent by which a cell's box is taken larger than it is, against rounding."""
 
-# Slots of Grid.frame.
+# Places in `SampleIndex.frame`.
 _X, _Y, _CELL_M, _MARGIN_M = 0, 1, 2, 3
 
 
 class SampleIndex(NamedTuple):
-    """The index over N samples, for the kernels. C = 4^(levels - 1) cells, `side` in a row."""
+    """The index over N samples, as kernels take it. C = 4^(levels - 1) cells.
+
+    What the attributes say of one another, and of the weights, holds after `build`, `remove` and
+    `remove_empty`; `validate` asserts it.
+    """
 
     xy_m: npt.NDArray[np.float64]
-    """(N, 2) world frame."""
+    """(N, 2) positions of the samples, world frame."""
     order: npt.NDArray[np.int32]
-    """(N,) samples by cell, those with weight first."""
+    """(N,) every sample once, cell by cell; in each cell those with weight come first."""
     cell: npt.NDArray[np.int32]
-    """(N,) the cell of each sample."""
+    """(N,) the cell in which `xy_m` lies, by `frame`; beyond the frame, the nearest at its border."""
     first: npt.NDArray[np.int32]
-    """(C + 1,) where each cell begins in `order`."""
+    """(C + 1,) where the samples of each cell begin in `order`; the last entry is N."""
     alive: npt.NDArray[np.int32]
-    """Samples with weight: per node, level by level from the root, row by row in each."""
+    """(nodes,) samples with weight, level by level from the root to the cells, row by row in each: a
+    cell counts those in front in its part of `order`, any other node the sum of its four children."""
     frame: npt.NDArray[np.float64]
-    """Lower left corner (x, y), edge of a cell, margin; metres."""
+    """(4,) lower left corner (x, y), edge of a cell, margin; metres."""
     levels: int
+    """From the root to the cells; a row of cells has 2^(levels - 1)."""
+
+    def validate(self, weights: npt.NDArray[np.int64] | npt.NDArray[np.int32]) -> None:
+        """Assert what the attributes say of one another and of the weights (N,)."""
+        count, side = self.xy_m.shape[0], 1 << (self.levels - 1)
+        place = (self.xy_m - self.frame[:2]) / self.frame[_CELL_M]
+        column, row = np.clip(place, 0, side - 1).astype(np.int64).T
+        assert np.array_equal(self.cell, row * side + column)
+        assert np.array_equal(np.sort(self.order), np.arange(count))
+        assert self.first[0] == 0
+        assert self.first[-1] == count
+        sizes = np.diff(self.first)
+        assert np.array_equal(self.cell[self.order], np.repeat(np.arange(side * side), sizes))
+        rank = np.arange(count) - np.repeat(self.first[:-1], sizes)
+        in_front = rank < np.repeat(self.alive[-side * side :], sizes)
+        assert np.array_equal(in_front, weights[self.order] > 0)
+        here = 0
+        for level in range(self.levels - 1):
+            nodes = 4**level
+            below = self.alive[here + nodes : here + 5 * nodes].reshape(
+                1 << level, 2, 1 << level, 2
+            )
+            assert np.array_equal(self.alive[here : here + nodes], below.sum(axis=(1, 3)).ravel())
+            here += nodes
 
 
 @kernel
@@ -60,7 +89,7 @@ def _cell_of(grid: SampleIndex, x: float, y: float) -> tuple[int, int]:
 
 @kernel
 def build(grid: SampleIndex, weights: np.ndarray) -> None:
-    """Sort all samples into cells by their present places, and count those with weight."""
+    """Sort all samples into cells by their present positions, and count those with weight."""
     side = 1 << (grid.levels - 1)
     leaves = _level_start(grid.levels - 1)
     grid.alive[:] = 0
@@ -71,7 +100,7 @@ def build(grid: SampleIndex, weights: np.ndarray) -> None:
         grid.first[grid.cell[j] + 1] += 1
     for c in range(side * side):
         grid.first[c + 1] += grid.first[c]
-    # Those with weight first, so that they are in front. The dead count only while they are placed.
+    # Those with weight first, so that they are in front. The others count only while they are placed.
     for with_weight in (True, False):
         for j in range(grid.xy_m.shape[0]):
             if (weights[j] > 0) == with_weight:
@@ -97,17 +126,17 @@ def build(grid: SampleIndex, weights: np.ndarray) -> None:
 
 @kernel
 def remove(grid: SampleIndex, j: int) -> None:
-    """Take a sample out of the search. A sample that is out already stays out."""
+    """Take a sample out of the search; one that is out already stays out."""
     leaf = grid.levels - 1
     c = grid.cell[j]
     start = grid.first[c]
     end = start + grid.alive[_level_start(leaf) + c]
-    slot = start
-    while slot < end and grid.order[slot] != j:
-        slot += 1
-    if slot == end:
+    at = start
+    while at < end and grid.order[at] != j:
+        at += 1
+    if at == end:
         return
-    grid.order[slot], grid.order[end - 1] = grid.order[end - 1], j
+    grid.order[at], grid.order[end - 1] = grid.order[end - 1], j
     row, column = c >> leaf, c & ((1 << leaf) - 1)
     for level in range(leaf, -1, -1):
         grid.alive[_level_start(level) + (row << level) + column] -= 1
@@ -116,10 +145,10 @@ def remove(grid: SampleIndex, j: int) -> None:
 
 
 @kernel
-def _reach_for(grid: SampleIndex, samples: np.ndarray) -> int:
-    """Read what `remove` reads of each: memory answers many at once when none waits for another.
+def _prefetch(grid: SampleIndex, samples: np.ndarray) -> int:
+    """Prefetch what `remove` reads of each sample: loads that do not depend on one another overlap.
 
-    Returns a sum that means nothing, but for which the compiler must read.
+    Returns a sum without meaning, which keeps the compiler from dropping the loads.
     """
     leaves = _level_start(grid.levels - 1)
     read = 0
@@ -131,8 +160,8 @@ def _reach_for(grid: SampleIndex, samples: np.ndarray) -> int:
 
 @kernel
 def remove_empty(grid: SampleIndex, weights: np.ndarray, lowered: np.ndarray) -> int:
-    """Take those of the lowered samples out that have no weight left; see `_reach_for`."""
-    read: int = _reach_for(grid, lowered)
+    """Take out those of the lowered samples that have no weight left; returns the sum of `_prefetch`."""
+    read: int = _prefetch(grid, lowered)
     for i in range(lowered.shape[0]):
         if weights[lowered[i]] <= 0:
             remove(grid, lowered[i])
@@ -149,7 +178,7 @@ def _scan_cell(
     best: np.ndarray,
     near: np.ndarray,
 ) -> None:
-    """Insert the cell's samples with weight into the k best, ordered by (distance, index)."""
+    """Insert the samples with weight of a cell into the k best, ordered by (distance, index)."""
     k = near.shape[0]
     start = grid.first[c]
     for i in range(start, start + grid.alive[_level_start(grid.levels - 1) + c]):
@@ -175,7 +204,7 @@ def _scan_cell(
 
 @kernel
 def _box_d2(grid: SampleIndex, level: int, row: int, column: int, x: float, y: float) -> float:
-    """No sample of the node is nearer than this, squared. Border cells reach to infinity."""
+    """Squared lower bound on the distance to the samples of a node; border cells reach to infinity."""
     width = 1 << level
     edge = grid.frame[_CELL_M] * (1 << (grid.levels - 1 - level))
     left = grid.frame[_X] + column * edge - grid.frame[_MARGIN_M]
@@ -197,7 +226,7 @@ def _box_d2(grid: SampleIndex, level: int, row: int, column: int, x: float, y: f
 
 @kernel
 def _reach_d2(grid: SampleIndex, level: int, row: int, column: int, x: float, y: float) -> float:
-    """From (x, y) in a node, all that is nearer than this, squared, lies in the node too."""
+    """Squared radius around (x, y), in a node, within which all samples lie in the node too."""
     width = 1 << level
     edge = grid.frame[_CELL_M] * (1 << (grid.levels - 1 - level))
     reach: float = math.inf
@@ -215,7 +244,7 @@ def _reach_d2(grid: SampleIndex, level: int, row: int, column: int, x: float, y:
 
 @kernel
 def _nearest_quarter(below: int, row: int, column: int, home_row: int, home_column: int) -> int:
-    """Which quarter of a node, 2 * upper + right, lies towards the home cell.
+    """The quarter of a node, 2 * upper + right, that lies towards the home cell.
 
     below: levels from the quarters down to the cells.
     """
@@ -228,10 +257,9 @@ def _nearest_quarter(below: int, row: int, column: int, home_row: int, home_colu
 def nearest(
     grid: SampleIndex, x: float, y: float, skip: np.ndarray, best: np.ndarray, near: np.ndarray
 ) -> int:
-    """The k nearest samples with weight that are not in `skip`; how many there are.
+    """Find the k nearest samples with weight that are not in `skip`; returns how many there are.
 
-    best: (k,) float64 room for squared distances; near: (k,) int64 room for the samples, nearest
-    first.
+    best: (k,) float64 output, squared distances; near: (k,) int64 output, the samples, nearest first.
     """
     k = near.shape[0]
     best[:] = np.inf
@@ -270,9 +298,9 @@ def nearest(
 
 
 def index_over(xy_m: npt.NDArray[np.float64], weights: npt.NDArray[np.int64]) -> SampleIndex:
-    """The index over samples (N, 2).
+    """Build the index over samples (N, 2) with weights (N,).
 
-    It keeps and reads `xy_m` itself: samples may be moved in place and sorted in anew by `build`.
+    It keeps `xy_m` itself: samples may be moved in place and sorted in anew by `build`.
     """
     count = xy_m.shape[0]
     low, high = xy_m.min(axis=0), xy_m.max(axis=0)

@@ -1,9 +1,19 @@
-"""When robots on a map get new targets, and from whom: the same rules in the supervisor and in a robot.
+"""When robots on a map get new targets, and which participant assigns them: one set of rules for all.
 
-What a robot tells of itself, and the supervisor of all robots, are registers (`registers.py`):
+Theory of operation
+-------------------
+1. In every step each robot writes its state into its register, and the supervisor the targets of all
+   robots into its own (`registers.py`):
 
-    robot         cell + 1, ARRIVED | RESTING, target + 1, since, the task's memo
-    supervisor    0, 0, 0, tick, then the target + 1 of every robot
+       robot         cell + 1, ARRIVED | RESTING, target + 1, since, the task's memo
+       supervisor    0, 0, 0, tick, then the target + 1 of every robot
+
+2. From the registers that it holds, a participant knows its visible team: the robots in contact. Of a robot
+   that has been out of contact for a while it still counts the target as taken.
+3. A member needs a target when it has none, has arrived, or heads for a cell that is a frontier no more. Then
+   the planner is asked, for the whole team or for those members alone, and not more often than `replan_gap` says.
+4. Without a supervisor every robot asks for its visible team and takes its own task from the answer. Robots
+   that know the same come to the same assignment.
 """
 
 from collections.abc import Mapping, Sequence
@@ -13,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_agent.mapping.cost_map import CostMap
-from kantor_agent.planners.map_base import Member, Situation, Task, past
+from kantor_agent.planners.map_base import Member, Situation, Task, past_or_long_ago
 from kantor_agent.planners.map_registry import ALLOCATORS
 from kantor_protocol.base.grid import NOWHERE, Frame
 from kantor_protocol.replication.gossip import CONTACT_PERIODS
@@ -21,76 +31,82 @@ from kantor_protocol.replication.registers import Registers
 from kantor_protocol.scenario.schema import Scenario
 
 ARRIVED, RESTING = 1, 2
+"""Flags of a robot's register."""
 CELL, FLAGS, TARGET, SINCE, MEMO = 0, 1, 2, 3, 4
+"""Places in a register; a supervisor's targets begin at MEMO."""
 
 
-class ProgressMonitor(NamedTuple):
-    """How long a participant counts on what it was told, in its own steps."""
+class ContactLimits(NamedTuple):
+    """How long a participant relies on the register of another, in its own steps."""
 
-    contact_steps: int
-    """Whoever's register was not renewed for longer is out of contact."""
+    contact_timeout_steps: int
+    """A robot whose register has not been renewed for longer is out of contact."""
     remember_steps: int
-    """The target of a robot out of contact counts as taken for so long."""
+    """The target of a robot out of contact counts as taken while its register is no older."""
 
     @classmethod
-    def of(cls, scenario: Scenario, period_ns: int) -> "ProgressMonitor":
-        """For a participant that steps once in period_ns."""
+    def of(cls, scenario: Scenario, period_ns: int) -> "ContactLimits":
+        """The limits of a participant that steps once in period_ns."""
         return cls(
             CONTACT_PERIODS * scenario.period_ns // period_ns,
             round(scenario.planner.remember_s * 1e9) // period_ns,
         )
 
 
-def register_of(member: Member, *, resting: bool) -> list[int]:
-    """What a robot tells of itself."""
+def robot_register(member: Member, *, resting: bool) -> list[int]:
+    """The numbers of a robot's register."""
     flags = ARRIVED * member.arrived | RESTING * resting
     return [member.cell + 1, flags, member.task.target + 1, member.since, *member.task.memo]
 
 
-def member_of(robot: int, register: npt.NDArray[np.int64], cells: int, tick: int) -> Member | None:
-    """What a robot has told of itself; None while it has told nothing sound, or rests."""
+def read_member(
+    robot: int, register: npt.NDArray[np.int64], cells: int, tick: int
+) -> Member | None:
+    """The robot that a register describes; None if it is resting, or the register empty or malformed.
+
+    cells: of the map. tick: now; a later `since` is of a wrong clock.
+    """
     cell, flags, target, since = register[:MEMO].tolist()
     if not (1 <= cell <= cells and 0 <= target <= cells) or flags & RESTING:
         return None
     used = register.nonzero()[0]
     memo = tuple(register[MEMO : used[-1] + 1].tolist())  # registers lose zeros at the end too
-    return Member(
-        robot, cell - 1, Task(target - 1, memo), past(since, tick), arrived=bool(flags & ARRIVED)
-    )
+    since, arrived = past_or_long_ago(since, tick), bool(flags & ARRIVED)
+    return Member(robot, cell - 1, Task(target - 1, memo), since, arrived=arrived)
 
 
 def visible_team(
-    registers: Registers, robots: int, frame: Frame, tick: int, patience: ProgressMonitor
+    registers: Registers, robots: int, frame: Frame, tick: int, limits: ContactLimits
 ) -> tuple[list[Member], list[int]]:
-    """Who is in contact, by place, as all others know them; and where those were heading who are not."""
-    group, absent = [], []
+    """The robots in contact, in roster order, as all others know them; the targets of robots out of contact."""
+    team, absent = [], []
     for robot in range(robots):
-        slot = registers.newest(robot)
-        member = member_of(robot, registers.values[slot], frame.cells, tick)
+        origin = registers.newest(robot)
+        member = read_member(robot, registers.values[origin], frame.cells, tick)
         if member is None:
             continue
-        age = 0 if slot == registers.me else registers.age_steps(slot)
-        if age <= patience.contact_steps:
-            group.append(member)
-        elif age <= patience.remember_steps and member.task.target != NOWHERE:
+        age = 0 if origin == registers.me else registers.age_steps(origin)
+        if age <= limits.contact_timeout_steps:
+            team.append(member)
+        elif age <= limits.remember_steps and member.task.target != NOWHERE:
             absent.append(member.task.target)
-    return group, absent
+    return team, absent
 
 
-def orders_of(tasks: Mapping[int, Task], robots: int, tick: int) -> list[int]:
-    """What the supervisor tells."""
+def supervisor_register(tasks: Mapping[int, Task], robots: int, tick: int) -> list[int]:
+    """The numbers of the supervisor's register. tasks: by robot; the others have no target."""
     targets = [tasks[robot].target + 1 if robot in tasks else 0 for robot in range(robots)]
     return [0, 0, 0, tick, *targets]
 
 
-def order_in(register: npt.NDArray[np.int64], robot: int, cells: int) -> int:
-    """The target that the supervisor has given a robot, or NOWHERE."""
+def assigned_target(register: npt.NDArray[np.int64], robot: int, cells: int) -> int:
+    """The target of a robot in the supervisor's register, or NOWHERE. cells: of the map."""
     target = int(register[MEMO + robot]) - 1
     return target if 0 <= target < cells else NOWHERE
 
 
 class Assignment:
-    """Asks the strategy when somebody needs a target."""
+    """Asks the planner for tasks when robots need them."""
 
     def __init__(self, scenario: Scenario, cost_map: CostMap, seed: int, me: int | None) -> None:
         """me: the robot that asks, or None for the supervisor."""
@@ -102,50 +118,53 @@ class Assignment:
         self._whole_team = planner.replan_whose == "team"
         self._gap = planner.replan_gap
         self._asked: dict[int, int] = {}
-        """For each robot in contact the revision of the chart when a target for it was last asked for."""
+        """By robot in contact: the revision of the fused map when a target for it was last asked for."""
 
-    def decide(self, group: Sequence[Member], absent: Sequence[int], tick: int) -> dict[int, Task]:
-        """New tasks by robot, for those who get one now. group: everybody in contact, by place."""
-        # Whoever was out of contact has no target any more: it gets one though the chart is as it was.
+    def decide(self, team: Sequence[Member], absent: Sequence[int], tick: int) -> dict[int, Task]:
+        """New tasks, by robot, for those that get one now.
+
+        team: all robots in contact, in roster order. absent: targets of robots out of contact.
+        """
+        # A robot that was out of contact has no target any more: it gets one though the map is the same.
         known = self._asked
-        self._asked = {m.robot: known[m.robot] for m in group if m.robot in known}
-        members, others = self._chosen(group, tick)
+        self._asked = {m.robot: known[m.robot] for m in team if m.robot in known}
+        members, others = self._split(team, tick)
         if not members:
             return {}
         self._asked |= dict.fromkeys((m.robot for m in members), self._cost_map.fused_map.revision)
         situation = Situation(
-            self._cost_map, self._frontiers(group), members, others, tuple(absent), tick
+            self._cost_map, self._frontiers(team), members, others, tuple(absent), tick
         )
         tasks = self._allocator.assign(situation)
         return {member.robot: task for member, task in zip(members, tasks, strict=True)}
 
-    def _chosen(
-        self, group: Sequence[Member], tick: int
+    def _split(
+        self, team: Sequence[Member], tick: int
     ) -> tuple[tuple[Member, ...], tuple[Member, ...]]:
-        """Who gets a target now, and who keeps the one it has."""
+        """The members that get a target now, and those that keep the one they have."""
         if self._allocator.negotiates:
-            mine = tuple(m for m in group if self._me in (None, m.robot))
-            return mine, tuple(m for m in group if m not in mine)
-        due = [self._needs(member) for member in group]
+            mine = tuple(m for m in team if self._me in (None, m.robot))
+            return mine, tuple(m for m in team if m not in mine)
+        needs = [self._needs_target(member) for member in team]
+        gap_over = [m.since + self._gap <= tick for m in team]
         if self._whole_team:
-            rested = all(m.since + self._gap <= tick for m in group)
-            return (tuple(group), ()) if any(due) and rested else ((), ())
-        ripe = [need and m.since + self._gap <= tick for m, need in zip(group, due, strict=True)]
+            return (tuple(team), ()) if any(needs) and all(gap_over) else ((), ())
+        due = [need and over for need, over in zip(needs, gap_over, strict=True)]
         return (
-            tuple(m for m, now in zip(group, ripe, strict=True) if now),
-            tuple(m for m, now in zip(group, ripe, strict=True) if not now),
+            tuple(m for m, now in zip(team, due, strict=True) if now),
+            tuple(m for m, now in zip(team, due, strict=True) if not now),
         )
 
-    def _needs(self, member: Member) -> bool:
+    def _needs_target(self, member: Member) -> bool:
         fused_map, target = self._cost_map.fused_map, member.task.target
         if target == NOWHERE:
             return self._asked.get(member.robot) != fused_map.revision
-        if member.arrived or fused_map.void[target]:
+        if member.arrived or fused_map.dead_frontiers[target]:
             return True
         return self._on_events and not fused_map.is_frontier(target)
 
-    def _frontiers(self, group: Sequence[Member]) -> npt.NDArray[np.int64]:
-        """All but those at which somebody stands that has looked around."""
+    def _frontiers(self, team: Sequence[Member]) -> npt.NDArray[np.int64]:
+        """All frontiers but those at which a member stands and has looked around."""
         frontiers = self._cost_map.fused_map.frontiers
-        looked = [m.task.target for m in group if m.arrived]
+        looked = [m.task.target for m in team if m.arrived]
         return frontiers[~np.isin(frontiers, looked)] if looked else frontiers

@@ -1,8 +1,9 @@
-"""The map that a participant has of the unknown: everybody's layers, fused (Burgard et al., eq. 1-3).
+"""The map that a participant has: the evidence layers of all robots, fused (Burgard et al., eq. 1-3).
 
-Every origin (an incarnation of a robot) has a layer of its own, folded from its log alone (`evidence.py`). The fused log odds of a
-cell are the sum over the layers, each counted as certain as evidence gets, and the sum is clamped once
-more. A cell is explored once any layer knows it, whatever its probability.
+Every origin (an incarnation of a robot) has a layer of its own, folded from its log alone
+(`occupancy_log.py`). The fused log odds of a cell are the sum over the layers, each counted as certain as
+evidence gets, and the sum is clamped once more. A cell is explored once any layer knows it, whatever its
+probability.
 """
 
 import numpy as np
@@ -14,6 +15,7 @@ from kantor_protocol.replication.occupancy_log import CERTAIN, RANGE_BINS
 from kantor_protocol.replication.replica import Replica
 
 _P_OCC = 1.0 / (1.0 + np.exp(-np.array([-1.0, 0.0, 1.0]) * CERTAIN / 100.0))
+"""Probability of occupancy where more layers say free, as many say either, or more say occupied."""
 
 
 @kernel
@@ -24,20 +26,20 @@ def _fold(
     layer: np.ndarray,
     votes: np.ndarray,
     cells: np.ndarray,
-    void: np.ndarray,
+    dead_frontiers: np.ndarray,
     ranges: np.ndarray,
 ) -> bool:
     """Apply the entries log[first:length] of one origin; whether any is about a cell. cells: (n,) fused."""
     count = cells.shape[0]
-    news = False
+    changed = False
     for i in range(first, length):
         entry = log[i, 0]
         if entry >= 3 * count:
             ranges[min(entry - 3 * count, ranges.shape[0] - 1)] += 1
             continue
-        news = True
+        changed = True
         if entry >= 2 * count:
-            void[entry - 2 * count] = True
+            dead_frontiers[entry - 2 * count] = True
         elif entry >= 0:
             cell, kind = entry // 2, OCCUPIED if entry & 1 else FREE
             votes[cell] += (1 if kind == OCCUPIED else -1) - (
@@ -45,15 +47,18 @@ def _fold(
             )
             layer[cell] = kind
             cells[cell] = FREE if votes[cell] < 0 else OCCUPIED  # in doubt there is a wall
-    return news
+    return changed
 
 
 @kernel
-def _find_frontiers(cells: np.ndarray, void: np.ndarray, columns: int, out: np.ndarray) -> int:
+def _find_frontiers(
+    cells: np.ndarray, dead_frontiers: np.ndarray, columns: int, out: np.ndarray
+) -> int:
+    """Write the frontiers into out (cells,), rising; returns how many there are."""
     count = 0
     total = cells.shape[0]
     for cell in range(total):
-        if cells[cell] != FREE or void[cell]:
+        if cells[cell] != FREE or dead_frontiers[cell]:
             continue
         column = cell % columns
         if (
@@ -68,49 +73,87 @@ def _find_frontiers(cells: np.ndarray, void: np.ndarray, columns: int, out: np.n
 
 
 class FusedMap:
-    """The fused map of one participant."""
+    """The fused map of one participant.
+
+    The attributes say which others they agree with; that holds after `fold`, and `validate` asserts it.
+    """
 
     def __init__(self, frame: Frame, origins: int) -> None:
-        """origins: incarnations that may have a layer; there may come more."""
+        """origins: incarnations that may have a layer; `fold` adds layers when there are more."""
         self.frame = frame
         self.cells = np.zeros(frame.cells, dtype=np.uint8)
-        """(cells,) UNKNOWN, FREE or OCCUPIED."""
+        """(cells,) UNKNOWN where no layer knows the cell, FREE where more layers say free than occupied,
+        OCCUPIED elsewhere."""
         self.ranges = np.zeros(RANGE_BINS, dtype=np.int64)
-        """Measured ranges of all robots so far, from 0 to the sensor's range."""
-        self.void = np.zeros(frame.cells, dtype=np.bool_)
-        """(cells,) frontiers at which somebody stood and saw nothing new."""
+        """(bins,) measured ranges from 0 to the sensor's range, as the folded entries of all logs count them."""
+        self.dead_frontiers = np.zeros(frame.cells, dtype=np.bool_)
+        """(cells,) cells that a folded entry of any log calls a dead frontier."""
         self.revision = 0
-        """Rises whenever a cell may have changed."""
+        """Rises with every fold that reads an entry about a cell."""
         self._layers = np.zeros((origins, frame.cells), dtype=np.uint8)
+        """(origins, cells) what the last folded entry of each log says of each cell, or UNKNOWN."""
         self._votes = np.zeros(frame.cells, dtype=np.int16)
+        """(cells,) layers that say occupied, less those that say free."""
         self._folded = np.zeros(origins, dtype=np.int64)
-        self._room = np.zeros(frame.cells, dtype=np.int64)
-        self._frontiers = self._room[:0]
+        """(origins,) entries of each log that have been folded: at most as many as the log has."""
+        self._found = np.zeros(frame.cells, dtype=np.int64)
+        """(cells,) output of `_find_frontiers`."""
+        self._frontiers = self._found[:0]
+        """The frontiers of `cells` and `dead_frontiers` while `_frontiers_of` is `revision`, else out of date."""
         self._frontiers_of = -1
 
+    def validate(self, replica: Replica) -> None:
+        """Assert what the attributes say of one another and of the logs. replica: the one that was folded."""
+        shape, cells = (self.frame.rows, self.frame.columns), self.frame.cells
+        dead_frontiers, ranges = np.zeros_like(self.dead_frontiers), np.zeros_like(self.ranges)
+        for origin, length in enumerate(self._folded.tolist()):
+            assert length <= replica.store.length[origin]
+            entries = replica.store.logs[origin, :length, 0].astype(np.int64)
+            kinds = entries[(entries >= 0) & (entries < 2 * cells)]
+            layer = np.full(cells, UNKNOWN)
+            layer[kinds // 2] = np.where(kinds & 1, OCCUPIED, FREE)  # of one cell, the last counts
+            assert np.array_equal(self._layers[origin], layer)
+            dead_frontiers[entries[(entries >= 2 * cells) & (entries < 3 * cells)] - 2 * cells] = (
+                True
+            )
+            bins = np.minimum(entries[entries >= 3 * cells] - 3 * cells, RANGE_BINS - 1)
+            ranges += np.bincount(bins, minlength=RANGE_BINS)
+        assert np.array_equal(self.dead_frontiers, dead_frontiers)
+        assert np.array_equal(self.ranges, ranges)
+        votes = (self._layers == OCCUPIED).sum(axis=0) - (self._layers == FREE).sum(axis=0)
+        assert np.array_equal(self._votes, votes)
+        fused = np.where(votes < 0, FREE, OCCUPIED)
+        fused[(self._layers == UNKNOWN).all(axis=0)] = UNKNOWN
+        assert np.array_equal(self.cells, fused)
+        if self._frontiers_of == self.revision:
+            unknown = np.pad((fused == UNKNOWN).reshape(shape), 1)
+            beside = unknown[1:-1, :-2] | unknown[1:-1, 2:] | unknown[:-2, 1:-1] | unknown[2:, 1:-1]
+            found = np.flatnonzero((fused == FREE) & beside.ravel() & ~dead_frontiers)
+            assert np.array_equal(self._frontiers, found)
+
     def fold(self, replica: Replica) -> bool:
-        """Take in what the logs hold by now; whether a cell may have changed."""
-        if replica.slots > self._folded.shape[0]:
-            self._widen(replica.slots)
+        """Take in the entries that the logs have gained; whether a cell may have changed."""
+        if replica.origins > self._folded.shape[0]:
+            self._widen(replica.origins)
         lengths = replica.store.length
         before = self.revision
         for origin in np.flatnonzero(lengths > self._folded).tolist():
-            news = _fold(
+            changed = _fold(
                 replica.store.logs[origin],
                 int(self._folded[origin]),
                 int(lengths[origin]),
                 self._layers[origin],
                 self._votes,
                 self.cells,
-                self.void,
+                self.dead_frontiers,
                 self.ranges,
             )
             self._folded[origin] = lengths[origin]
-            self.revision = before + 1 if news else self.revision
+            self.revision = before + 1 if changed else self.revision
         return self.revision > before
 
     def _widen(self, origins: int) -> None:
-        """Make room for the layers of new incarnations."""
+        """Add layers for new incarnations."""
         layers, folded = self._layers, self._folded
         self._layers = np.zeros((origins, self.frame.cells), dtype=np.uint8)
         self._layers[: layers.shape[0]] = layers
@@ -119,10 +162,12 @@ class FusedMap:
 
     @property
     def frontiers(self) -> npt.NDArray[np.int64]:
-        """Known free cells with an unknown 4-neighbour, rising; do not change them."""
+        """Known free cells with an unknown 4-neighbour that are not dead, rising; do not change the array."""
         if self._frontiers_of != self.revision:
-            count = _find_frontiers(self.cells, self.void, self.frame.columns, self._room)
-            self._frontiers = self._room[:count].copy()
+            count = _find_frontiers(
+                self.cells, self.dead_frontiers, self.frame.columns, self._found
+            )
+            self._frontiers = self._found[:count].copy()
             self._frontiers_of = self.revision
         return self._frontiers
 
@@ -133,9 +178,9 @@ class FusedMap:
         return at < frontiers.shape[0] and int(frontiers[at]) == cell
 
     def p_occ(self) -> npt.NDArray[np.float64]:
-        """(cells,) probability of a wall, 0.5 where nothing is known."""
+        """(cells,) probability of occupancy, 0.5 where nothing is known."""
         return np.asarray(_P_OCC[np.sign(self._votes) + 1])
 
     def explored(self) -> npt.NDArray[np.bool_]:
-        """(cells,) known to anybody."""
+        """(cells,) whether any layer knows the cell."""
         return np.asarray(self.cells != UNKNOWN)

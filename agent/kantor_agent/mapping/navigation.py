@@ -1,4 +1,4 @@
-"""From a target cell to the next place to head for, round the walls that are known."""
+"""Navigation: from a target cell to the next place to head for, round the known walls."""
 
 import math
 
@@ -11,9 +11,9 @@ from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.machine import Pose
 
 _MARGIN_CELLS = 1e-3
-"""How far a way keeps from corners: rounding must not make a wall of one."""
-_AHEAD_CELLS = 64
-"""How far along its way a robot looks for a shortcut."""
+"""Distance that a way keeps from corners, so that rounding does not lead it into a wall."""
+_LOOKAHEAD_CELLS = 64
+"""Length of the way, in cells, over which a robot looks for a shortcut."""
 
 
 @kernel
@@ -23,7 +23,7 @@ def _farthest_in_sight(
     """The last place along the way to which a straight line is free, or -1; cells: (rows, columns)."""
     columns = cells.shape[1]
     last = -1
-    for i in range(first, min(way.shape[0], first + _AHEAD_CELLS)):
+    for i in range(first, min(way.shape[0], first + _LOOKAHEAD_CELLS)):
         row, column = way[i] // columns, way[i] % columns
         if free_way(cells, FREE, u, v, column + 0.5, row + 0.5, margin) < 1.0:
             break
@@ -32,20 +32,23 @@ def _farthest_in_sight(
 
 
 class Navigator:
-    """Keeps the way to the target, and cuts its corners where nothing stands in between."""
+    """Keeps the way to the target, and takes a shortcut where a straight line is free."""
 
     def __init__(self, cost_map: CostMap) -> None:
         self._cost_map = cost_map
         self._frame = cost_map.frame
         self._target = NOWHERE
         self._way: npt.NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        """The cells of the way to `_target`."""
         self._beyond: npt.NDArray[np.float64] = np.zeros(0)
+        """For each cell of `_way` the length of the way from there to its end, in cells."""
         self._passed = 0
+        """The place in `_way` that the robot headed for last."""
         self.left_cells = math.inf
-        """How far it still is; never rises while the robot keeps to a way."""
+        """Length of the way that is left; never rises while the robot keeps to a way."""
 
     def head(self, pose: Pose, target: int) -> tuple[float, float] | None:
-        """Where to head for, world frame; None if no way is known."""
+        """The next place to head for, world frame; None if no way is known."""
         cell = self._frame.cell_of(pose.x_m, pose.y_m)
         if cell == NOWHERE:
             return None
@@ -53,9 +56,9 @@ class Navigator:
         if ahead < 0:
             self._target, self._passed = target, 0
             self._way = self._cost_map.way(cell, target)
-            self._beyond = self._to_the_end()
+            self._beyond = self._lengths_to_the_end()
             ahead = self._look_ahead(pose)
-        if ahead < 0:  # it stands beside a corner
+        if ahead < 0:  # the robot stands beside a corner
             ahead = self._look_ahead(pose, 0.0)
         if ahead < 0:
             self._target = NOWHERE
@@ -66,8 +69,8 @@ class Navigator:
         self.left_cells = away_m / self._frame.resolution_m + float(self._beyond[ahead])
         return place_m
 
-    def _to_the_end(self) -> npt.NDArray[np.float64]:
-        """How far it is from every cell of the way to its last, in cells."""
+    def _lengths_to_the_end(self) -> npt.NDArray[np.float64]:
+        """(way,) the length of the way from each of its cells to the last, in cells."""
         rows, columns = np.divmod(self._way, self._frame.columns)
         steps = np.hypot(np.diff(rows), np.diff(columns))
         return np.append(steps[::-1].cumsum()[::-1], 0.0)

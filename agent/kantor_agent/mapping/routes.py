@@ -1,4 +1,4 @@
-"""Ways over an occupancy map: what it costs to get from one cell to every other, and the way itself.
+"""Ways over an occupancy map: the cost of getting from one cell to every other, and the way itself.
 
 The value function of Burgard et al. (2000), section 2.2.1, over the eight neighbours n of a cell x:
 
@@ -9,12 +9,14 @@ passable cells are entered, and a diagonal step needs both cells beside it, so t
 corner. With cost 1 everywhere V is the length of the way, in cells.
 
 The paper iterates until nothing changes. Here every cell is settled once, by buckets (Dial 1969) hardly
-narrower than the shortest step: nothing in the lowest bucket can improve anything else in it, so that a
+narrower than the shortest step: no cell in the lowest bucket can improve another one in it, so that a
 bucket needs no order. Both end in the same numbers, to the last bit. Where costs differ by more than
 the ring of buckets holds, a binary heap settles the cells, with the same numbers again.
 """
 
+import itertools
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,32 +26,32 @@ from kantor_protocol.base.grid import CELLS_MAX
 from kantor_protocol.base.kernels import kernel
 
 UNKNOWN = 0.5
-"""The probability of occupancy of a cell that nobody has seen."""
+"""The probability of occupancy of a cell that no robot has seen."""
 COST_MIN = 0.05
-"""Of a passable cell: at 0 there would be plateaus."""
+"""The least cost of a passable cell: at 0 there would be plateaus."""
 TRUNCATE = 3.0
 """Standard deviations after which the smoothing kernel ends."""
 
 _SLANT = math.sqrt(2.0)
 _SLANTED = 0b10100101
-"""Which of the eight steps are diagonal. Steps are numbered as the cells that they lead to."""
+"""The diagonal ones of the eight steps, a bit for each. Steps are in the order of the cells that they lead to."""
 _RING = 256
-"""Buckets: a power of two."""
-_RATIO_MAX = _RING / _SLANT - 2.0
-"""Highest to lowest cost for which the ring is wide enough."""
+"""Number of buckets: a power of two."""
+RATIO_MAX = _RING / _SLANT - 2.0
+"""The ratio of the highest to the lowest cost up to which the ring is wide enough."""
 _LEAST, _MOST = 1e-200, 1e200
-"""Costs in between can be divided by one another."""
+"""Costs in between can be divided by one another without overflow."""
 _NARROWER = 1.0 - 2.0**-16
-"""A bucket's width in shortest steps: rounding lets no step end in the bucket where it began, on no map
-of `CELLS_MAX` cells."""
+"""A bucket's width in shortest steps: rounding lets no step end in the bucket where it began, on any map
+of up to `CELLS_MAX` cells."""
 _ENTRIES = 8
-"""Of one cell in all buckets: every neighbour improves it once at most."""
+"""Entries of one cell in all buckets: every neighbour improves it once at most."""
 _LOWEST_BIT = np.array([0] + [(byte & -byte).bit_length() - 1 for byte in range(1, 256)])
-"""Of a byte."""
+"""Number of the lowest bit that is set, for each byte; 0 for 0."""
 
 
 @kernel
-def survey(
+def possible_moves(
     cost: np.ndarray,
     rows: int,
     columns: int,
@@ -57,10 +59,10 @@ def survey(
     passable: np.ndarray,
     moves: np.ndarray,
 ) -> tuple[float, float]:
-    """Which of the eight steps can be taken from every cell; the lowest and the highest cost.
+    """Find the steps that can be taken from every cell; returns the lowest and the highest cost.
 
-    cost: (rows * columns,) float64; price: a copy of it. passable: (rows + 2, columns + 2) bytes, with a
-    margin of zeros. moves: (rows * columns,) bytes, a bit for every step.
+    cost: (rows * columns,) float64. Outputs: price, a copy of it; passable, (rows + 2, columns + 2) bytes
+    with a margin of zeros; moves, (rows * columns,) bytes with a bit for every step.
     """
     least, most = math.inf, 0.0
     for row in range(rows):
@@ -105,20 +107,20 @@ def spread_by_buckets(
     """Settle all cells, or those up to `until`. `value` is infinite before, and the source passable.
 
     around: the memory of `value` with a margin at both ends, columns + 1 wide, so that all eight
-    neighbours can be compared without asking first which of them there are: one jump that is hard to
-    foresee instead of sixteen.
+    neighbours can be compared without first testing which of them exist: one branch that is hard to
+    predict instead of sixteen.
 
-    A bucket is a chain of entries: `heads` has its first, `links` what follows an entry, `members` an
-    entry's cell. When a cell moves to a lower bucket its entry stays in the higher one, and is passed
-    over there.
+    A bucket is a linked list of entries: `heads` has its first, `links` the one after an entry, `members`
+    an entry's cell. When a cell moves to a lower bucket its entry stays in the higher one, and is skipped
+    there.
     """
     per = 1.0 / (least * _NARROWER)
     margin = (around.shape[0] - value.shape[0]) >> 1
     heads[:] = -1
     heads[0], links[0], members[0] = 0, -1, source
     value[source] = 0.0
-    waiting, used, spare, bucket = 1, 1, -1, 0
-    while waiting > 0:
+    queued, used, spare, bucket = 1, 1, -1, 0
+    while queued > 0:
         entry = heads[bucket & (_RING - 1)]
         if entry < 0:
             bucket += 1
@@ -126,7 +128,7 @@ def spread_by_buckets(
         heads[bucket & (_RING - 1)] = links[entry]
         links[entry] = spare
         spare = entry
-        waiting -= 1
+        queued -= 1
         cell = int(members[entry])
         if int(value[cell] * per) != bucket:
             continue
@@ -143,24 +145,24 @@ def spread_by_buckets(
             better &= better - 1
             n = cell + offsets[step]
             offer = slant if (_SLANTED >> step) & 1 else straight
-            had = value[n]
+            before = value[n]
             value[n] = offer
-            its = int(offer * per)
-            if had < math.inf and int(had * per) == its:
+            new = int(offer * per)
+            if before < math.inf and int(before * per) == new:
                 continue
             if spare >= 0:
                 entry, spare = spare, links[spare]
             else:
                 entry, used = used, used + 1
             members[entry] = n
-            links[entry] = heads[its & (_RING - 1)]
-            heads[its & (_RING - 1)] = entry
-            waiting += 1
+            links[entry] = heads[new & (_RING - 1)]
+            heads[new & (_RING - 1)] = entry
+            queued += 1
 
 
 @kernel
 def _rise(value: np.ndarray, heap: np.ndarray, place: np.ndarray, cell: int, at: int) -> None:
-    """Put a cell where it belongs between the heap's top and a place that is free for it."""
+    """Sift a cell up: put it where it belongs between the heap's top and the free place `at`."""
     while at > 0 and value[cell] < value[heap[(at - 1) >> 1]]:
         above = (at - 1) >> 1
         heap[at] = heap[above]
@@ -172,7 +174,7 @@ def _rise(value: np.ndarray, heap: np.ndarray, place: np.ndarray, cell: int, at:
 
 @kernel
 def _pop_least(value: np.ndarray, heap: np.ndarray, place: np.ndarray, size: int) -> int:
-    """Take the cell of the lowest value from a heap of so many."""
+    """Take the cell of the lowest value from a heap of `size` cells."""
     first, last = heap[0], heap[size - 1]
     at, below, end = 0, 1, size - 1
     while below < end:
@@ -199,7 +201,10 @@ def spread_by_heap(
     heap: np.ndarray,
     place: np.ndarray,
 ) -> None:
-    """The same for any costs. heap, place: (cells,) room: which cell is where, and where a cell is."""
+    """`spread_by_buckets` for any costs.
+
+    heap, place: (cells,) scratch: the cell at each place of the heap, and the place of each cell.
+    """
     value[source] = 0.0
     heap[0], place[source], size = source, 0, 1
     while size > 0:
@@ -232,10 +237,10 @@ def trace(
     value: np.ndarray,
     way: np.ndarray,
 ) -> int:
-    """The cells from the target back to the source; how many, 0 if there is no way.
+    """Write the cells from the target back to the source into way (cells,); returns how many, 0 without a way.
 
     The predecessor of a cell is the neighbour that gave it its value; of several the one of the lowest
-    value, then of the lowest index. way: (cells,) room.
+    value, then of the lowest index.
     """
     if not (0 <= target < value.shape[0] and value[target] < math.inf):
         return 0
@@ -259,7 +264,7 @@ def trace(
 
 
 class Routes:
-    """The value function over one grid, with room for it: a call allocates nothing but a way."""
+    """The value function over one grid, with its scratch arrays: a call allocates nothing but a way."""
 
     def __init__(self, rows: int, columns: int) -> None:
         """Raises ValueError if there is no cell, or more than `CELLS_MAX`."""
@@ -284,38 +289,38 @@ class Routes:
     def spread(
         self, cost: npt.NDArray[np.float64], source: int, *, until: int = -1
     ) -> npt.NDArray[np.float64]:
-        """(cells,) what it costs to get from the source to every cell; infinite where there is no way.
+        """(cells,) the value function: the cost of the way from the source to every cell, inf without a way.
 
         cost: (cells,) of crossing a cell, row by row; not passable unless it is finite and above 0.
         until: stop as soon as the value of this cell is final; others may be too high. If the source is
-        no passable cell nothing is reached, not even itself.
+        no passable cell, no cell is reached, not even the source.
 
-        The array is this object's own, to be read, and the next call overwrites it. Raises ValueError if
-        the costs are not as many as the cells.
+        The array belongs to this object: read it only, the next call overwrites it. Raises ValueError if
+        there are not as many costs as cells.
         """
         if cost.shape != (self.cells,):
             raise ValueError(f"costs of shape {cost.shape} for {self.cells} cells")
         cost = np.ascontiguousarray(cost, dtype=np.float64)
-        least, most = survey(
+        least, most = possible_moves(
             cost, self.rows, self.columns, self._price, self._passable, self._moves
         )
         self._source = int(source)
         self._value.fill(np.inf)
         if not (0 <= source < self.cells and 0.0 < cost[source] < math.inf):
             return self._value
-        walk = (self._price, self._moves, self._offsets, int(source), int(until))
-        if most <= _RATIO_MAX * least and least >= _LEAST and most <= _MOST:
-            room = (self._heads, self._links, self._members)
-            spread_by_buckets(*walk, least, self._value, self._around, *room)
+        graph = (self._price, self._moves, self._offsets, int(source), int(until))
+        if most <= RATIO_MAX * least and least >= _LEAST and most <= _MOST:
+            buckets = (self._heads, self._links, self._members)
+            spread_by_buckets(*graph, least, self._value, self._around, *buckets)
         else:
-            spread_by_heap(*walk, self._value, self._links, self._members)
+            spread_by_heap(*graph, self._value, self._links, self._members)
         return self._value
 
     def way(self, target: int) -> npt.NDArray[np.int64]:
-        """The cells of the way from the source of the last `spread` to the target, with both ends.
+        """The cells of the way from the source of the last `spread` to the target, both ends included.
 
-        It is empty if the target was not reached, and also where costs are so small beside the value that
-        their sum does not grow. Of ways that cost the same it is, seen from the target, the one whose
+        The way is empty if the target was not reached, and also where costs are so small beside the value
+        that their sum does not grow. Of ways that cost the same it is, seen from the target, the one whose
         last cells have the lowest value, then the lowest index.
         """
         count = trace(
@@ -330,8 +335,35 @@ class Routes:
         return self._way[:count][::-1].copy()
 
 
+def iterate_once(
+    cost: npt.NDArray[np.float64], value: npt.NDArray[np.float64], source: int
+) -> npt.NDArray[np.float64]:
+    """(rows, columns) one iteration of the paper's update on all cells at once, of which V is the fixed point.
+
+    cost, value: (rows, columns). Slow and plain: for assertions.
+    """
+    rows, columns = cost.shape
+    price = np.pad(cost, 1, constant_values=np.inf)
+    before = np.pad(value, 1, constant_values=np.inf)
+    passable = np.isfinite(price) & (price > 0.0)
+
+    def shifted(array: npt.NDArray[Any], up: int, right: int) -> npt.NDArray[Any]:
+        return array[1 + up : 1 + up + rows, 1 + right : 1 + right + columns]
+
+    least = np.full((rows, columns), np.inf)
+    for up, right in itertools.product((-1, 0, 1), repeat=2):
+        can = shifted(passable, up, right) & shifted(passable, up, 0) & shifted(passable, 0, right)
+        step = math.sqrt(2.0) if up and right else 1.0
+        offer = shifted(before, up, right) + step * shifted(price, up, right)
+        if (up, right) != (0, 0):
+            least = np.where(can & shifted(passable, 0, 0), np.fmin(least, offer), least)
+    if 0 <= source < value.size and shifted(passable, 0, 0).flat[source]:
+        least.flat[source] = 0.0
+    return least
+
+
 def length_cost(passable: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
-    """(cells,) costs by which V is the length of the way in cells. passable: (rows, columns)."""
+    """(cells,) costs with which V is the length of the way in cells. passable: (rows, columns)."""
     return np.where(passable, 1.0, np.inf).ravel()
 
 
@@ -344,11 +376,11 @@ def smoothed_cost(
 ) -> npt.NDArray[np.float64]:
     """(cells,) costs of Burgard et al. (2000), section 2.2.1: the occupancy, smoothed by a Gaussian.
 
-    p_occ: (rows, columns) probability that a cell is occupied; explored: the same shape. What is not
+    p_occ: (rows, columns) probability that a cell is occupied; explored: the same shape. A cell that is not
     explored counts as `UNKNOWN`, the map goes on beyond its border as it is there, the Gaussian ends after
-    `TRUNCATE` standard deviations, and the costs are at least `COST_MIN`. Passable is what is explored and
-    below `p_max` before it is smoothed: a step is charged by the cell that it leaves, so that it
-    would be cheap to step into a wall.
+    `TRUNCATE` standard deviations, and the costs are at least `COST_MIN`. A cell is passable if it is
+    explored and its occupancy is below `p_max` before smoothing: a step is charged by the cell that it
+    leaves, so that it would be cheap to step into a wall.
     """
     known = np.where(explored, p_occ, UNKNOWN)
     smooth = gaussian_filter(known, sigma_cells, mode="nearest", truncate=TRUNCATE)

@@ -1,4 +1,4 @@
-"""What every planner is: a choice of a goal from what the robot believes."""
+"""The interface of planners on densities: a choice of a goal from what the robot believes."""
 
 from typing import Protocol
 
@@ -9,17 +9,17 @@ from kantor_protocol.base.machine import Pose
 
 
 class Goal(msgspec.Struct, frozen=True, gc=False):
-    """Where to head, in the world frame."""
+    """A place to head for, in the world frame."""
 
     x_m: float
     y_m: float
     sample: int
-    """The sample that stands there, or -1."""
+    """The sample at that place, or -1."""
 
 
 class Planner(Protocol):
-    """A strategy. It never knows which vehicle drives."""
+    """A planner on a density. It never knows which vehicle drives, and reads no clock."""
 
     def choose(self, belief: Belief, pose: Pose, now_ns: int, /) -> Goal | None:
-        """The next goal; None when there is nothing to head for."""
+        """The next goal from the present pose, at simulated time now_ns; None to stay."""
         ...

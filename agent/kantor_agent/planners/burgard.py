@@ -1,11 +1,11 @@
 """Coordinated exploration by utility and cost (Burgard et al. 2000, table 1 and eq. 4-6).
 
-Every frontier is worth 1 at first. The robot and the frontier with the largest U - beta V are a pair; what
-the robot will probably see from there lessens the worth of the frontiers around, for the robots that have no
-target yet. V is in sensor ranges of open floor, so that it can be set against a worth of 1.
+The utility U of every frontier is 1 at first. The robot and the frontier with the largest U - beta V are a
+pair; what the robot will probably see from there reduces the utility of the frontiers around it, for the
+robots that have no target yet. V is in sensor ranges of open floor, so that it compares with a utility of 1.
 
-Of equal pairs it is the one with the shorter way, then the lower robot, then the lower cell. So a robot
-alone drives to its cheapest frontier, to the last bit, as every robot does without coordination.
+Of equal pairs the one with the shorter way is taken, then the lower robot, then the lower cell. A robot
+alone therefore drives to its cheapest frontier, to the last bit, as every robot does without coordination.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ from kantor_protocol.scenario.schema import Scenario
 def in_sight(cells: np.ndarray, columns: int, one: int, other: int) -> bool:
     """Whether no known wall touches the line between the middles of two cells; cells: (cells,).
 
-    At a corner, both cells beside it count. The line is walked in integers: exact, and the same from both ends.
+    At a corner, both cells beside it count. The line is traced in integers: exact, and the same from both ends.
     """
     row, column = one // columns, one % columns
     rise, run = other // columns - row, other % columns - column
@@ -43,9 +43,9 @@ def in_sight(cells: np.ndarray, columns: int, one: int, other: int) -> bool:
 
 @kernel
 def coverage(distance: float, reach: float, shares: np.ndarray) -> float:
-    """P(d), the probability that what lies so far from a target is seen from it; 0 beyond `reach`.
+    """P(d), the probability that a cell at a distance d from a target is seen from it; 0 beyond `reach`.
 
-    shares: (bins,) of P over equal parts of the reach, or empty for 1 - d / reach.
+    shares: (bins,) P for equal parts of the reach, or empty for 1 - d / reach.
     """
     bins = shares.shape[0]
     if distance > reach:
@@ -67,9 +67,9 @@ def discount(
     cells: np.ndarray,
     columns: int,
 ) -> None:
-    """Eq. 6: lessen the utility (f,) of frontiers (f,) near a target. reach: of the sensor, in cells.
+    """Eq. 6: reduce the utility (f,) of frontiers (f,) near a target. reach: the sensor's range, in cells.
 
-    subtract: by P(d), and not by the factor 1 - P(d). sight: P(d) is 0 where a known wall stands between.
+    subtract: by P(d), not by the factor 1 - P(d). sight: P(d) is 0 where a known wall stands between.
     """
     if not 0 <= target < cells.shape[0]:
         return
@@ -89,9 +89,9 @@ def discount(
 def best_pair(
     utility: np.ndarray, value: np.ndarray, beta: float, picked: np.ndarray
 ) -> tuple[int, int]:
-    """Eq. 5: robot and frontier with the largest U - beta V, of robots with picked[robot] < 0; or -1, -1.
+    """Eq. 5: robot and frontier with the largest U - beta V, among robots with picked[robot] < 0; or -1, -1.
 
-    value: (robots, f), infinite where no way leads.
+    value: (robots, f) V, infinite where no way leads.
     """
     best_robot, best_frontier, best, shortest = -1, -1, -np.inf, np.inf
     for robot in range(value.shape[0]):
@@ -122,9 +122,9 @@ def pick(
     utility: np.ndarray,
     picked: np.ndarray,
 ) -> None:
-    """Table 1: which frontier every robot drives to, as its place in `frontiers`, or -1 in `picked`.
+    """Table 1: write the frontier of every robot into picked (robots,), as its index in `frontiers`, or -1.
 
-    value: (robots, f) V in sensor ranges; taken: targets that others have already; utility: (f,) room.
+    value: (robots, f) V in sensor ranges; taken: targets of other robots; utility: (f,) scratch.
     """
     utility[:] = 1.0
     picked[:] = -1
@@ -139,7 +139,7 @@ def pick(
 
 
 class Burgard:
-    """The planner of table 1; uncoordinated, the baseline that the paper compares it with."""
+    """The planner `burgard` of table 1; uncoordinated, the baseline that the paper compares it with."""
 
     negotiates = False
 
@@ -148,16 +148,19 @@ class Burgard:
         self._planner = scenario.planner
 
     def assign(self, situation: Situation, /) -> list[Task]:
-        """A frontier for each member; none for those that can reach none."""
+        """A frontier for each member; no target for those that can reach none."""
         cost_map, frontiers = situation.cost_map, situation.frontiers
         ways = [cost_map.travel(member.cell)[frontiers] for member in situation.members]
         value = np.array(ways) / cost_map.sensor_cells
-        picked = self._coordinated(situation, value) if self._planner.coordinated else _own(value)
+        picked = (
+            self._coordinated(situation, value) if self._planner.coordinated else _cheapest(value)
+        )
         return [Task(int(frontiers[f])) if f >= 0 else Task() for f in picked.tolist()]
 
     def _coordinated(
         self, situation: Situation, value: npt.NDArray[np.float64]
     ) -> npt.NDArray[np.int64]:
+        """(robots,) index of every robot's frontier by table 1. value: (robots, f)."""
         cost_map, planner = situation.cost_map, self._planner
         held = [member.task.target for member in situation.others]
         taken = [target for target in (*held, *situation.absent) if target != NOWHERE]
@@ -168,7 +171,7 @@ class Burgard:
             np.array(taken, dtype=np.int64),
             planner.beta,
             cost_map.sensor_cells,
-            self._shares(cost_map.fused_map.ranges),
+            self.shares(cost_map.fused_map.ranges),
             planner.discount == "subtract",
             planner.sight,
             cost_map.fused_map.cells,
@@ -178,8 +181,11 @@ class Burgard:
         )
         return picked
 
-    def _shares(self, ranges: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-        """Eq. 4: (bins,) P(d) for d in each bin, a range in the same bin counting as one of at least d."""
+    def shares(self, ranges: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+        """Eq. 4: (bins,) P(d) for d in each bin, by the option `coverage`; empty for 1 - d / reach.
+
+        ranges: (bins,) counts of measured ranges. One in the bin of d counts as at least d.
+        """
         if self._planner.coverage == "disc":
             return np.ones(1)
         measured = ranges.sum()
@@ -188,8 +194,8 @@ class Burgard:
         return np.asarray(ranges[::-1].cumsum()[::-1] / measured)
 
 
-def _own(value: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
-    """Every robot's cheapest frontier, whatever the others do."""
+def _cheapest(value: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """(robots,) index of every robot's cheapest frontier, whatever the others do; -1 without a way."""
     if value.shape[1] == 0:
         return np.full(value.shape[0], -1)
     nearest = value.argmin(axis=1)

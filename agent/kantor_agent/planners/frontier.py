@@ -1,9 +1,10 @@
 """Yamauchi's frontier-based exploration: every robot drives to the nearest frontier that it can reach.
 
-A robot never returns to a frontier where it has been while there is another. What it makes no progress
-towards becomes void (`mapper.py`), for everybody: the paper's list of inaccessible frontiers.
+A robot never returns to a frontier where it has been while there is another. A frontier towards which it
+makes no progress becomes a dead frontier (`robots/mapping.py`) for all robots: the paper's list of
+inaccessible frontiers.
 
-Nobody coordinates with anybody. Robots side by side choose the same target, and do so again and again.
+Robots do not coordinate. Robots side by side choose the same target, and do so again and again.
 """
 
 import numpy as np
@@ -13,7 +14,7 @@ from kantor_protocol.scenario.schema import Scenario
 
 
 class Frontier:
-    """What robots share is the map alone."""
+    """The planner `frontier`: robots share the map and nothing else."""
 
     negotiates = False
 
@@ -21,9 +22,10 @@ class Frontier:
         """me: the robot that asks, for itself alone, or None for the supervisor."""
         self._me = me
         self._visited: dict[int, list[int]] = {}
+        """By robot: the targets at which it has arrived."""
 
     def assign(self, situation: Situation, /) -> list[Task]:
-        """Each member's cheapest frontier; of equal ones the lowest cell. A robot leaves the others theirs."""
+        """Each member's cheapest frontier; of equal ones the lowest cell. A robot chooses for itself alone."""
         return [
             self._nearest(member, situation) if self._me in (None, member.robot) else member.task
             for member in situation.members

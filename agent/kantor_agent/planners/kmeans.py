@@ -1,12 +1,12 @@
 """KME: every robot explores a region of its own (Puig, Garcia, Wu, section IV).
 
-An assignment
+The steps of an assignment:
 
-1. K-means divides what is unknown, and the frontiers, into as many regions as robots are in contact;
+1. K-means divides the unknown cells and the frontiers into as many regions as robots are in contact;
 2. robots get regions so that the sum of the distances is least (eq. 1-5);
-3. who needs a target gets a frontier that lies near, and on the way to its region (eq. 6-7).
+3. a robot that needs a target gets a frontier that lies near, and on the way to its region (eq. 6-7).
 
-Everything is in cells. A centroid is in sixteenths of a cell, whole numbers, so that K-means ends alike
+Distances are in cells. A centroid is in sixteenths of a cell, whole numbers, so that K-means ends alike
 in every process. The memo of a robot's task is the count of its assignments, up to two, and its region's
 centroid (row, column): where K-means begins the next time.
 """
@@ -25,11 +25,11 @@ from kantor_protocol.base.kernels import kernel
 from kantor_protocol.scenario.schema import Scenario
 
 PARTS = 16
-"""Of a cell, in which centroids are told."""
+"""Centroids are whole numbers of this fraction of a cell."""
 RANDOM_ASSIGNMENTS = 2
-"""So many times a robot's centroid is drawn; from then on its region's is taken."""
+"""Assignments for which a robot's centroid is drawn; from then on that of its region is taken."""
 ROUNDS = 20
-"""Of K-means, at most; what is not settled by then is settled by the next assignment."""
+"""Rounds of K-means, at most; the next assignment goes on from there."""
 NO_REGION = -1
 
 Ints = npt.NDArray[np.int64]
@@ -91,9 +91,10 @@ def gather(
     stack: np.ndarray,
     points: np.ndarray,
 ) -> int:
-    """The frontiers, and what is unknown and connected to one; how many. What walls enclose is left out.
+    """Write the points, frontiers and unknown cells connected to one, into points (cells,); returns how many.
 
-    region: (cells,) NO_REGION; 0 afterwards where there is a point. stack: (cells,) room.
+    Unknown cells enclosed by walls are left out. region: (cells,) NO_REGION, and 0 afterwards at each point.
+    stack: (cells,) scratch.
     """
     count = cells.shape[0]
     for j in range(frontiers.shape[0]):
@@ -121,7 +122,7 @@ def gather(
 def _label(
     at: np.ndarray, centroids: np.ndarray, regions: int, label: np.ndarray, away: np.ndarray
 ) -> None:
-    """Every point's nearest centroid, of equal ones the first; written so that it becomes SIMD."""
+    """Label every point with its nearest centroid, of equal ones the first; written to become SIMD code."""
     for k in range(regions):
         row, column = centroids[k, 0], centroids[k, 1]
         for i in range(at.shape[1]):
@@ -160,7 +161,7 @@ def _move_centroids(
     sums: np.ndarray,
     centroids: np.ndarray,
 ) -> bool:
-    """To the middle of their points, rounded; whether any moved."""
+    """Move centroids to the mean of their points, rounded; whether any moved."""
     sums[:, :] = 0
     for i in range(label.shape[0]):
         sums[label[i], 0] += int(at[0, i])
@@ -188,10 +189,10 @@ def cluster(
     sums: np.ndarray,
     region: np.ndarray,
 ) -> None:
-    """Lloyd's rounds from given centroids, which are moved; every point's region is noted.
+    """Lloyd's algorithm from given centroids, which it moves; writes every point's region into region (cells,).
 
-    points: (n,) cells, n >= regions. centroids: (regions, 2) row and column in PARTS of a cell, whole
-    numbers. Room: at (2, n), label (n,), away (n,), sizes (regions,), sums (regions, 2).
+    points: (n,) cells, n >= regions. centroids: (regions, 2) row and column, whole numbers of 1/PARTS of a
+    cell. Scratch: at (2, n), label (n,), away (n,), sizes (regions,), sums (regions, 2).
     """
     regions = centroids.shape[0]
     for i in range(points.shape[0]):
@@ -215,9 +216,9 @@ def find_contour(
     inside: np.ndarray,
     contour: np.ndarray,
 ) -> int:
-    """The unknown cells on the edge of each region, rising; how many.
+    """Write the unknown cells on the edge of each region into contour, rising; returns how many.
 
-    A region that has nothing unknown is all contour. inside: (regions,) zeros, its unknown cells.
+    A region without unknown cells is all contour. inside: (regions,) zeros, and its unknown cells afterwards.
     """
     for i in range(points.shape[0]):
         if cells[points[i]] == UNKNOWN:
@@ -252,8 +253,8 @@ def measure_accessible(
 ) -> None:
     """Eq. 1 and 3: the least cost of the way to a frontier beside a contour cell, and this cell.
 
-    travel: (robots, frontiers). distance: (robots, regions) infinite, and so afterwards where a region
-    is inaccessible; nearest: the same shape.
+    travel: (robots, frontiers). distance: (robots, regions) infinite, and still so afterwards where a
+    region is inaccessible; nearest: the same shape.
     """
     for j in range(frontiers.shape[0]):
         for side in range(5):
@@ -284,7 +285,7 @@ def measure_inaccessible(
     distance: np.ndarray,
     nearest: np.ndarray,
 ) -> None:
-    """Eq. 2 and 3: as the crow flies, and the map's diagonal if a known obstacle is in the way."""
+    """Eq. 2 and 3: the straight line, and the map's diagonal if a known obstacle is on it."""
     for e in range(contour.shape[0]):
         c = contour[e]
         k = region[c]
@@ -311,10 +312,10 @@ def space(
     kept: np.ndarray,
     spaced: np.ndarray,
 ) -> None:
-    """F_M: take frontiers in this order, unless one that is taken lies nearer than the sensor sees.
+    """F_M: take frontiers in this order, unless one that is taken lies nearer than the sensor's range.
 
-    kept: (frontiers,) room. spaced: (frontiers,) False, and whether each is taken. Those that cost an
-    infinity are not.
+    kept: (frontiers,) scratch. spaced: (frontiers,) False, and whether each is taken afterwards. Those of
+    infinite cost are not.
     """
     count = 0
     for o in range(order.shape[0]):
@@ -334,7 +335,7 @@ def space(
 def mark_taken(
     frontiers: np.ndarray, columns: int, target: int, range_cells: float, taken: np.ndarray
 ) -> None:
-    """A target stands for all frontiers that are nearer to it than the sensor sees."""
+    """Mark the frontiers that are nearer to a target than the sensor's range as taken."""
     if target == NOWHERE:
         return
     for j in range(frontiers.shape[0]):
@@ -353,7 +354,7 @@ def choose(
     contour_cell: int,
     diagonal: float,
 ) -> int:
-    """Eq. 6-7: the place in `frontiers` of a robot's target, of equal ones the first; -1 without any.
+    """Eq. 6-7: the index in `frontiers` of a robot's target, of equal ones the first; -1 without any.
 
     travel: (frontiers,) of this robot. contour_cell: the nearest of its region, or NOWHERE.
     """
@@ -374,47 +375,47 @@ def choose(
 
 
 class KMeans:
-    """Regions for all robots in contact, and targets on the way to them."""
+    """The planner `kmeans`: regions for all robots in contact, and targets on the way to them."""
 
     negotiates = False
 
     def __init__(self, _scenario: Scenario, seed: int, _me: int | None) -> None:
-        """The rest is the same for everybody."""
+        """seed: of the mission, for the draws of the first centroids."""
         self._seed = seed
 
     def assign(self, situation: Situation, /) -> list[Task]:
-        """Every member's target, with its region as a memo. Without frontiers nothing is to be done."""
+        """Every member's target, with its region as a memo. Without frontiers memos stay as they are."""
         cost_map, frontiers, members, others, _, _ = situation
         if not (members and frontiers.size):
             return [Task(NOWHERE, member.task.memo) for member in members]
-        group = sorted((*members, *others), key=lambda member: member.robot)
-        cells = np.array([member.cell for member in group])
-        starts = np.array([self._start(member, cost_map.frame) for member in group])
-        travel = np.stack([cost_map.travel(member.cell)[frontiers] for member in group])
+        team = sorted((*members, *others), key=lambda member: member.robot)
+        cells = np.array([member.cell for member in team])
+        starts = np.array([self._start(member, cost_map.frame) for member in team])
+        travel = np.stack([cost_map.travel(member.cell)[frontiers] for member in team])
         regions = Regions(cost_map, frontiers, cells, starts, travel)
-        mine = [group.index(member) for member in members]
-        targets = _targets(situation, regions, travel, mine)
-        return [Task(targets[i], (_assignments(group[i], 1), *regions.places[i])) for i in mine]
+        mine = [team.index(member) for member in members]
+        targets = choose_targets(situation, regions, travel, mine)
+        return [Task(targets[i], (_assignments(team[i], 1), *regions.places[i])) for i in mine]
 
     def _start(self, member: Member, frame: Frame) -> tuple[int, int]:
-        """Where a robot's centroid begins: at its region's, or drawn from the whole map."""
+        """The initial centroid of a robot: that of its region, or drawn from the whole map."""
         row, column = PARTS * (frame.rows - 1), PARTS * (frame.columns - 1)
         count = _assignments(member)
         if count == RANDOM_ASSIGNMENTS:
-            _, told_row, told_column = (*member.task.memo, 0, 0)[:3]
-            return min(max(told_row, 0), row), min(max(told_column, 0), column)
+            _, last_row, last_column = (*member.task.memo, 0, 0)[:3]
+            return min(max(last_row, 0), row), min(max(last_column, 0), column)
         key = (self._seed, int(Purpose.CENTROIDS), member.robot, count)
         return round(uniform(*key, 0) * row), round(uniform(*key, 1) * column)
 
 
 def _assignments(member: Member, more: int = 0) -> int:
-    """How many a robot has had, as far as it matters."""
+    """Assignments that a robot has had, and `more`, up to RANDOM_ASSIGNMENTS."""
     before = max(0, member.task.memo[0]) if member.task.memo else 0
     return min(before + more, RANDOM_ASSIGNMENTS)
 
 
 class Regions:
-    """A partition of what is unknown, and whose each part is (sections IV.A and IV.B)."""
+    """A partition of the unknown cells, and the robot of each part (sections IV.A and IV.B)."""
 
     def __init__(
         self, cost_map: CostMap, frontiers: Ints, robots: Ints, starts: Ints, travel: Floats
@@ -425,51 +426,55 @@ class Regions:
         points = _points(cost_map.fused_map, frontiers, region)
         count = min(robots.shape[0], points.shape[0])
         centroids = starts[:count].astype(np.float64)
-        _cluster(points, frame.columns, centroids, region)
+        divide(points, frame.columns, centroids, region)
         self.diagonal = math.sqrt(frame.rows**2 + frame.columns**2)
-        """l"""
+        """The map's diagonal, l, in cells."""
         self.distance = np.full((robots.shape[0], count), np.inf)
         """(n, regions) eq. 3."""
         self.nearest = np.full((robots.shape[0], count), NOWHERE)
-        """(n, regions) the contour cell that is so far."""
+        """(n, regions) the contour cell at that distance."""
         grid, measured = (cells, frame.columns, region), (self.distance, self.nearest)
         inside, contour = np.zeros(count, np.int64), np.empty_like(points)
         edges = find_contour(*grid, points, inside, contour)
         measure_accessible(*grid, inside, frontiers, travel, *measured)
         self.accessible = np.isfinite(self.distance)
-        """(n, regions)"""
+        """(n, regions) whether the robot can get to the region."""
         rest = (robots, self.accessible, self.diagonal)
         measure_inaccessible(*grid, contour[:edges], *rest, *measured)
         from scipy.optimize import linear_sum_assignment  # noqa: PLC0415  20 MB that other planners do without
 
         owners, theirs = linear_sum_assignment(self.distance)
         self.owned = np.full(robots.shape[0], NO_REGION)
-        """(n,) eq. 4-5; NO_REGION for some if there are fewer regions than robots."""
+        """(n,) each robot's region by eq. 4-5; NO_REGION for some if there are fewer regions than robots."""
         self.owned[owners] = theirs
         places = starts.copy()
         places[owners] = centroids[theirs]
         self.places: list[list[int]] = places.tolist()
-        """(n, 2) the centroid of each one's region, or where it began."""
+        """(n, 2) the centroid of each robot's region, or its initial one without a region."""
 
 
 def _points(fused_map: FusedMap, frontiers: Ints, region: Ints) -> Ints:
-    """The cells that are to be divided, rising."""
+    """The cells that are to be divided into regions, rising."""
     stack, points = np.empty_like(region), np.empty_like(region)
     count = gather(fused_map.cells, fused_map.frame.columns, frontiers, region, stack, points)
     return points[:count]
 
 
-def _cluster(points: Ints, columns: int, centroids: Floats, region: Ints) -> None:
+def divide(points: Ints, columns: int, centroids: Floats, region: Ints) -> None:
+    """`cluster` with its scratch arrays."""
     n, count = points.shape[0], centroids.shape[0]
-    room = (np.empty((2, n)), np.empty(n, np.int64), np.empty(n))
+    per_point = (np.empty((2, n)), np.empty(n, np.int64), np.empty(n))
     sums = (np.empty(count, np.int64), np.empty((count, 2), np.int64))
-    cluster(points, columns, centroids, *room, *sums, region)
+    cluster(points, columns, centroids, *per_point, *sums, region)
 
 
-def _targets(
+def choose_targets(
     situation: Situation, regions: Regions, travel: Floats, mine: list[int]
 ) -> dict[int, int]:
-    """Of these robots of the group (section IV.C): first of those that cannot get to their region yet."""
+    """Targets by index in the team (section IV.C): first for robots that cannot get to their region yet.
+
+    travel: (n, frontiers). mine: indices in the team of the robots that get a target.
+    """
     cost_map, frontiers = situation.cost_map, situation.frontiers
     columns, range_cells = cost_map.frame.columns, cost_map.sensor_cells
     costs = travel[mine].min(axis=0)
@@ -481,7 +486,10 @@ def _targets(
         mark_taken(frontiers, columns, target, range_cells, taken)
     targets = dict.fromkeys(mine, NOWHERE)
     for i in sorted(mine, key=lambda i: _has_way(regions, i)):
-        for eligible in (spaced, np.ones_like(spaced)):  # rather one of the others than none
+        for eligible in (
+            spaced,
+            np.ones_like(spaced),
+        ):  # one that is too near to another is better than none
             its = (eligible, taken, travel[i], _contour_cell(regions, i), regions.diagonal)
             j = choose(cost_map.fused_map.cells, columns, frontiers, *its)
             if j >= 0:
@@ -492,12 +500,12 @@ def _targets(
 
 
 def _has_way(regions: Regions, i: int) -> bool:
-    """Whether a robot can get to its region, or has none."""
+    """Whether a robot can get to its region, or has no region."""
     k = regions.owned[i]
     return bool(k == NO_REGION or regions.accessible[i, k])
 
 
 def _contour_cell(regions: Regions, i: int) -> int:
-    """The nearest of a robot's region, or NOWHERE."""
+    """The nearest contour cell of a robot's region, or NOWHERE."""
     k = regions.owned[i]
     return NOWHERE if k == NO_REGION else int(regions.nearest[i, k])

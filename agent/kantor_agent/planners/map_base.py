@@ -1,6 +1,6 @@
-"""What every planner on a map is: an assignment of targets to robots, from what they know together.
+"""The interface of planners on maps: an assignment of targets to robots, from what they know together.
 
-The same strategy runs in the supervisor, for all robots, and in every robot, for those it is in contact
+The same planner runs in the supervisor, for all robots, and in every robot, for those it is in contact
 with. It is a function of the situation and its own memory of earlier ones, so that robots which know the
 same come to the same assignment.
 """
@@ -17,8 +17,8 @@ from kantor_protocol.base.grid import NOWHERE
 _LONG_AGO = -(1 << 40)
 
 
-def past(since: int, tick: int) -> int:
-    """A tick that has been. One to come is of a clock that runs wrong: nobody must wait for it."""
+def past_or_long_ago(since: int, tick: int) -> int:
+    """A past tick as it is. A later one than now is of a wrong clock and counts as long ago: no robot waits for it."""
     return since if since <= tick else _LONG_AGO
 
 
@@ -28,19 +28,19 @@ class Task(NamedTuple):
     target: int = NOWHERE
     """The cell to drive to."""
     memo: tuple[int, ...] = ()
-    """What the strategy wants everybody in contact to know of this robot, such as its region; at most
-    `Scenario.register_width` - 4 integers, each below 2^52 in size."""
+    """Integers of the planner that all robots in contact get to know, such as the robot's region; at most
+    `Scenario.register_width` - 4 of them, each below 2^52 in size."""
 
 
 class Member(NamedTuple):
-    """A robot of the group, as everybody in it knows it."""
+    """A robot of the visible team, as every other robot of the team knows it."""
 
     robot: int
     """Its place in the roster; members are in this order."""
     cell: int
-    """Where it is."""
+    """The cell in which it is."""
     task: Task
-    """What it does now."""
+    """Its present task."""
     since: int
     """The tick in which it got that task."""
     arrived: bool
@@ -48,26 +48,26 @@ class Member(NamedTuple):
 
 
 class Situation(NamedTuple):
-    """What is known to all members of a group."""
+    """What all members of a visible team know when targets are assigned."""
 
     cost_map: CostMap
     frontiers: npt.NDArray[np.int64]
     """Cells to choose from, rising."""
     members: tuple[Member, ...]
-    """Who gets a target now."""
+    """The robots that get a target now."""
     others: tuple[Member, ...]
-    """Who is in contact, and keeps the one it has."""
+    """The robots in contact that keep the target they have."""
     absent: tuple[int, ...]
-    """Targets of robots that are out of contact, as they were told last."""
+    """The last known targets of robots that are out of contact."""
     tick: int
     """Periods since the start."""
 
 
 class Allocator(Protocol):
-    """A strategy."""
+    """A planner on a map. It is made with the scenario, the seed, and the robot that asks, or None (supervisor)."""
 
     negotiates: bool
-    """It is asked in every step, not only when a robot needs a target; in a robot then for that robot alone."""
+    """Whether it is asked in every step, not only when a robot needs a target; in a robot then for that robot alone."""
 
     def assign(self, situation: Situation, /) -> Sequence[Task]:
         """A task for each of the situation's members, in their order."""

@@ -1,4 +1,11 @@
-"""The planners on maps by name. They stand apart from the others: a robot on a density needs none of them."""
+"""Planners on maps, by the name that `planner.name` has in a scenario.
+
+To add one: a module or folder of its own in this folder, with a class as `map_base.Allocator` describes it; an entry
+in `ALLOCATORS`; its name in `PlannerName` and `MAP_PLANNERS` in `kantor_protocol/scenario/schema.py`; and a test.
+Options are fields of `PlannerOptions` there. No planner imports another (`docs/planners.md`).
+
+Planners on densities are in `registry.py`, apart from these: a robot on a density loads none of them.
+"""
 
 from collections.abc import Callable
 
@@ -17,4 +24,4 @@ ALLOCATORS: dict[str, Callable[[Scenario, int, int | None], Allocator]] = {
     "kmeans": KMeans,
     "market": Market,
 }
-"""Targets for a group. Scenario, seed, and the robot that asks or None."""
+"""Makes a planner from the scenario, the seed, and the robot that asks, or None for the supervisor."""

@@ -5,8 +5,8 @@ far, n their number and mu_k the mean of f_k over the density, S_k = c_k - n mu_
 are from the density at the scale of mode k. Each robot descends the sum of Lambda_k S_k^2 / 2, large
 scales first: Lambda_k = (1 + |k|^2)^(-3/2).
 
-Each robot keeps the sum over its own poses as its register, in integers (`modes.py`), and plans with what
-it has of the others': centralized and decentralized differ in who is heard.
+Each robot keeps the sum over its own poses as its register, in integers (`cosine_basis.py`), and plans with
+the registers of the others that it holds: centralized and decentralized missions differ in whose those are.
 """
 
 import math
@@ -65,9 +65,9 @@ def gradient(
 
 @kernel
 def way_out(domain: np.ndarray, x: float, y: float, dx: float, dy: float) -> tuple[float, float]:
-    """Where the ray from (x, y) along (dx, dy) leaves the domain, sliding along a border it is on.
+    """The point where the ray from (x, y) along (dx, dy) leaves the domain, sliding along a border it is on.
 
-    From outside, the ray is the one to the nearest place inside. The place itself if there is no way.
+    From outside, the ray is the one to the nearest point inside. (x, y) itself if the ray has no length.
     """
     x_min, x_max = domain[0], domain[0] + domain[2]
     y_min, y_max = domain[1], domain[1] + domain[3]
@@ -107,7 +107,7 @@ def _choose(
     x: float,
     y: float,
 ) -> tuple[float, float]:
-    """Count the visit, then the goal of steepest descent."""
+    """Count the visit of (x, y), then return the goal of steepest descent."""
     harmonics(phase(x, domain[0], domain[2]), cos_x, sin_x)
     harmonics(phase(y, domain[1], domain[3]), cos_y, sin_y)
     visit(cos_x, cos_y, visited)
@@ -126,6 +126,7 @@ def _mean_over(
     sin_y: np.ndarray,
     mean: np.ndarray,
 ) -> None:
+    """Write the mean of each mode over samples (N, 2) into mean (K * K,); the harmonics are scratch."""
     modes = cos_x.shape[0]
     mean[:] = 0.0
     for j in range(xy_m.shape[0]):
@@ -161,10 +162,10 @@ def mean_over_mixture(density: tuple[Gaussian, ...], domain: Domain, modes: int)
 
 
 class Spectral:
-    """The planner of Spectral Multiscale Coverage."""
+    """The planner `spectral` of Spectral Multiscale Coverage."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """The density is the scenario's mixture where that stands still, else its samples."""
+        """The density is the scenario's mixture if that does not change with time, else its samples."""
         modes, domain, samples = scenario.planner.modes, scenario.domain, scenario.samples
         self._domain = rectangle_of(domain)
         order = np.arange(modes)
@@ -176,22 +177,23 @@ class Spectral:
         mean = None
         if samples.file is None and samples.diffusion_m == 0.0:
             mean = mean_over_mixture(scenario.density, domain, modes)
-        self._mean = np.zeros(modes * modes) if mean is None else mean
-        self._follows = mean is None
-        self._walked = -1
+        self.mean = np.zeros(modes * modes) if mean is None else mean
+        """(K * K,) the mean of each mode over the density."""
+        self._follows_samples = mean is None
+        self._walk_steps = -1
 
     def choose(self, belief: Belief, pose: Pose, _now_ns: int, /) -> Goal | None:
-        """Where the steepest descent leaves the domain: a goal so far that no vehicle slows down."""
-        if self._follows and belief.walked != self._walked:
-            self._walked = belief.walked
-            _mean_over(belief.grid.xy_m, self._domain, *self._harmonics, self._mean)
+        """The point where the steepest descent leaves the domain: so far that no vehicle slows down before."""
+        if self._follows_samples and belief.random_walk_steps != self._walk_steps:
+            self._walk_steps = belief.random_walk_steps
+            _mean_over(belief.grid.xy_m, self._domain, *self._harmonics, self.mean)
         registers = belief.registers
         x_m, y_m = _choose(
             registers.values,
             registers.total,
             registers.stamps,
             registers.me,
-            self._mean,
+            self.mean,
             self._emphasis,
             self._domain,
             *self._harmonics,

@@ -1,8 +1,8 @@
 """Optimal-transport exploration (Kabir & Lee, eq. 2-3).
 
 The goal is the first sample of the best order through the h nearest that still have weight. The paper
-walks through all h! orders. Held and Karp's recursion over subsets finds the same optimum: the cost of
-a step into a sample depends on where it comes from and on that sample alone.
+enumerates all h! orders. Held and Karp's recursion over subsets finds the same optimum: the cost of a
+step into a sample depends on the sample before and on that sample alone.
 """
 
 import math
@@ -14,7 +14,7 @@ from kantor_agent.belief.sample_index import SampleIndex, nearest
 from kantor_agent.planners.base import Goal
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.machine import Pose
-from kantor_protocol.replication.replica_kernels import NOBODY, claim, taken
+from kantor_protocol.replication.replica_kernels import NOBODY, claim, claimed_by_others
 
 
 @kernel
@@ -27,10 +27,10 @@ def first_of_best_order(
     count: int,
     cost_to_go: np.ndarray,
 ) -> int:
-    """Which of near[:count] begins the cheapest order by eq. 2. Equal costs: the nearer one.
+    """The index in near[:count] of the sample that begins the cheapest order by eq. 2; of equal ones the nearer.
 
-    cost_to_go: (2^h, h) float64 room; [s, j] is the least cost of what follows when the set s of
-    samples is still to be visited and the robot stands on j.
+    cost_to_go: (2^h, h) float64 scratch; [s, j] is the least cost of what follows when the set s of
+    samples is still to be visited and the robot is at sample j.
     """
     for remaining in range(1 << count):
         for at in range(count):
@@ -45,12 +45,12 @@ def first_of_best_order(
                     least = min(least, step + cost_to_go[remaining ^ (1 << following), following])
             cost_to_go[remaining, at] = least
     best, first = math.inf, 0
-    everything = (1 << count) - 1
+    all_samples = (1 << count) - 1
     for at in range(count):
         dx = xy_m[near[at], 0] - x
         dy = xy_m[near[at], 1] - y
         cost = math.sqrt(dx * dx + dy * dy) / weights[near[at]]
-        cost += cost_to_go[everything ^ (1 << at), at]
+        cost += cost_to_go[all_samples ^ (1 << at), at]
         if cost < best:
             best, first = cost, at
     return first
@@ -95,12 +95,12 @@ def _choose(
     y: float,
     now_ns: int,
 ) -> tuple[int, float, float]:
-    """The goal and its place, for calls from Python; see `Transport.choose`.
+    """The goal and its position, for calls from Python; see `Transport.choose`.
 
-    held: room for the samples that others hold. me: NOBODY in a mission without claims.
+    held: scratch for the samples that others have claimed. me: NOBODY in a mission without claims.
     """
     grid = SampleIndex(xy_m, order, cell, first, alive, frame, levels)
-    skip = held[: taken(claims, counters, me, held) if me != NOBODY else 0]
+    skip = held[: claimed_by_others(claims, counters, me, held) if me != NOBODY else 0]
     sample = choose_sample(grid, weights, x, y, skip, best, near, cost_to_go)
     if sample == NOBODY and skip.shape[0] > 0:
         sample = choose_sample(grid, weights, x, y, skip[:0], best, near, cost_to_go)
@@ -112,17 +112,17 @@ def _choose(
 
 
 class Transport:
-    """The planner of Algorithms 1-3, with claims if the mission has them."""
+    """The planner `transport` of Algorithms 1-3, with claims if the mission has them."""
 
     def __init__(self, horizon: int) -> None:
         """horizon: h, samples in one plan."""
-        self._room = (
+        self._scratch = (
             np.zeros(horizon, dtype=np.float64),
             np.zeros(horizon, dtype=np.int64),
             np.zeros((1 << horizon, horizon), dtype=np.float64),
         )
 
     def choose(self, belief: Belief, pose: Pose, now_ns: int, /) -> Goal | None:
-        """The first sample of the best order; one that another robot holds only if all are held."""
-        sample, x_m, y_m = _choose(*belief.to_choose, *self._room, pose.x_m, pose.y_m, now_ns)
+        """The first sample of the best order; one that another robot has claimed only if all are claimed."""
+        sample, x_m, y_m = _choose(*belief.to_choose, *self._scratch, pose.x_m, pose.y_m, now_ns)
         return None if sample == NOBODY else Goal(x_m, y_m, sample)

@@ -1,5 +1,5 @@
 """The two state machines of a robot, each with the one entrance `step`.
 
-They put belief, planner, vehicle and gossip in the order of a step; the parts themselves are in the other rooms.
-Start with `density.py`.
+They call belief or map, planner, vehicle and gossip in the order of a step; the parts themselves are in the other
+rooms. Start with `density.py`.
 """

@@ -68,7 +68,7 @@ class FaultCoverage:
                 self.counts["hostile"] += len(record.injected)
         elif isinstance(record, ProcessEvent) and record.fault >= 0:
             fault = self._faults[record.fault]
-            if record.what in _STRIKES or (record.what == "start" and kind_of(fault) == "late"):
+            if record.kind in _STRIKES or (record.kind == "start" and kind_of(fault) == "late"):
                 self._count(fault, record.who, 1)
         elif isinstance(record, Opening):
             self._faults = record.scenario.faults

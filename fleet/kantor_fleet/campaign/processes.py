@@ -32,7 +32,7 @@ from kantor_fleet.campaign.run import commit
 from kantor_fleet.execution.experiment import code
 from kantor_fleet.execution.in_process_team import play
 from kantor_fleet.execution.preload import warm_up
-from kantor_fleet.execution.verify import verdicts
+from kantor_fleet.execution.verify import findings
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.processes.local import Fleet, FleetConfig, local_fleet, watch_progress
@@ -228,9 +228,9 @@ def _judged(config: FleetConfig, failures: list[str]) -> ProcessMission:
     complaints = [*failures, *result.complaints]
     if result.ended != "done" or result.record != "whole":
         complaints.append(f"end: {result.ended}; record {result.record}")
-    complaints += [f"verify: {line}" for held, line in verdicts(folder, journal) if not held]
+    complaints += [f"verify: {line}" for held, line in findings(folder, journal) if not held]
     complaints += liveness.complaints
-    complaints += [f"{i.who}: let in" for i in _incidents(records) if i.what == "let in"]
+    complaints += [f"{i.who}: let in" for i in _incidents(records) if i.kind == "let in"]
     rejoined_s: tuple[float, ...] = ()
     resumed_s: tuple[float, ...] = ()
     if config.exchange == "lockstep":
@@ -283,7 +283,7 @@ def _back_s(
     before is done. Clocks of participants run on while world-sim is down, and it goes on by them.
     """
     due_ns = {
-        (deed.fault, deed.who): deed.at_ns for deed in schedule_of(scenario) if deed.what == "start"
+        (deed.fault, deed.who): deed.at_ns for deed in schedule_of(scenario) if deed.kind == "start"
     }
     killed: set[ParticipantId] = set()
     ordered_ns: dict[ParticipantId, int] = {}
@@ -292,9 +292,9 @@ def _back_s(
     for record in records:
         if isinstance(record, ProcessEvent) and record.fault >= 0:
             who = record.who
-            if record.what == "kill":
+            if record.kind == "kill":
                 killed.add(who)
-            elif record.what == "start" and who in killed:
+            elif record.kind == "start" and who in killed:
                 due = due_ns[record.fault, who]
                 ordered_ns[who] = due if who == WORLD_SIM else max(before_ns, due)
             before_ns = record.now_ns

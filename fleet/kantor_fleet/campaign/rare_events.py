@@ -17,14 +17,12 @@ from kantor_protocol.base.machine import (
     State,
 )
 from kantor_protocol.base.varint import Pairs
-from kantor_protocol.replication.replica import read_version_vector
-from kantor_protocol.scenario.faults.links import OneWay, Partition
+from kantor_protocol.scenario.faults.links import FORGED_SEQUENCE_MIN, OneWay, Partition
 from kantor_protocol.scenario.faults.processes import ClockFault, Kill, Late
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
-from kantor_protocol.wire.version_vector import slots_told
+from kantor_protocol.wire.version_vector import covered_ids, read_version_vector
 from kantor_worldsim.radio.channel import DROPPED
-from kantor_worldsim.radio.forgeries import FIRST_SEQUENCE
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
 
 Pair = tuple[float, float]
@@ -81,7 +79,7 @@ class _Ears(_RareEvent):
         name, born = step_record.name, self._born
         newest = self._newest[name]
         for source, sequence in step_record.heard:
-            if sequence >= FIRST_SEQUENCE:
+            if sequence >= FORGED_SEQUENCE_MIN:
                 continue
             last = newest.get(source, -1)
             if sequence > last:
@@ -98,7 +96,7 @@ class _Ears(_RareEvent):
 
     def _note_refused(self, step_record: StepRecord, refused: int) -> None:
         if refused > self._refused.get(step_record.name, 0) and step_record.heard:
-            forged = any(sequence >= FIRST_SEQUENCE for _, sequence in step_record.heard)
+            forged = any(sequence >= FORGED_SEQUENCE_MIN for _, sequence in step_record.heard)
             self.seen["hostile message refused"] += forged
         self._refused[step_record.name] = refused
 
@@ -112,7 +110,7 @@ class _Ears(_RareEvent):
             self.seen["stale word after a restart"] += 1
 
     def incident(self, incident: ProcessEvent) -> None:
-        if incident.what == "start" and incident.step > 0:
+        if incident.kind == "start" and incident.step > 0:
             self._restarted.add(incident.who)
             self._refused[incident.who] = 0
             if incident.incarnation:
@@ -149,7 +147,7 @@ class _Lives(_RareEvent):
 
     def incident(self, incident: ProcessEvent) -> None:
         who, now_ns = incident.who, incident.now_ns
-        if incident.what == "kill":
+        if incident.kind == "kill":
             fault = self.scenario.faults[incident.fault]
             if isinstance(fault, Kill) and fault.mid_step:
                 self.seen["death between note and answer"] += 1
@@ -159,7 +157,7 @@ class _Lives(_RareEvent):
             if who == WORLD_SIM and max(self._due_ns.values()) > now_ns:
                 self.seen["world-sim restarted with messages under way"] += 1
             self._dead.add(who)
-        elif incident.what == "start":
+        elif incident.kind == "start":
             self._dead.discard(who)
             if any(cut.from_ns <= now_ns < (cut.until_ns or 2**63) for cut in self._cuts):
                 self.seen["restart during a partition"] += 1
@@ -194,7 +192,7 @@ class _Memory(_RareEvent):
             del self._lost[name]
 
     def incident(self, incident: ProcessEvent) -> None:
-        if incident.what != "start":
+        if incident.kind != "start":
             return
         who = incident.who
         if incident.fault >= 0 and isinstance(self.scenario.faults[incident.fault], Late):
@@ -218,7 +216,7 @@ class _Memory(_RareEvent):
             version_vector = decode_gossip(body).version_vector
         except RefusedError:
             return []
-        slots = slots_told(version_vector, len(self._names), claims=self.scenario.claiming)
+        slots = covered_ids(version_vector, len(self._names), claims=self.scenario.claiming)
         return (slots and read_version_vector(version_vector, slots)) or []
 
 

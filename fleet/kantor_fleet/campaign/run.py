@@ -20,9 +20,9 @@ from kantor_fleet.execution.pools import Pool
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.report.progress import printable
-from kantor_fleet.report.run_progress import RunsView, table_console
-from kantor_fleet.sweep.journal import Journal
-from kantor_fleet.sweep.plan import Key, parse_seeds
+from kantor_fleet.report.run_progress import RunProgressView, table_console
+from kantor_fleet.sweep.journal import RunsJournal
+from kantor_fleet.sweep.plan import RunKey, parse_seeds
 from kantor_protocol.scenario.dump import to_toml
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.world.world import WorldSetup
@@ -60,7 +60,7 @@ def campaign(config: CampaignConfig, start: Callable[[Iterable[Case]], Pool]) ->
     """
     started_s = time.monotonic()
     totals = Totals()
-    with Interrupts() as interrupts, Journal(config.folder / RUNS, Trial) as journal:
+    with Interrupts() as interrupts, RunsJournal(config.folder / RUNS, Trial) as journal:
         broken = _known(config, journal, totals)
         if broken is None:
             broken = _run(config, journal, totals, start, interrupts)
@@ -99,7 +99,7 @@ def replay(seed: int, folder: Path) -> Exit:
     return Exit.NOT_MET if complaints else Exit.DONE
 
 
-def _known(config: CampaignConfig, journal: Journal, totals: Totals) -> Broken | None:
+def _known(config: CampaignConfig, journal: RunsJournal, totals: Totals) -> Broken | None:
     """Count what was run before; the first of it that broke."""
     first = None
     for seed in config.seeds:
@@ -115,7 +115,7 @@ def _known(config: CampaignConfig, journal: Journal, totals: Totals) -> Broken |
 
 def _run(
     config: CampaignConfig,
-    journal: Journal,
+    journal: RunsJournal,
     totals: Totals,
     start: Callable[[Iterable[Case]], Pool],
     interrupts: Interrupts,
@@ -123,7 +123,7 @@ def _run(
     left = [seed for seed in config.seeds if _key(seed) not in journal.outcomes]
     if not left:
         return None
-    with RunsView(len(left)) as view, closing(start(_cases(left, config.minutes))) as pool:
+    with RunProgressView(len(left)) as view, closing(start(_cases(left, config.minutes))) as pool:
         view.note("starting workers (the first time, kernels are compiled: about half a minute)")
         for done in pool:
             if done is not None:
@@ -198,9 +198,9 @@ def _command(path: Path, seed: int) -> str:
     return f"kantor run {path} --exchange in-process --seed {seed}"
 
 
-def _key(seed: int) -> Key:
+def _key(seed: int) -> RunKey:
     """A mission is known by what draws and judges it, and by its seed."""
-    return Key(f"campaign {_draws()}", code(), seed, exact=False)
+    return RunKey(f"campaign {_draws()}", code(), seed, exact=False)
 
 
 @functools.cache

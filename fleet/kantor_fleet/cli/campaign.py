@@ -17,27 +17,27 @@ def campaign(
     speed: float = 8.0,
     storm: float = 40.0,
 ) -> int:
-    """Draw missions full of faults, seed by seed, and judge every event, until a rule breaks.
+    """Draw missions full of faults, seed by seed, and check every event, until a rule is broken.
 
     The first violation ends it: its seed, the command that replays it, and the smallest scenario that
     shows it are printed. Finished missions are kept: the same command goes on where it was stopped.
-    Exit code 1 for a violation, and from 500 missions on for a fault that never struck or a rare
-    situation that was never seen.
+    Exit code 1 for a violation, and from 500 missions on for a fault that had no effect or a rare
+    event that did not occur.
 
     With --processes missions run one after the other on real processes over the bus, under real signals:
     robots, the supervisor and world-sim are killed and frozen. The first violation keeps its run folder.
     Exit code 1 too if restarts are slow to rejoin, or memory is not flat.
 
     Args:
-        seeds: How many, from 0 on; or 500:1000 (without 1000). By default 2000; with --processes 18, or as
+        seeds: Number of seeds, from 0 on; or 500:1000 (without 1000). By default 2000; with --processes 18, or as
             many as there is time for.
-        jobs: Processes, by default one for each core; not with --processes.
+        jobs: Number of processes, by default one for each core; not with --processes.
         minutes: Real time after which no further mission begins.
-        out: Where campaign.jsonl is kept, and what is found.
+        out: Folder of campaign.jsonl and of violations.
         replay: Run the mission of this seed alone, and leave its scenario and its record.
         processes: On real processes over the bus.
         speed: With --processes: simulated seconds in a real one.
-        storm: With --processes: real seconds of each mission in which anything may go wrong.
+        storm: With --processes: real seconds of each mission in which faults occur.
     """
     from kantor_fleet.campaign.run import numbered  # noqa: PLC0415
 
@@ -65,5 +65,5 @@ def campaign(
 
     if replay is not None:
         return replay_mission(replay, out)
-    order = CampaignConfig(numbered(seeds or "2000"), out, minutes)
-    return run_campaign(order, pool(jobs, work=attempt))
+    config = CampaignConfig(numbered(seeds or "2000"), out, minutes)
+    return run_campaign(config, pool(jobs, work=attempt))

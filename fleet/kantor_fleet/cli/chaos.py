@@ -14,15 +14,15 @@ def chaos(
     project: str = "kantor",
     patience: float = 120.0,
 ) -> int:
-    """Kill, pause and cut off containers of a running fleet by a schedule, and check the record afterwards.
+    """Kill, pause and disconnect containers of a running fleet on a schedule, and check the record afterwards.
 
-    Exit code 1 if the mission was not met, a rule was broken, or world-sim did not see what was done.
+    Exit code 1 if the mission was not met, a rule was broken, or the record does not show an injected fault.
 
     Args:
         where: docker: a compose project on this machine's engine.
-        storm: A TOML file of [[faults]]: kill, pause, and partition with shape "isolate"; times of the mission.
+        storm: A TOML file of [[faults]]: kill, pause, and partition with shape "isolate"; with times of the mission.
         project: Name of the compose project.
-        patience: Seconds to wait for the mission to begin.
+        patience: Seconds to wait for world-sim to begin the mission.
     """
     from kantor_fleet.processes.chaos import chaos_docker  # noqa: PLC0415
 

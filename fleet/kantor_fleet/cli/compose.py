@@ -17,15 +17,15 @@ def compose(
 ) -> int:
     """Write a compose file for a fleet: world-sim and every robot in a container of its own.
 
-    Beside it come `runs/`, and `.env` with the user that runs the containers.
+    Beside it are made `runs/`, `keys/`, and `.env` with the user that runs the containers.
 
     Args:
-        robots: How many.
-        supervisor: Have a supervisor as well, in the profile `centralized`.
-        isolated: Each robot on a network of its own with world-sim.
+        robots: Number of robots.
+        supervisor: Add a supervisor, in the profile `centralized`.
+        isolated: Put each robot on a network of its own with world-sim.
         scenario: A packaged name, or /runs/FILE.toml for a file in the run folder.
-        hub: The endpoint of a world-sim elsewhere, tls/HOST:PORT; then only the robots are in the file.
-        out: The file.
+        hub: Endpoint of a world-sim elsewhere, tls/HOST:PORT; then only the robots are in the file.
+        out: The compose file.
         set: Override a key of the scenario.
     """
     from kantor_fleet.processes.compose import ComposeConfig  # noqa: PLC0415

@@ -22,23 +22,23 @@ def keys(
     list: bool = False,  # noqa: A002  the flag is --list
     out: Path = Path("keys"),
 ) -> int:
-    """Make a fleet's certificates: its private authority, once, and a file for each member.
+    """Issue a fleet's certificates: its private authority, once, and an identity file for each member.
 
-    Run again it keeps what there is and adds what is missing. Hand each file to whoever runs that member, and to
-    nobody else; authority.toml stays. What has changed in the register reaches world-sim with worldsim.toml.
+    Run again it keeps existing files and adds missing ones. Give each file to the machine of that member and to
+    no other; authority.toml stays here. A changed member list reaches world-sim with its new worldsim.toml.
 
     Args:
         fleet: Name of the fleet in every key.
-        robots: Robots r1 to r<robots>; those that there are stay.
-        supervisor: Also the supervisor.
+        robots: Robots r1 to r<robots>; existing ones stay.
+        supervisor: Add the supervisor.
         host: A name or an address by which others reach world-sim, or a site's router: north=10.0.0.5. Any number
-            of times. Each has localhost, 127.0.0.1, ::1 and its id anyway.
-        site: A site and the robots that stand behind it, such as north=r1,r2,r3; any number of times.
-        days: How long the new certificates count.
-        renew: Make a new certificate for this member; the old one ceases to count. Any number of times.
-        revoke: This member's certificate ceases to count. Any number of times.
-        list: Say which certificates there are, and until when they count; nothing is made.
-        out: The folder.
+            of times. Each certificate has localhost, 127.0.0.1, ::1 and its id anyway.
+        site: A site and the robots that connect through it, such as north=r1,r2,r3; any number of times.
+        days: Validity of new certificates.
+        renew: Issue a new certificate for this member; the old one becomes invalid. Any number of times.
+        revoke: Invalidate this member's certificate. Any number of times.
+        list: List the certificates and their expiry, and change nothing.
+        out: The folder of the authority and the identities.
     """
     from kantor_fleet.security.authority import Wanted, issue, listing, today  # noqa: PLC0415
 

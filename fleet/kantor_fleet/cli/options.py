@@ -1,11 +1,24 @@
-"""Checks of options that several verbs have."""
+"""Options that several verbs have: their checks, and the exchange's name on record."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from kantor_fleet.exits import Exit, fail
 
 if TYPE_CHECKING:
     from kantor_protocol.scenario.schema import Scenario
+
+ProcessExchange = Literal["lockstep", "realtime", "wall"]
+"""Exchanges with one process for each participant, as options name them; wall is an alias of realtime."""
+AnyExchange = Literal["in-process", ProcessExchange]
+_RECORDED = {"realtime": "wall"}
+
+
+def recorded(exchange: AnyExchange) -> str:
+    """The name of an exchange in records, manifests, messages and result.json, where realtime is `wall`.
+
+    Everything behind the command line uses this name.
+    """
+    return _RECORDED.get(exchange, exchange)
 
 
 def check_seed(seed: int) -> None:
@@ -20,7 +33,9 @@ def check_speed(speed: float) -> None:
         fail(Exit.USAGE, f"--speed {speed:g}: give a factor above 0, at most 1000")
 
 
-def exact_period(scenario: "Scenario", every: int, exchange: str, *, exact: bool) -> int | None:
+def exact_period(
+    scenario: "Scenario", every: int, exchange: AnyExchange, *, exact: bool
+) -> int | None:
     """Periods between exact distances, 0 for the end only, None for none."""
     from kantor_worldsim.observers.metrics.wasserstein_exact import AFFORDABLE, available  # noqa: PLC0415
 
@@ -28,8 +43,10 @@ def exact_period(scenario: "Scenario", every: int, exchange: str, *, exact: bool
         return None
     if every < 0:
         fail(Exit.USAGE, f"--exact-every {every}: give a number of periods")
-    if every and exchange == "wall":
-        fail(Exit.USAGE, "--exact-every: not on the wall, it would hold the relay up; use --exact")
+    if every and recorded(exchange) == "wall":
+        fail(
+            Exit.USAGE, "--exact-every: not in realtime, where it would delay messages; use --exact"
+        )
     if not available():
         fail(Exit.USAGE, "--exact: needs POT; pip install 'kantor[exact]'")
     if scenario.energy.points * (scenario.samples.count or 1) > AFFORDABLE:

@@ -33,27 +33,27 @@ def reproduce(
     jobs: int | None = None,
     out: Path = Path("reproduced"),
 ) -> int:
-    """Run a paper's experiments, draw its figures, and hold our numbers against the published ones.
+    """Run a paper's experiments, draw its figures, and compare the results with the published numbers.
 
     Leaves a PNG, a PDF and a CSV for each figure, and verdicts.csv. Exit code 1 if a claim is missed.
-    Figures of explored maps keep finished runs in runs.jsonl: the same command goes on where it was
-    stopped, and one figure uses what another has run.
+    Figures on maps, and `resilience`, keep finished runs in runs.jsonl: the same command goes on where it was
+    stopped, and one figure uses the runs of another.
 
     Args:
         figure: fig4 to fig9 are Kabir & Lee's, section VI, and all stands for these six. burgard-fig8:
-            coordinated frontiers. kme-fig6 to kme-fig8: exploration by K-means beside three others;
-            kme-all: the same over all 630 configurations.
+            coordinated frontiers. kme-fig6 to kme-fig8: exploration by K-means and three other planners;
+            kme-all: the same over all 630 configurations. resilience: quality under faults.
         runs: Runs for each setting; by default as many as in the paper (fig6: 50, fig9: 10, kme-*: 15),
             burgard-fig8: 20. kme-all: how many of the configurations, evenly spread over maps, starts and
             teams.
         jobs: Processes; by default one for each core.
-        out: Where the figures go.
+        out: Folder of the figures.
     """
     from kantor_fleet.execution.pools import pool  # noqa: PLC0415
     from kantor_fleet.reproduce import papers  # noqa: PLC0415
-    from kantor_fleet.reproduce.measured_runs import run_all  # noqa: PLC0415
+    from kantor_fleet.reproduce.measured_runs import run_measured  # noqa: PLC0415
     from kantor_fleet.reproduce.run import reproduce as reproduce_figures  # noqa: PLC0415
 
     if runs is not None and runs < 2:
         fail(Exit.USAGE, f"--runs {runs}: give at least 2, an interval needs them")
-    return reproduce_figures(papers.figures(figure), runs, pool(jobs, work=run_all), out)
+    return reproduce_figures(papers.figures(figure), runs, pool(jobs, work=run_measured), out)

@@ -15,8 +15,8 @@ def scenarios(
     """List the packaged scenarios, or show one as TOML.
 
     Args:
-        action: list, or show.
-        name: Which one to show.
+        action: list or show.
+        name: The scenario to show.
     """
     from kantor_fleet.scenarios.catalog import find, names, path_of  # noqa: PLC0415
 

@@ -14,16 +14,16 @@ def site(
     credentials: Path = Path("keys"),
     patience: float = 60.0,
 ) -> int:
-    """The router of a place: its robots connect to it, and it connects to world-sim.
+    """Run the router of a site: the robots of one place connect to it, and it connects to world-sim.
 
-    It speaks for its own robots only, those that `kantor keys --site` has put behind it, and keeps nothing.
+    It relays messages of its own robots only, those that `kantor keys --site` assigns to it, and stores nothing.
 
     Args:
         name: Which site, such as north.
         connect: World-sim's endpoint, tls/HOST:PORT.
         listen: Endpoint for the site's robots.
         credentials: The folder of identities, or this site's file.
-        patience: Seconds to wait for world-sim to come up.
+        patience: Seconds to wait for world-sim.
     """
     from kantor_fleet.processes.site import serve  # noqa: PLC0415
 

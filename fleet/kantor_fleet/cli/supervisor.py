@@ -9,13 +9,13 @@ def supervisor(
     state: Path = Path("state"),
     patience: float = 60.0,
 ) -> int:
-    """The supervisor by hand, for centralized scenarios.
+    """Run the supervisor, for centralized scenarios.
 
     Args:
         connect: World-sim's endpoint, tcp/HOST:PORT or tls/HOST:PORT.
         credentials: The credentials folder, or the supervisor's file.
-        state: Folder of its diary.
-        patience: Seconds to wait for world-sim to come up.
+        state: Folder of its write-ahead log.
+        patience: Seconds to wait for world-sim.
     """
     from kantor_fleet.processes.standalone import participate_standalone  # noqa: PLC0415
     from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415

@@ -17,17 +17,17 @@ def sweep(
     jobs: int | None = None,
     cluster: str | None = None,
     out: Path | None = None,
-    format: Literal["csv", "parquet"] = "csv",  # noqa: A002  the word users know
+    format: Literal["csv", "parquet"] = "csv",  # noqa: A002  the term that users know
     plot: str | None = None,
     exact: bool = False,
     retry_failed: bool = False,
     chaos: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
 ) -> int:
-    """Run many seeds of many variants: a table, a summary and a plot.
+    """Run many seeds of many variants, and write a table, a summary and a plot.
 
     Every variant has the same seeds. Finished runs are kept: the same command goes on where it was
-    stopped, and a wider one runs only what is new.
+    stopped, and a wider one runs only the new runs.
 
     Args:
         scenario: A packaged name or a TOML file.
@@ -35,11 +35,11 @@ def sweep(
         seeds: 0:50 (without 50), 7, or 1,4,9.
         jobs: Processes, by default one for each core; with --cluster slurm the number of Slurm jobs.
         cluster: Run on the Dask scheduler at this address, or in jobs of `slurm`.
-        out: Where everything is kept; sweeps/<scenario> by default.
-        format: Of the table.
+        out: Folder of the results; sweeps/<scenario> by default.
+        format: Format of the table.
         plot: The column that plot.png shows.
         exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
-        retry_failed: Run again what has failed.
+        retry_failed: Run failed runs again.
         chaos: A TOML file of [[faults]] that are added to the scenario's own.
         set: Override a key in every variant.
     """
@@ -52,5 +52,5 @@ def sweep(
     for variant in planned.variants:
         exact_period(variant.scenario, 0, "in-process", exact=exact)
     folder = out or Path("sweeps") / planned.name
-    order = SweepConfig(planned, folder, format, plot, retry_failed)
-    return run_sweep(order, pool(jobs, cluster))
+    config = SweepConfig(planned, folder, format, plot, retry_failed)
+    return run_sweep(config, pool(jobs, cluster))

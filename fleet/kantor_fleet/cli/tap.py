@@ -12,14 +12,14 @@ def tap(
     count: int = 0,
     patience: float = 60.0,
 ) -> int:
-    """Print what goes over the bus, decoded; it reads and never writes.
+    """Print messages on the bus, decoded; it reads and never writes.
 
     Args:
         connect: World-sim's endpoint, tcp/HOST:PORT or tls/HOST:PORT.
         credentials: The credentials folder, or the observer's file.
         only: Kinds to print: pose, weights, tx, rx, world; by default all.
-        count: Stop after so many messages; 0: never.
-        patience: Seconds to wait for world-sim to come up.
+        count: Stop after so many messages; 0: no limit.
+        patience: Seconds to wait for world-sim.
     """
     from kantor_fleet.processes.tap import tap as tap_bus  # noqa: PLC0415
 

@@ -7,10 +7,10 @@ import tyro
 
 
 def verify(run: Annotated[Path, tyro.conf.Positional], /) -> int:
-    """Execute a recorded run again and compare; exit code 1 if anything differs.
+    """Check a recorded run, execute it again and compare; exit code 1 if anything differs.
 
-    A deterministic run is executed anew from its scenario and seed. A wall run is replayed robot by
-    robot from the inboxes that it recorded.
+    A deterministic run is executed again from its scenario and seed. A realtime run is replayed robot by
+    robot from its recorded inputs.
 
     Args:
         run: A run folder.

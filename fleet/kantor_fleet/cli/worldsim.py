@@ -1,11 +1,17 @@
 """`kantor worldsim`: its options and their checks."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
-from kantor_fleet.cli.options import check_seed, check_speed, exact_period
+from kantor_fleet.cli.options import (
+    ProcessExchange,
+    check_seed,
+    check_speed,
+    exact_period,
+    recorded,
+)
 from kantor_fleet.exits import Exit, fail
 
 
@@ -17,7 +23,7 @@ def worldsim(
     credentials: Path = Path("credentials"),
     fleet: str | None = None,
     seed: int = 0,
-    exchange: Literal["lockstep", "wall"] = "wall",
+    exchange: ProcessExchange = "realtime",
     speed: float = 1.0,
     start_after: float | None = None,
     out: Path = Path("runs"),
@@ -27,24 +33,25 @@ def worldsim(
     state: Path | None = None,
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = (),  # noqa: A002
 ) -> int:
-    """World-sim by hand: host the bus, wait for the roster, run the mission, record it.
+    """Run world-sim: host the bus, wait for the roster, run the mission and record it.
 
     Args:
         scenario: A packaged name or a TOML file.
         listen: Endpoint of the bus: tcp/HOST:PORT for passwords, tls/HOST:PORT for certificates.
-        credentials: tcp: folder of the passwords; world-sim writes what is missing. tls: what `kantor keys` has
-            made, the folder or world-sim's file.
-        fleet: Name of the fleet in every key, `kantor` by default; certificates are of a fleet already.
+        credentials: tcp: folder of the passwords; world-sim writes missing ones. tls: the folder that `kantor keys`
+            made, or world-sim's file.
+        fleet: Name of the fleet in every key, `kantor` by default; certificates name their fleet.
         seed: Decides every draw.
-        exchange: lockstep: step by step together. wall: every robot on its own clock.
-        speed: wall only: simulated seconds in a real one.
-        start_after: Seconds after which to start without whoever is missing; by default never.
-        out: Where the run folder is made.
+        exchange: lockstep: all step together, batch by batch. realtime: every robot on its own clock; wall is
+            accepted for it.
+        speed: Realtime only: simulated seconds in a real second.
+        start_after: Seconds after which to start without missing participants; by default never.
+        out: Folder in which the run folder is made.
         exact: Also compute the exact Wasserstein distance at the end (needs the extra `exact`).
         chaos: A TOML file of [[faults]] that are added to the scenario's own.
         resume: The folder of a run that was cut short: go on with its mission. Participants that wait
             for it come back by themselves; give the same --listen, --credentials and --fleet.
-        state: A folder in which it notes its run. Started again with it on the same machine (or in the same
+        state: Folder with a pointer to its run. Started again with it on the same machine (or in the same
             container), it goes on with that run if it was cut short.
         set: Override a key of the scenario.
     """
@@ -69,5 +76,15 @@ def worldsim(
     mission = find(scenario, set, chaos)
     every = exact_period(mission, 0, exchange, exact=exact)
     return host_standalone(
-        mission, seed, exchange, speed, listen, credentials, fleet, start_after, out, every, state
+        mission,
+        seed,
+        recorded(exchange),
+        speed,
+        listen,
+        credentials,
+        fleet,
+        start_after,
+        out,
+        every,
+        state,
     )

@@ -1,5 +1,6 @@
-"""Execution of missions: one run as a value, pools of workers, verification of a run folder.
+"""Execution of missions: in this process, as cases in pools of workers, and again from a record.
 
-`mission.py` runs a mission from start to picture, `experiment.py` a case for sweeps and campaigns, `verify.py`
-executes a record again. Start with `mission.py`.
+`in_process_team.py` plays a mission in this process, `experiment.py` runs a case for sweeps and campaigns in the
+processes of `pools.py`, `verify.py` executes a record again; `fork_server.py` has processes start warm. Fleets of
+processes on the bus are in `processes`. Start with `in_process_team.py`.
 """

@@ -27,7 +27,7 @@ _REASON_LETTERS = 300
 
 
 class Case(msgspec.Struct, frozen=True):
-    """What decides a run."""
+    """A run before it is run: everything that decides its result."""
 
     scenario: Scenario
     seed: int
@@ -36,7 +36,7 @@ class Case(msgspec.Struct, frozen=True):
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of a case: a result, or the reason why there is none."""
+    """The outcome of a case: a result, or the reason why there is none."""
 
     result: Result | None = None
     failed: str | None = None
@@ -48,7 +48,7 @@ class Outcome(msgspec.Struct, frozen=True, kw_only=True):
 
 @functools.cache
 def code() -> str:
-    """Digest of the sources that decide what comes of a case, a planner of the user's own among them."""
+    """Digest of the sources that decide the outcome of a case, a user's own planner among them."""
     digest = hashlib.blake2b(digest_size=16)
     for package in (kantor_protocol, kantor_agent, kantor_supervisor, kantor_worldsim):
         for path in sorted(Path(package.__path__[0]).rglob("*.py")):
@@ -57,12 +57,12 @@ def code() -> str:
 
 
 def run_case(case: Case) -> Outcome:
-    """Run a case in this process, with every referee; whatever goes wrong is its outcome."""
+    """Run a case in this process, with every checker; any exception becomes its outcome."""
     started = time.monotonic()
     result, failed = None, None
     try:
         result = _run(case)
-    except Exception as error:  # noqa: BLE001  a run that fails must not take others with it
+    except Exception as error:  # noqa: BLE001  a run that fails must not end others
         failed = reason(error)
     return Outcome(
         result=result,

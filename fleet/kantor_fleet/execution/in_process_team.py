@@ -13,43 +13,44 @@ from kantor_supervisor.density import DensitySupervisor
 from kantor_supervisor.mapping import MappingSupervisor
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Observer, Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.world.world import WorldSetup
 
 
-def team(scenario: Scenario, seed: int, site: WorldSetup) -> dict[ParticipantId, StateMachine]:
-    """Everybody in the roster; whom the scenario has killed can be killed."""
+def team(scenario: Scenario, seed: int, setup: WorldSetup) -> dict[ParticipantId, StateMachine]:
+    """All participants of the roster; a `KillableNode` for each that the scenario kills."""
     killed = {name for fault in scenario.faults if isinstance(fault, Kill) for name in fault.who}
     made: dict[ParticipantId, StateMachine] = {}
-    for name, pose in site.poses(scenario).items():
-        build, body = partial(participant, name, scenario, seed, site), Body(pose)
+    for name, pose in setup.poses(scenario).items():
+        build, body = partial(participant, name, scenario, seed, setup), Body(pose)
         made[name] = KillableNode(build, body) if name in killed else build(body)
     return made
 
 
 def participant(
-    name: ParticipantId, scenario: Scenario, seed: int, site: WorldSetup, body: Body
+    name: ParticipantId, scenario: Scenario, seed: int, setup: WorldSetup, body: Body
 ) -> StateMachine:
-    """One participant as it takes over a body."""
-    frame = site.ground.frame if site.ground is not None else None
+    """The state machine of a participant that takes over a body."""
+    frame = setup.ground.frame if setup.ground is not None else None
     if name == SUPERVISOR:
         if frame is not None:
             return MappingSupervisor(name, scenario, seed, body, frame)
-        return DensitySupervisor(name, scenario, body, site.samples_m.shape[0])
+        return DensitySupervisor(name, scenario, body, setup.samples_m.shape[0])
     if frame is not None:
         return MappingRobot(name, scenario, seed, body, frame)
-    return DensityRobot(name, scenario, seed, body, site.samples_m)
+    return DensityRobot(name, scenario, seed, body, setup.samples_m)
 
 
 def play(
     scenario: Scenario,
     seed: int,
-    site: WorldSetup,
+    setup: WorldSetup,
     observers: Iterable[Observer],
     *,
     machines: Mapping[ParticipantId, StateMachine] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> str:
-    """A mission in this process; why it ended. machines: the team, unless others take its place."""
-    simulation = Simulation(scenario, seed, site, observers)
-    return simulate(simulation, in_process(machines or team(scenario, seed, site)), seed, stopped)
+    """Run a mission in this process; the reason of its end. machines: instead of the scenario's team."""
+    simulation = Simulation(scenario, seed, setup, observers)
+    exchange = InProcessExchange(machines or team(scenario, seed, setup))
+    return simulate(simulation, exchange, seed, stopped, exchange)

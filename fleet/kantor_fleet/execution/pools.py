@@ -1,13 +1,12 @@
-"""Where cases run: in processes of this machine, or on a Dask cluster.
+"""Pools that run cases: in processes of this machine, or on a Dask cluster.
 
 A pool is a generator. It yields every case with its outcome as it completes, in any order, and None
-when nothing has completed for a moment, so that whoever asks stays in charge. Closing it gives up
-what is running.
+when nothing has completed for a moment, so that its caller can look for signals. Closing it ends the
+cases that are running.
 """
 
 import importlib.util
 import logging
-import multiprocessing
 import os
 import shutil
 import signal
@@ -22,6 +21,7 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, NamedTuple
 
 from kantor_fleet.execution.experiment import Case, Outcome, code, reason, run_case
+from kantor_fleet.execution.fork_server import await_fork_server, fork_server
 from kantor_fleet.exits import Exit, fail
 
 if TYPE_CHECKING:
@@ -32,8 +32,8 @@ Work = Callable[[Case], Outcome]
 Pool = Generator[tuple[Case, Outcome] | None]
 
 SLURM = "slurm"
-"""As an address: a Dask cluster of Slurm jobs that is made for the occasion."""
-_GLANCE_S = 0.1
+"""The address of a Dask cluster of Slurm jobs that is started for this command."""
+_POLL_S = 0.1
 _CONNECT_S = 10.0
 
 
@@ -52,7 +52,7 @@ def cores() -> int:
 def pool(
     jobs: int | None = None, address: str | None = None, work: Work = run_case
 ) -> Callable[[Iterable[Case]], Pool]:
-    """What takes cases, as a user asks for it; ends the command if that cannot be."""
+    """The pool that a user asks for, as a function of cases; ends the command if there is none."""
     if jobs is not None and jobs < 1:
         fail(Exit.USAGE, f"--jobs {jobs}: give at least 1")
     if address is None:
@@ -72,9 +72,11 @@ def pool(
 def local(cases: Iterable[Case], jobs: int, work: Work = run_case) -> Pool:
     """Run cases in `jobs` processes of this machine.
 
-    A worker that dies, killed for the memory it took, say, costs nobody but its own case a thing. That
-    case is tried once more at the end, with nothing beside it; if it kills that worker too it has failed.
+    A worker that dies, such as one killed for its use of memory, affects only its own case. That case is tried
+    once more at the end, with no other beside it; if that worker dies too, the case has failed.
     """
+    await_fork_server()
+    yield None  # a caller that was interrupted meanwhile leaves here
     suspects: list[Case] = []
     with closing(_in_processes(cases, jobs, work)) as running:
         for done in running:
@@ -98,13 +100,15 @@ def cluster(
     with _client(address, jobs) as client:
         arrived: SimpleQueue[Future] = SimpleQueue()
         here = code()
-        pending = {client.submit(_run_there, work, case, here, pure=False): case for case in cases}
+        pending = {
+            client.submit(_run_remotely, work, case, here, pure=False): case for case in cases
+        }
         for future in pending:
             future.add_done_callback(arrived.put)
         try:
             while pending:
                 try:
-                    future = arrived.get(timeout=_GLANCE_S)
+                    future = arrived.get(timeout=_POLL_S)
                 except Empty:
                     yield None
                 else:
@@ -113,56 +117,53 @@ def cluster(
             client.cancel(list(pending))
 
 
-class _Done(NamedTuple):
+class _Completed(NamedTuple):
     case: Case
     outcome: Outcome
     died: bool = False
-    """Its worker did, before it could tell."""
+    """The worker died before it had an outcome."""
 
 
-class _Worker:
+class _WorkerProcess:
     """A process that runs one case after another."""
 
     def __init__(self, work: Work) -> None:
-        context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["kantor_fleet.execution.preloaded"])
+        context = fork_server()
         self.pipe, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(theirs, work), daemon=True)
         self._process.start()
         theirs.close()  # so that the pipe ends when the process does
 
-    def finish(self, case: Case) -> _Done:
-        """What came of the case that it was given; call it when the pipe has something."""
+    def finish(self, case: Case) -> _Completed:
+        """The outcome of the case that it was given; call it when the pipe is ready."""
         try:
-            return _Done(case, self.pipe.recv())
+            return _Completed(case, self.pipe.recv())
         except (EOFError, OSError):
             self._process.join()
             code = self._process.exitcode or 0
             how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-            return _Done(case, Outcome(failed=f"its worker died: {how}"), died=True)
+            return _Completed(case, Outcome(failed=f"its worker died: {how}"), died=True)
 
     def kill(self) -> None:
-        """End it, whatever it does."""
+        """End the process at once."""
         self._process.kill()
         self._process.join()
         self.pipe.close()
 
 
-def _in_processes(cases: Iterable[Case], jobs: int, work: Work) -> Generator[_Done | None]:
-    for library in ("OMP", "OPENBLAS", "MKL"):
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")  # a core each
+def _in_processes(cases: Iterable[Case], jobs: int, work: Work) -> Generator[_Completed | None]:
     waiting = iter(cases)
-    idle: list[_Worker] = []
-    busy: dict[object, tuple[_Worker, Case]] = {}  # by the worker's pipe
+    idle: list[_WorkerProcess] = []
+    busy: dict[object, tuple[_WorkerProcess, Case]] = {}  # by the worker's pipe
     try:
         while True:
             for case in islice(waiting, jobs - len(busy)):
-                worker = idle.pop() if idle else _Worker(work)
+                worker = idle.pop() if idle else _WorkerProcess(work)
                 busy[worker.pipe] = worker, case
                 worker.pipe.send(case)
             if not busy:
                 return
-            ready = wait([worker.pipe for worker, _ in busy.values()], _GLANCE_S)
+            ready = wait([worker.pipe for worker, _ in busy.values()], _POLL_S)
             for pipe in ready:
                 worker, case = busy.pop(pipe)
                 done = worker.finish(case)
@@ -179,8 +180,8 @@ def _in_processes(cases: Iterable[Case], jobs: int, work: Work) -> Generator[_Do
 
 
 def _serve(pipe: Connection, work: Work) -> None:
-    """Run cases until the other end is gone."""
-    # The terminal's Ctrl-C reaches everybody; whoever started this process sees to its end.
+    """Run cases until the other end of the pipe is closed."""
+    # Ctrl-C in a terminal reaches all processes; the parent ends this one.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:
@@ -194,7 +195,7 @@ def _client(address: str, jobs: int | None) -> Iterator["Client"]:
     """A connection to a cluster. Raises ClusterError."""
     from distributed import Client  # noqa: PLC0415  an extra
 
-    for name in ("distributed", "distributed.client"):  # what matters is raised
+    for name in ("distributed", "distributed.client"):  # errors that matter are raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         scheduler = stack.enter_context(_slurm(jobs)) if address == SLURM else address
@@ -211,12 +212,14 @@ def _client(address: str, jobs: int | None) -> Iterator["Client"]:
 
 @contextmanager
 def _slurm(jobs: int | None) -> Iterator["SLURMCluster"]:
-    """So many Slurm jobs as a cluster, as the user's jobqueue.yaml has them. Raises ClusterError."""
+    """A cluster of so many Slurm jobs, set up by the user's jobqueue.yaml. Raises ClusterError."""
     from dask_jobqueue import SLURMCluster  # noqa: PLC0415  an extra
 
     if shutil.which("sbatch") is None:
         raise ClusterError("slurm: no sbatch here; run this on a machine that submits jobs")
-    warnings.filterwarnings("ignore", "Port .* is already in use")  # of a page nobody looks at
+    warnings.filterwarnings(
+        "ignore", "Port .* is already in use"
+    )  # the port of the dashboard, which is not used
     try:
         slurm = SLURMCluster()
     except (ValueError, TypeError) as error:
@@ -228,7 +231,7 @@ def _slurm(jobs: int | None) -> Iterator["SLURMCluster"]:
 
 
 async def _submit(slurm: "SLURMCluster", jobs: int) -> str | None:
-    """Submit jobs; unlike `scale` it tells why Slurm does not take them."""
+    """Submit jobs; why Slurm refused them, which `scale` does not report."""
     from distributed import Status  # noqa: PLC0415  an extra
 
     for _ in range(jobs):
@@ -237,20 +240,20 @@ async def _submit(slurm: "SLURMCluster", jobs: int) -> str | None:
         await slurm
     except (RuntimeError, ValueError) as error:
         for job in slurm.workers.values():
-            job.status = Status.failed  # Dask cannot close what it believes to be on its way
+            job.status = Status.failed  # Dask cannot close a job that it believes is starting
         return str(error).rpartition("stderr:")[2].strip()
     return None
 
 
-def _run_there(work: Work, case: Case, here: str) -> Outcome:
-    """What a worker of a cluster does. Raises ClusterError."""
+def _run_remotely(work: Work, case: Case, here: str) -> Outcome:
+    """Run a case on a worker of a cluster, if it has the same sources. Raises ClusterError."""
     if code() != here:
         raise ClusterError(f"{socket.gethostname()}: another kantor; install the same everywhere")
     return work(case)
 
 
 def _collected(future: "Future", address: str) -> Outcome:
-    """What came of a case on a cluster. Raises ClusterError."""
+    """The outcome of a case on a cluster. Raises ClusterError."""
     from distributed import KilledWorker  # noqa: PLC0415  an extra
 
     outcome: Outcome
@@ -264,8 +267,8 @@ def _collected(future: "Future", address: str) -> Outcome:
         raise ClusterError(
             f"{address}: no kantor on a worker ({error}); install it there"
         ) from None
-    except Exception as error:  # noqa: BLE001  whatever Dask makes of a run that fails
-        if future.status != "error":  # the run itself is well; what came of it cannot be had
+    except Exception as error:  # noqa: BLE001  Dask has many for a run that fails
+        if future.status != "error":  # the run itself did not fail; its outcome is lost
             raise ClusterError(f"{address}: the scheduler is gone") from None
         outcome = Outcome(failed=reason(error))
     return outcome

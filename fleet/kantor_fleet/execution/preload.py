@@ -1,6 +1,6 @@
-"""What every process of a local fleet shares: imported and compiled once, in the fork server.
+"""Imports and compiled kernels that every process of a local fleet shares through the fork server.
 
-It opens nothing. Zenoh must not be open in a process that forks.
+It opens nothing: Zenoh must not be open in a process that forks.
 """
 
 import kantor_worldsim.exchange.main  # noqa: F401
@@ -34,7 +34,7 @@ clock = { jitter_s = 0.01 }
 vehicle = { speed_m_s = 20 }
 radio = { drop = 0.1, duplicate = 0.1, jitter_s = 0.01, reorder = 0.1, line_of_sight = true }
 """
-_MANNERS = (
+_VARIANTS = (
     ("merge='ledger'", "samples.diffusion_m=0"),
     ("merge='min'", "samples.diffusion_m=1"),
     ("planner='spectral'", "samples.diffusion_m=1"),
@@ -43,8 +43,8 @@ _MANNERS = (
 
 def warm_up() -> None:
     """Compile every kernel, or load it from the cache, by tiny missions."""
-    for config in _MANNERS:
-        _play(_TINY, [*config, "targets.diffusion_m=1"])
+    for overrides in _VARIANTS:
+        _play(_TINY, [*overrides, "targets.diffusion_m=1"])
     for planner in sorted(MAP_PLANNERS):
         _play(_TINY_MAP, [f"planner='{planner}'"])
 

@@ -1,4 +1,4 @@
-"""`kantor verify`: execute a recorded run again and compare."""
+"""`kantor verify`: check a recorded run, execute it again and compare."""
 
 import json
 from collections.abc import Iterator
@@ -14,6 +14,7 @@ from kantor_protocol.wire.messages import RefusedError
 from kantor_worldsim.engine.process_faults import ProcessFaults
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.record.journal import Digest, file_digest, read
+from kantor_worldsim.record.process_events import TAKE_OVER
 from kantor_worldsim.record.records import (
     Batch,
     Ending,
@@ -27,33 +28,37 @@ from kantor_worldsim.record.records import (
 from kantor_worldsim.record.run_folder import JOURNAL, MANIFEST
 from kantor_worldsim.world.world import World, WorldSetup
 
+_REALTIME = "wall"
+"""The name of the realtime exchange on record."""
+
 
 def verify(folder: Path) -> Exit:
-    """Print a verdict on each thing that can be verified; NOT_MET if any differs."""
-    found = verdicts(folder)
-    for held, line in found:
-        print(f"{'ok  ' if held else 'FAIL'}  {line}")
-    return Exit.DONE if all(held for held, _ in found) else Exit.NOT_MET
+    """Print all findings on a run folder; NOT_MET if one of them is a failure."""
+    return print_findings(findings(folder))
 
 
-def verdicts(folder: Path, records: list[tuple[bytes, Record]] | None = None) -> "list[Verdict]":
-    """A verdict on each thing that can be verified. records: the journal, if it has been read."""
+def print_findings(found: "list[Finding]") -> Exit:
+    """Print a line for each finding; NOT_MET if one of them is a failure."""
+    for passed, line in found:
+        print(f"{'ok  ' if passed else 'FAIL'}  {line}")
+    return Exit.DONE if all(passed for passed, _ in found) else Exit.NOT_MET
+
+
+def findings(folder: Path, records: list[tuple[bytes, Record]] | None = None) -> "list[Finding]":
+    """A finding on the file, on the rules and on the execution. records: the journal, if it has been read."""
     manifest = _manifest(folder)
     records = _journal(folder) if records is None else records
     if not records or not isinstance(records[0][1], Opening):
         return [(False, f"{JOURNAL}: no opening record in it")]
-    found = list(_verdicts_on_file(folder, manifest, records))
+    found = list(_findings_on_file(folder, manifest, records))
     try:
         found += [
-            _verdict_of_checker(manifest, records),
-            _verdict_of_execution(manifest, records),
+            _finding_of_checker(manifest, records),
+            _finding_of_execution(manifest, records),
         ]
-    except (
-        RefusedError,
-        ScenarioError,
-        ValueError,
-    ) as error:  # an opening that nothing can start from
-        found.append((False, f"{JOURNAL}: its opening is no use: {str(error).splitlines()[0]}"))
+    except (RefusedError, ScenarioError, ValueError) as error:
+        problem = str(error).splitlines()[0]
+        found.append((False, f"{JOURNAL}: no run can start from its opening: {problem}"))
     return found
 
 
@@ -77,13 +82,13 @@ def _journal(folder: Path) -> list[tuple[bytes, Record]]:
         fail(Exit.USAGE, f"{folder / JOURNAL}: no such file; give a folder that a run left")
 
 
-Verdict = tuple[bool, str]
-"""Whether it held, and a line about it."""
+Finding = tuple[bool, str]
+"""Whether what was checked is in order, and a line about it."""
 
 
-def _verdicts_on_file(
+def _findings_on_file(
     folder: Path, manifest: dict[str, Any], records: list[tuple[bytes, Record]]
-) -> Iterator[Verdict]:
+) -> Iterator[Finding]:
     if "digest" not in manifest:
         yield True, f"{JOURNAL}: the run was killed; {len(records)} records up to then"
         return
@@ -99,24 +104,24 @@ def _verdicts_on_file(
     yield same, f"digest of {digest.records} records: {digest.hex}"
 
 
-def _verdict_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Verdict:
-    virtual = manifest.get("exchange") != "wall"
+def _finding_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Finding:
+    virtual = manifest.get("exchange") != _REALTIME
     checker = check((record for _, record in records), virtual=virtual)
     if not checker.count:
         return True, "checker: all rules held"
-    return False, f"checker: {checker.count} complaints, first: {checker.complaints[0]}"
+    return False, f"checker: {checker.count} violations, first: {checker.complaints[0]}"
 
 
-def _verdict_of_execution(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Verdict:
+def _finding_of_execution(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Finding:
     opening = records[0][1]
     assert isinstance(opening, Opening)
-    if manifest.get("exchange") == "wall" or any(_chance(opening.scenario, records)):
+    if manifest.get("exchange") == _REALTIME or any(_unscheduled(opening.scenario, records)):
         return _replayed(opening, records)
     return _executed(opening, records)
 
 
-def _chance(scenario: Scenario, records: list[tuple[bytes, Record]]) -> Iterator[bool]:
-    """Of every record whether something happened that no scenario orders."""
+def _unscheduled(scenario: Scenario, records: list[tuple[bytes, Record]]) -> Iterator[bool]:
+    """For each record of processes whether it has an event or an absence that the scenario does not schedule."""
     outages = ProcessFaults(scenario)
     for _, record in records:
         if isinstance(record, ProcessEvent):
@@ -125,8 +130,8 @@ def _chance(scenario: Scenario, records: list[tuple[bytes, Record]]) -> Iterator
             yield not all(outages.dies(name, record.now_ns) for name in record.absent)
 
 
-def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
-    """The whole run anew, in process, record by record."""
+def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> Finding:
+    """Execute the run again in this process, and compare it record by record."""
     scenario, seed = opening.scenario, opening.seed
     world = scenario.map
     from_files = scenario.samples.file or scenario.targets.file or (world and world.file)
@@ -153,9 +158,9 @@ def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
     return True, f"executed again: {compared} records, every byte the same"
 
 
-def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
-    """Every participant anew, each from the inbox that it had."""
-    team = _Team(opening)
+def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Finding:
+    """Step every participant again from its recorded inputs, and compare its outputs."""
+    team = _ReplayedTeam(opening)
     steps = 0
     for _, record in records:
         if isinstance(record, ProcessEvent):
@@ -164,28 +169,24 @@ def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Verdict:
             for step_record in record.step_records:
                 if step_record.outputs is None:
                     continue
+                name, recorded = step_record.name, step_record.outputs
                 try:
                     outputs = team.step(step_record)
                 except (KeyError, RefusedError):
-                    return (
-                        False,
-                        f"replayed: {step_record.name} heard at t={step_record.now_ns} what nobody sent",
-                    )
-                if outputs != step_record.outputs:
-                    return (
-                        False,
-                        f"replayed: {step_record.name} differs at its step {step_record.outputs.step}",
-                    )
+                    line = f"{name} received at t={step_record.now_ns} a message that was not sent"
+                    return False, f"replayed: {line}"
+                if outputs != recorded:
+                    return False, f"replayed: {name} differs at its step {recorded.step}"
                 steps += 1
-            team.mailbag.post(record)
+            team.envelopes.add(record)
     return True, f"replayed: {steps} steps of {team.count} participants, all the same"
 
 
-class _Team:
-    """The participants of a record. A new incarnation takes over the body as the world then knows it."""
+class _ReplayedTeam:
+    """The participants of a record. A new incarnation takes over the body in the state that the world knows."""
 
     def __init__(self, opening: Opening) -> None:
-        self.mailbag = EnvelopeIndex()
+        self.envelopes = EnvelopeIndex()
         self._opening = opening
         self._site = opening.site
         self._world = World(opening.scenario, opening.seed, self._site)
@@ -193,23 +194,23 @@ class _Team:
 
     @property
     def count(self) -> int:
-        """How many have acted, incarnations aside."""
+        """Number of participants that have stepped, without counting incarnations."""
         return len(self._machines)
 
-    def follow(self, incident: ProcessEvent) -> None:
-        """A process that comes back goes on, unless it is another incarnation."""
-        who = incident.who
-        if incident.what not in {"start", "join"} or who == WORLD_SIM:
+    def follow(self, event: ProcessEvent) -> None:
+        """Replace the machine of a process that returns as a new incarnation."""
+        who = event.who
+        if event.kind not in TAKE_OVER or who == WORLD_SIM:
             return
-        if self._world.begin(who, incident.incarnation):
+        if self._world.begin(who, event.incarnation):
             self._machines[who] = self._participant(who)
 
     def step(self, step_record: StepRecord) -> Outputs:
-        """What comes of an act's inputs. Raises KeyError for what nobody sent."""
+        """Outputs of a participant for recorded inputs. Raises KeyError for an envelope that was not sent."""
         name = step_record.name
         if name not in self._machines:
             self._machines[name] = self._participant(name)
-        outputs = self._machines[name].step(self.mailbag.inputs(step_record))
+        outputs = self._machines[name].step(self.envelopes.inputs(step_record))
         self._world.accept(name, step_record.now_ns, outputs)
         return outputs
 

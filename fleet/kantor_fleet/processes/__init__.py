@@ -1,5 +1,6 @@
-"""Processes of a fleet: on this machine, one by one, in containers, and what observes them.
+"""Processes of a fleet: all on this machine, one by one, or in containers; and tools that observe and disturb them.
 
-`local.py` starts and stops a whole fleet, `standalone.py` one process, `compose.py` writes container fleets and
-`chaos.py` injects faults into them. Start with `local.py`.
+`mission.py` is `kantor run`, `local.py` starts and stops a whole fleet, `standalone.py` and `site.py` run one process,
+`compose.py` writes container fleets, `chaos.py` injects faults into them. Algorithms and rules are in the packages
+below. Start with `mission.py`.
 """

@@ -1,6 +1,7 @@
-"""`kantor compose`: a compose file for a fleet, a container and an identity for each.
+"""`kantor compose`: a compose file for a fleet, with a container and an identity for each process.
 
-The text is written as it is to be read. It keeps to what both Compose v2 and docker-compose 1.29 understand.
+The templates below are YAML text as a person reads it, in the subset that both Compose v2 and docker-compose 1.29
+understand.
 """
 
 import os
@@ -15,7 +16,7 @@ NETWORKS_MAX = 25
 """Docker's own address pools have room for about thirty networks."""
 _PORT = 7447
 _USER = 10001
-"""Who runs the containers if the one who prepares them is root."""
+"""User id of the containers if the command is run as root."""
 _ID = "r{}"
 
 _HEAD = """\
@@ -26,7 +27,7 @@ _HEAD = """\
 # KANTOR_SCENARIO   a packaged name, or /runs/FILE.toml for a file in the run folder
 # KANTOR_SET        overrides, such as KANTOR_SET='radio.range_m=300 radio.drop=0.2'
 # KANTOR_SEED, KANTOR_SPEED, KANTOR_RUNS (folder of the runs), KANTOR_KEYS (folder of the identities),
-# KANTOR_USER (uid:gid who owns both), KANTOR_IMAGE
+# KANTOR_USER (uid:gid, the owner of both), KANTOR_IMAGE
 
 x-kantor: &kantor
   image: ${{KANTOR_IMAGE:-kantor}}
@@ -64,7 +65,7 @@ _WORLDSIM = """\
 _KEYS = """\
   keys:  # makes the identities: docker-compose run --rm keys
     <<: *kantor
-    command: keys kantor --robots {robots}{people} --host worldsim --out /keys
+    command: keys kantor --robots {robots}{supervisor} --host worldsim --out /keys
     restart: "no"
     network_mode: none
     volumes: ["${{KANTOR_KEYS:-./keys}}:/keys"]
@@ -81,7 +82,7 @@ _PARTICIPANT = """\
 
 
 class ComposeConfig(NamedTuple):
-    """Which fleet. hub: an endpoint where a world-sim listens; without one, world-sim is in the file."""
+    """The fleet of a compose file. hub: endpoint of a world-sim elsewhere; without it, world-sim is in the file."""
 
     robots: int
     supervisor: bool = False
@@ -92,7 +93,7 @@ class ComposeConfig(NamedTuple):
 
 
 def compose(config: ComposeConfig, file: Path) -> Exit:
-    """Write a fleet's compose file, and beside it what it needs. Raises BusError, ScenarioError, OSError."""
+    """Write a compose file, and beside it the folders and `.env` that it needs. Raises BusError, ScenarioError, OSError."""
     _check(config)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(text(config), encoding="utf-8")
@@ -126,13 +127,13 @@ def _check(config: ComposeConfig) -> None:
 
 
 def text(config: ComposeConfig) -> str:
-    """The file. The supervisor stands in a profile of its own, `centralized`."""
+    """The text of the file. The supervisor has a profile of its own, `centralized`."""
     connect = config.hub or f"tls/worldsim:{_PORT}"
     protocol, _, place = connect.partition("/")
     port = place.rpartition(":")[2]
     robots = [_ID.format(i) for i in range(1, config.robots + 1)]
-    people = [*robots, *(["supervisor"] if config.supervisor else [])]
-    networks = people if config.isolated else ["fleet"]
+    participants = [*robots, *(["supervisor"] if config.supervisor else [])]
+    networks = participants if config.isolated else ["fleet"]
     parts = [_HEAD.format(title=_title(config), command=_up(config), port=port), "\nservices:\n"]
     if config.hub is None:
         overrides = " ".join(config.overrides)
@@ -146,8 +147,8 @@ def text(config: ComposeConfig) -> str:
                 networks=", ".join(networks),
             )
         )
-        parts.append(_KEYS.format(robots=config.robots, people=_people(config)))
-    for name in people:
+        parts.append(_KEYS.format(robots=config.robots, supervisor=_supervisor_option(config)))
+    for name in participants:
         verb = name if name == "supervisor" else f"agent {name}"
         network = name if config.isolated else "fleet"
         parts.append(_PARTICIPANT.format(name=name, verb=verb, connect=connect, network=network))
@@ -155,8 +156,8 @@ def text(config: ComposeConfig) -> str:
             parts.append("    depends_on: [worldsim]\n")
             if name == "supervisor":
                 parts.append("    profiles: [centralized]\n")
-    owners = people if config.hub else ["worldsim", *people]
-    # Nobody in a fleet has any business beyond it, unless its hub is there.
+    owners = participants if config.hub else ["worldsim", *participants]
+    # Containers reach nothing beyond their networks, unless the hub is there.
     inside = "internal: false" if config.hub else "internal: true"
     secrets = "".join(
         f'  {who}: {{file: "${{KANTOR_KEYS:-./keys}}/{who}.toml"}}\n' for who in owners
@@ -167,12 +168,12 @@ def text(config: ComposeConfig) -> str:
 
 
 def _title(config: ComposeConfig) -> str:
-    whose = "" if config.hub is None else f", which world-sim at {config.hub} awaits"
+    hub = "" if config.hub is None else f", for world-sim at {config.hub}"
     apart = ", each on a network of its own with world-sim" if config.isolated else ""
-    return f"{config.robots} robots in containers{apart}{whose}. Written by `kantor compose`."
+    return f"{config.robots} robots in containers{apart}{hub}. Written by `kantor compose`."
 
 
-def _people(config: ComposeConfig) -> str:
+def _supervisor_option(config: ComposeConfig) -> str:
     return " --supervisor" if config.supervisor else ""
 
 
@@ -183,10 +184,10 @@ def _up(config: ComposeConfig) -> str:
 
 
 def prepare(folder: Path) -> str:
-    """Make the folders of the runs and of the identities, and `.env`, which says who runs the containers; who that is.
+    """Make the folders of runs and identities, and `.env` with the user of the containers; that user as UID:GID.
 
-    Identities are for their owner's eyes only and the run folder is the user's, so containers run as the user; never
-    as root.
+    Identities are readable by their owner only and the run folder belongs to the user, so containers run as the user,
+    never as root.
     """
     root = os.getuid() == 0
     user = f"{_USER}:{_USER}" if root else f"{os.getuid()}:{os.getgid()}"

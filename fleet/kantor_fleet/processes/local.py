@@ -38,9 +38,8 @@ from kantor_protocol.transport.session import BusError
 from kantor_protocol.transport.zenoh_log import init_log
 from kantor_protocol.wire import keys
 from kantor_protocol.wire.messages import Progress, RefusedError, decode_progress
-from kantor_worldsim.exchange.config import MissionConfig, late
-from kantor_worldsim.exchange.process_control import ProcessCommand as Deed
-from kantor_worldsim.exchange.process_control import ProcessController
+from kantor_worldsim.exchange.config import MissionConfig, late_participants
+from kantor_worldsim.exchange.process_control import CommandKind, ProcessCommand, ProcessController
 from kantor_worldsim.record.run_folder import RESULT
 
 FLEET = "kantor"
@@ -99,7 +98,7 @@ class Fleet:
         self._frozen: set[ParticipantId] = set()
         self._impostors: dict[ParticipantId, tuple[ForkServerProcess, float]] = {}
         self.world_sim = self._start_world_sim(resume=False)
-        absent = set(late(config.scenario))
+        absent = set(late_participants(config.scenario))
         self.participants: dict[ParticipantId, ForkServerProcess] = {
             name: self._start_participant(name, name)
             for name in config.scenario.roster
@@ -196,31 +195,31 @@ class Fleet:
                 self.participants[name].kill()
             processes = [self.world_sim, *self.participants.values()]
             processes += [process for process, _ in self._impostors.values()]
-            for step_record in (None, "terminate", "kill"):
+            for act in (None, "terminate", "kill"):
                 for process in processes:
-                    if step_record is not None and process.exitcode is None:
-                        getattr(process, step_record)()
+                    if act is not None and process.exitcode is None:
+                        getattr(process, act)()
                 give_up = time.monotonic() + _GOODBYE_S
                 for process in processes:
                     process.join(max(0.0, give_up - time.monotonic()))
         if (self._config.folder / RESULT).exists():
             shutil.rmtree(self._state, ignore_errors=True)
 
-    # Hands.
+    # Commands of world-sim.
 
     def _serve(self, pipe: Connection, process: ForkServerProcess) -> None:
-        """Carry out what a world-sim process orders, as long as it lives."""
+        """Carry out the commands of a world-sim process, as long as it lives."""
         with contextlib.suppress(EOFError, OSError), pipe:
             while True:
-                deed: Deed = pipe.recv()
-                if deed.what == "restart":
-                    self._restart(process, deed.after_s)
+                command: ProcessCommand = pipe.recv()
+                if command.kind is CommandKind.RESTART_WORLD_SIM:
+                    self._restart(process, command.after_s)
                     return
-                if deed.what == "rest":
-                    self._rest(process, deed.after_s)
+                if command.kind is CommandKind.REST_WORLD_SIM:
+                    self._rest(process, command.after_s)
                     pipe.send(None)
                 else:
-                    pipe.send(self._carry_out(deed))
+                    pipe.send(self._carry_out(command))
 
     def _restart(self, process: ForkServerProcess, after_s: float) -> None:
         with self._lock:
@@ -237,24 +236,27 @@ class Fleet:
         self._stopping.wait(after_s)
         os.kill(process.pid or 0, signal.SIGCONT)
 
-    def _carry_out(self, deed: Deed) -> bool | None:
-        name = deed.who
+    def _carry_out(self, command: ProcessCommand) -> bool | None:
+        """Carry out a command to a participant's process; the answer."""
+        name = command.who
         with self._lock:
-            if deed.what == "refused":
-                return self._impostor_refused(name)
-            if deed.what == "pretend":
-                impostor = self._start_participant(name, f"{name}-impostor")
-                self._impostors[name] = impostor, time.monotonic()
-                return None
-            if deed.what in {"kill", "start"}:
-                self._kill(name)
-            if deed.what == "start":
-                self._see_to_disk(deed)
-                self.participants[name] = self._start_participant(name, name)
-                self._excused.discard(name)
-            process = self.participants.get(name)
-            if process is not None and process.exitcode is None:
-                self._act_on(process.pid or 0, deed)
+            match command.kind:
+                case CommandKind.IS_IMPOSTOR_REFUSED:
+                    return self._impostor_refused(name)
+                case CommandKind.START_IMPOSTOR:
+                    impostor = self._start_participant(name, f"{name}-impostor")
+                    self._impostors[name] = impostor, time.monotonic()
+                case CommandKind.KILL:
+                    self._kill(name)
+                case CommandKind.START:
+                    self._kill(name)
+                    self._damage_log(command)
+                    self.participants[name] = self._start_participant(name, name)
+                    self._excused.discard(name)
+                case _:
+                    process = self.participants.get(name)
+                    if process is not None and process.exitcode is None:
+                        self._act_on(process.pid or 0, command)
         return None
 
     def _kill(self, name: ParticipantId) -> None:
@@ -265,28 +267,34 @@ class Fleet:
             process.kill()
             process.join()
 
-    def _see_to_disk(self, deed: Deed) -> None:
-        path = self._state / f"{deed.who}.diary"
+    def _damage_log(self, command: ProcessCommand) -> None:
+        """Leave of a participant's write-ahead log what the fault leaves."""
+        path = self._log_of(command.who)
         with contextlib.suppress(FileNotFoundError):
-            if deed.disk == "lost":
+            if command.disk == "lost":
                 path.unlink()
-            elif deed.disk == "torn":
-                wal.tear(path, deed.step)
+            elif command.disk == "torn":
+                wal.tear(path, command.step)
 
-    def _act_on(self, pid: int, deed: Deed) -> None:
-        """What can be done to a process that lives."""
-        if deed.what == "freeze":
-            os.kill(pid, signal.SIGSTOP)
-            self._frozen.add(deed.who)
-        elif deed.what == "thaw":
-            os.kill(pid, signal.SIGCONT)
-            self._frozen.discard(deed.who)
-        elif deed.what in {"fill", "free"}:
-            _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
-            path = self._state / f"{deed.who}.diary"
-            size = path.stat().st_size if path.exists() else 0
-            room = hard if deed.what == "free" else size + _SPARE_BYTES
-            resource.prlimit(pid, resource.RLIMIT_FSIZE, (room, hard))
+    def _act_on(self, pid: int, command: ProcessCommand) -> None:
+        """Carry out a command to a process that lives."""
+        match command.kind:
+            case CommandKind.FREEZE:
+                os.kill(pid, signal.SIGSTOP)
+                self._frozen.add(command.who)
+            case CommandKind.THAW:
+                os.kill(pid, signal.SIGCONT)
+                self._frozen.discard(command.who)
+            case CommandKind.FILL_DISK | CommandKind.FREE_DISK:
+                _, hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)
+                path = self._log_of(command.who)
+                size = path.stat().st_size if path.exists() else 0
+                free = command.kind is CommandKind.FREE_DISK
+                room = hard if free else size + _SPARE_BYTES
+                resource.prlimit(pid, resource.RLIMIT_FSIZE, (room, hard))
+
+    def _log_of(self, name: ParticipantId) -> Path:
+        return self._state / f"{name}.diary"
 
     def _impostor_refused(self, name: ParticipantId) -> bool | None:
         impostor, since_s = self._impostors[name]
@@ -354,8 +362,8 @@ def _be_world_sim(
             return
         except ResumeError:  # nothing has happened yet
             past = None
-    site = WorldSetup.of(scenario, seed) if past is None else past.opening.site
-    plan = MissionConfig(scenario, seed, site, config.exchange, config.speed)
+    setup = WorldSetup.of(scenario, seed) if past is None else past.opening.site
+    mission = MissionConfig(scenario, seed, setup, config.exchange, config.speed)
     identity = credentials.find(secrets, credentials.HOST)
     users = credentials.users_file(secrets)
     # The terminal and the parent may both say so: one Ctrl-C must not count as two.
@@ -375,7 +383,13 @@ def _be_world_sim(
                 )
                 say(f"run {recording.run}" + (", resumed" if past is not None else ""))
                 result = run(
-                    host, plan, recording, interrupts, past=past, hands=_hands(pipe), say=say
+                    host,
+                    mission,
+                    recording,
+                    interrupts,
+                    past=past,
+                    controller=_controller(pipe),
+                    say=say,
                 )
         except BusError as error:
             say(str(error))
@@ -395,15 +409,15 @@ def _host(identity: Identity, listen: str, users: Path, scenario: Scenario) -> H
             time.sleep(0.02)
 
 
-def _hands(pipe: Connection) -> ProcessController:
-    """World-sim's end of the hands."""
+def _controller(pipe: Connection) -> ProcessController:
+    """World-sim's end of the pipe that carries commands."""
 
-    def config(deed: Deed) -> bool | None:
-        pipe.send(deed)
+    def carry_out(command: ProcessCommand) -> bool | None:
+        pipe.send(command)
         answer: bool | None = pipe.recv()
         return answer
 
-    return config
+    return carry_out
 
 
 def _be_participant(

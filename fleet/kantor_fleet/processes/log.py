@@ -1,4 +1,4 @@
-"""Logs of processes: JSON lines, one file each."""
+"""Logs of processes: a file of JSON lines each."""
 
 import os
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import structlog
 
 
 def log_to(path: Path, process: str) -> Callable[[str], None]:
-    """Send everything that this process prints to a file, and return a line-by-line log into it."""
+    """Redirect all output of this process to a file, and return a function that logs a line there."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     os.dup2(descriptor, 1)
     os.dup2(descriptor, 2)
@@ -21,7 +21,7 @@ def log_to(path: Path, process: str) -> Callable[[str], None]:
         ],
     ).bind(process=process, pid=os.getpid())
 
-    def say(line: str) -> None:
+    def log(line: str) -> None:
         logger.msg(line)
 
-    return say
+    return log

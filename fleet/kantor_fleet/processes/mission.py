@@ -1,8 +1,9 @@
-"""`kantor run`: a mission from start to picture."""
+"""`kantor run`: a mission from its start to its picture."""
 
 import time
 from pathlib import Path
 
+from kantor_fleet.execution.fork_server import await_fork_server
 from kantor_fleet.execution.in_process_team import play
 from kantor_fleet.execution.preload import warm_up
 from kantor_fleet.exits import Exit, warn
@@ -18,15 +19,15 @@ from kantor_worldsim.record.records import Record
 from kantor_worldsim.record.run_folder import folder_for
 from kantor_worldsim.world.world import WorldSetup
 
-_GLANCE_S = 0.2
+_SHOW_S = 0.2
 
 
 def run(
     scenario: Scenario, seed: int, exchange: str, speed: float, out: Path, exact_every: int | None
 ) -> Exit:
-    """Run a mission and leave its folder; what to exit with. Raises ScenarioError, BusError, OSError.
+    """Run a mission and leave its run folder; the exit code. Raises ScenarioError, BusError, OSError.
 
-    exact_every: see Metrics.
+    exchange: its name on record. exact_every: periods between exact distances, 0 for the end only.
     """
     site = WorldSetup.of(scenario, seed)
     warn(site.warnings)
@@ -47,15 +48,15 @@ def _run_in_process(
 ) -> Exit:
     with ProgressView(scenario.name) as view:
         warm_up()
-        glanced = time.monotonic()
+        shown_s = time.monotonic()
 
-        def snapshot(_record: Record) -> None:
-            nonlocal glanced
-            if time.monotonic() - glanced >= _GLANCE_S:
-                glanced = time.monotonic()
+        def show(_record: Record) -> None:
+            nonlocal shown_s
+            if time.monotonic() - shown_s >= _SHOW_S:
+                shown_s = time.monotonic()
                 view.show(progress(recording.metrics, scenario, "running", ""))
 
-        reason = play(scenario, seed, site, [recording.observe, snapshot], stopped=interrupts)
+        reason = play(scenario, seed, site, [recording.observe, show], stopped=interrupts)
         view.show(progress(recording.metrics, scenario, "over", reason))
     return verdict(recording.finish())
 
@@ -63,22 +64,22 @@ def _run_in_process(
 def _run_processes(config: FleetConfig, interrupts: Interrupts) -> Exit:
     with ProgressView(config.scenario.name) as view:
         view.note("starting the fleet (the first time, kernels are compiled: about half a minute)")
-        warm_up()
+        await_fork_server()
         if interrupts():
             return Exit.INTERRUPTED
         with local_fleet(config) as fleet:
-            asked = False
+            stopping = False
             try:
                 for message in watch_progress(fleet):
                     if message is not None:
                         view.show(message)
                     for name, failure in fleet.newly_failed():
-                        view.note(f"{name} ended with {_told(failure)}; the others go on")
+                        view.note(f"{name} ended with {_cause(failure)}; the others go on")
                     if (ended := fleet.revive()) is not None:
                         view.note(f"world-sim ended with {ended}; it goes on from its record")
                     waiting = message is not None and message.phase == "waiting"
-                    if not asked and (interrupts() or (waiting and fleet.deserted)):
-                        asked = True
+                    if not stopping and (interrupts() or (waiting and fleet.deserted)):
+                        stopping = True
                         view.note("ending the mission")
                         fleet.stop()
             except BusError:
@@ -92,5 +93,5 @@ def _run_processes(config: FleetConfig, interrupts: Interrupts) -> Exit:
     return Exit.PROCESS_FAILED if failed else verdict(result)
 
 
-def _told(code: int) -> str:
+def _cause(code: int) -> str:
     return f"signal {-code}" if code < 0 else f"exit code {code}"

@@ -1,7 +1,7 @@
-"""A world-sim that its engine starts again whenever it dies: which run it is in.
+"""The pointer to the current run of a world-sim that a container engine or systemd starts again when it dies.
 
-Its state folder names the run and the machine. A container is a machine of its own: the same one, started again, goes
-on with its run, and a new one begins another.
+The pointer is in its state folder and names the run and the machine. A container is a machine of its own: the same
+container, started again, goes on with its run; a new one begins another.
 """
 
 import socket
@@ -12,23 +12,23 @@ import msgspec
 _FILE = "worldsim.json"
 
 
-class _Standing(msgspec.Struct, frozen=True):
+class _ResumePointer(msgspec.Struct, frozen=True):
     machine: str
     run: str
 
 
 def note(state: Path, run: Path) -> None:
-    """This machine is in this run. Raises OSError."""
+    """Point to the run that this machine is in. Raises OSError."""
     state.mkdir(parents=True, exist_ok=True)
     draft = state / f".{_FILE}"
-    draft.write_bytes(msgspec.json.encode(_Standing(socket.gethostname(), str(run))))
+    draft.write_bytes(msgspec.json.encode(_ResumePointer(socket.gethostname(), str(run))))
     draft.replace(state / _FILE)
 
 
 def run_in(state: Path) -> Path | None:
-    """The run that this machine was last in, if any."""
+    """The run that this machine was in, if any."""
     try:
-        standing = msgspec.json.decode((state / _FILE).read_bytes(), type=_Standing)
+        pointer = msgspec.json.decode((state / _FILE).read_bytes(), type=_ResumePointer)
     except (OSError, msgspec.MsgspecError):
         return None
-    return Path(standing.run) if standing.machine == socket.gethostname() else None
+    return Path(pointer.run) if pointer.machine == socket.gethostname() else None

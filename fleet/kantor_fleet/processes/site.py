@@ -1,4 +1,4 @@
-"""A site: the router of the robots of one place."""
+"""`kantor site`: the router for the robots of one place."""
 
 from pathlib import Path
 
@@ -11,35 +11,35 @@ from kantor_protocol.transport.events import Joined, Left
 from kantor_protocol.transport.router import SiteRouter
 from kantor_protocol.transport.zenoh_log import host_log
 
-_LOOK_S = 0.2
-"""From one look at the connection to the next."""
+_POLL_S = 0.2
+"""From one check of the connection to the next."""
 
 
-def serve(name: str, connect: str, listen: str, place: Path, patience_s: float) -> Exit:
-    """Serve the site until a signal comes. Raises BusError, CredentialsError."""
+def serve(name: str, connect: str, listen: str, place: Path, connect_timeout_s: float) -> Exit:
+    """Serve the site until a signal arrives. Raises BusError, CredentialsError."""
     identity = credentials.find(place, f"site-{name}")
     for endpoint in (connect, listen):
         check_endpoint(endpoint, identity)
     if not isinstance(identity, Certificate):
         fail(Exit.USAGE, f"{place}: a password; a site needs a certificate of `kantor keys --site`")
     with (
-        host_log(identity, _say),
+        host_log(identity, _log),
         Interrupts() as interrupts,
-        SiteRouter(identity, connect, listen, patience_s, _say) as site,
+        SiteRouter(identity, connect, listen, connect_timeout_s, _log) as site,
     ):
-        _say(f"site {name} at {listen}, for {', '.join(site.members)}")
+        _log(f"site {name} at {listen}, for {', '.join(site.members)}")
         connected = False
         while not interrupts():
             if site.connected is not connected:
                 connected = not connected
-                _say(f"{connect}: {'connected' if connected else 'not there'}")
-            event = site.next(_LOOK_S)
+                _log(f"{connect}: {'connected' if connected else 'not there'}")
+            event = site.next(_POLL_S)
             if isinstance(event, Joined):
-                _say(f"{event.name} is here")
+                _log(f"{event.name} is here")
             elif isinstance(event, Left):
-                _say(f"{event.name} has left")
+                _log(f"{event.name} has left")
     return interrupts.code or Exit.DONE
 
 
-def _say(line: str) -> None:
+def _log(line: str) -> None:
     print(line, flush=True)

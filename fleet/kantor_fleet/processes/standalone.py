@@ -44,11 +44,11 @@ def host_standalone(
     exact_every: int | None,
     state: Path | None = None,
 ) -> Exit:
-    """World-sim in this terminal, for a new run. Raises ScenarioError, BusError, OSError.
+    """Run world-sim in this terminal, for a new run. Raises ScenarioError, BusError, OSError.
 
-    state: where it notes which run it is in.
+    exchange: its name on record. state: the folder of the pointer to the run.
     """
-    from kantor_worldsim.exchange.config import MissionConfig  # noqa: PLC0415  robots by hand do not need these
+    from kantor_worldsim.exchange.config import MissionConfig  # noqa: PLC0415  standalone robots do not need these
     from kantor_worldsim.observers.recording import Recording  # noqa: PLC0415
     from kantor_worldsim.record.run_folder import folder_for  # noqa: PLC0415
     from kantor_worldsim.world.world import WorldSetup  # noqa: PLC0415
@@ -68,7 +68,7 @@ def host_standalone(
 
 
 def resume_standalone(folder: Path, listen: str, secrets: Path, fleet: str | None) -> Exit:
-    """World-sim in this terminal, for a run that was cut short. Raises BusError, OSError."""
+    """Run world-sim in this terminal, for a run that was cut short. Raises BusError, OSError."""
     from kantor_worldsim.record.run_folder import Past, ResumeError  # noqa: PLC0415
 
     try:
@@ -95,9 +95,9 @@ def _go_on(folder: Path, past: "Past", listen: str, secrets: Path, fleet: str | 
 
 
 def go_on_standalone(state: Path, listen: str, secrets: Path, fleet: str | None) -> Exit | None:
-    """World-sim in this terminal, for the run that it is in; None if another is to begin.
+    """Run world-sim in this terminal, for the run that its state folder points to; None if a new run is to begin.
 
-    A mission that was not met is not tried again: whoever starts failed processes anew would do so for ever.
+    A mission that was not met is not run again: a container engine would restart it for ever.
     """
     from kantor_fleet.report.summary import conclude, read_result, verdict  # noqa: PLC0415
     from kantor_worldsim.record.run_folder import REPORT, OverError, Past, ResumeError  # noqa: PLC0415
@@ -110,13 +110,13 @@ def go_on_standalone(state: Path, listen: str, secrets: Path, fleet: str | None)
     except OverError as over:
         result = read_result(folder)
         code = Exit.PROCESS_FAILED if result is None else verdict(result)
-        if not (folder / REPORT).exists():  # killed on its last steps
+        if not (folder / REPORT).exists():  # world-sim was killed after the end of the mission
             conclude(folder)
             return code
         if code is not Exit.DONE:
-            warn([f"{over}, and was not met; a new container begins another"])
+            warn([f"{over}, and was not met; a new container begins another run"])
         return code or None
-    except ResumeError:  # nothing has happened in it
+    except ResumeError:  # no step was recorded
         return None
     return _go_on(folder, past, listen, secrets, fleet)
 
@@ -125,7 +125,10 @@ def _check_faults(scenario: Scenario, exchange: str) -> None:
     from kantor_worldsim.exchange.config import needs_process_control  # noqa: PLC0415
 
     if (fault := needs_process_control(scenario, exchange)) is not None:
-        fail(Exit.USAGE, f"{fault}: nobody here can do that to processes; use `kantor run`")
+        fail(
+            Exit.USAGE,
+            f"{fault}: needs control over the processes of participants; use `kantor run`",
+        )
 
 
 def _host(
@@ -136,8 +139,8 @@ def _host(
     record: "Callable[[], tuple[Path, Recording]]",
     past: "Past | None" = None,
 ) -> Exit:
-    """Host a mission. record: opens the run folder, once the bus is there."""
-    from kantor_fleet.execution.preload import warm_up  # noqa: PLC0415  robots by hand do not need these
+    """Host a mission. record: opens the run folder once the bus is up."""
+    from kantor_fleet.execution.preload import warm_up  # noqa: PLC0415  standalone robots do not need these
     from kantor_fleet.report.progress import ProgressView  # noqa: PLC0415
     from kantor_fleet.report.summary import conclude, read_result, verdict  # noqa: PLC0415
     from kantor_worldsim.exchange.main import run  # noqa: PLC0415
@@ -145,7 +148,7 @@ def _host(
     scenario = plan.scenario
     identity = _host_identity(listen, secrets, fleet, scenario)
     with (
-        host_log(identity, lambda line: view.note(line)),  # noqa: PLW0108  view comes later
+        host_log(identity, lambda line: view.note(line)),  # noqa: PLW0108  view is defined below
         Interrupts() as interrupts,
         ProgressView(scenario.name) as view,
     ):
@@ -157,7 +160,7 @@ def _host(
             for name in scenario.roster:
                 view.note(f"  {_joining(name, listen, secrets)}")
             run(host, plan, recording, interrupts, view.show, past, say=view.note)
-    with Interrupts(patient=True):  # what comes when the mission is over changes nothing
+    with Interrupts(patient=True):  # the mission is over, and its code is decided
         conclude(folder)
     result = read_result(folder)
     if result is not None and result.ended == "done":
@@ -166,18 +169,18 @@ def _host(
 
 
 def _joining(name: ParticipantId, listen: str, secrets: Path) -> str:
-    """The command with which a participant joins, where it is: a host may listen at any address that it has there."""
+    """The command with which a participant joins from its machine, with HOST for an unspecified address."""
     verb = name if name == SUPERVISOR else f"agent {name}"
     endpoint = listen.replace("/0.0.0.0:", "/HOST:").replace("/[::]:", "/HOST:")
     own = secrets if secrets.is_dir() else secrets.with_name(f"{name}.toml")
-    file = own if own.exists() else own.name  # it is with the robot
+    file = own if own.exists() else own.name  # it is on the robot's machine
     return f"kantor {verb} --connect {endpoint} --credentials {file}"
 
 
 def _host_identity(listen: str, place: Path, fleet: str | None, scenario: Scenario) -> Identity:
-    """World-sim's identity, for a mission with this roster. Raises BusError, CredentialsError.
+    """World-sim's identity for a mission with this roster. Raises BusError, CredentialsError.
 
-    Passwords are made here; certificates never are.
+    Missing passwords are issued here; certificates never are.
     """
     if not is_tls(listen):
         name = fleet or _FLEET
@@ -192,22 +195,22 @@ def _host_identity(listen: str, place: Path, fleet: str | None, scenario: Scenar
         fail(
             Exit.USAGE, f"--fleet {fleet}: {place} is of fleet {identity.fleet}; leave --fleet out"
         )
-    _check_register(identity, scenario, place)
+    _check_members(identity, scenario, place)
     warn(identity.warnings((*scenario.roster, credentials.OBSERVER), datetime.now(UTC)))
     return identity
 
 
-def _check_register(identity: Certificate, scenario: Scenario, place: Path) -> None:
-    """Everybody who takes part must have a certificate, or have had one. Raises CredentialsError."""
+def _check_members(identity: Certificate, scenario: Scenario, place: Path) -> None:
+    """Check that every participant has a certificate, or had one that was revoked. Raises CredentialsError."""
     withdrawn = {name.partition(".")[0] for name in identity.revoked}
     missing = [name for name in scenario.roster if name not in identity.members]
     for name in missing:
         if name not in withdrawn:
-            wanted = "--supervisor" if name == SUPERVISOR else f"--robots {len(scenario.robot_ids)}"
+            option = "--supervisor" if name == SUPERVISOR else f"--robots {len(scenario.robot_ids)}"
             raise CredentialsError(
-                f"{place}: the register has no {name}; `kantor keys {identity.fleet} {wanted}`"
+                f"{place}: the register has no {name}; `kantor keys {identity.fleet} {option}`"
             )
-    warn(f"{name} is revoked and will not be let in" for name in missing)
+    warn(f"{name} is revoked and will be refused" for name in missing)
 
 
 def participate_standalone(
@@ -215,22 +218,22 @@ def participate_standalone(
     name: ParticipantId,
     connect: str,
     place: Path,
-    patience_s: float,
+    connect_timeout_s: float,
     state: Path,
 ) -> Exit:
-    """A participant in this terminal. Raises BusError, CredentialsError."""
-    # A robot may start before world-sim, which writes the passwords: look for them when it is up.
+    """Run a participant in this terminal. Raises BusError, CredentialsError."""
+    # A robot may start before world-sim, which writes the passwords: read them once it is up.
     if not is_tls(connect) and (not place.exists() or place.is_dir()):
-        await_endpoint(connect, patience_s)
+        await_endpoint(connect, connect_timeout_s)
     identity = credentials.find(place, name)
     init_log()
 
-    def say(line: str) -> None:
+    def log(line: str) -> None:
         print(line, flush=True)
 
     try:
-        reason = run(connect, identity, patience_s, say, state)
+        reason = run(connect, identity, connect_timeout_s, log, state)
     except (RejectedError, StateError) as error:
         fail(Exit.USAGE, str(error))
-    say(f"{name}: mission over: {reason}")
+    log(f"{name}: mission over: {reason}")
     return Exit.DONE

@@ -1,4 +1,4 @@
-"""`kantor tap`: what goes over the bus, decoded with plain msgpack, independently of kantor's codec."""
+"""`kantor tap`: messages on the bus, decoded with plain msgpack, independently of kantor's codec."""
 
 import sys
 import time
@@ -20,21 +20,23 @@ _BYTES_SHOWN = 24
 _ITEMS_SHOWN = 12
 
 
-def tap(connect: str, place: Path, only: frozenset[str], count: int, patience_s: float) -> Exit:
-    """Print messages until interrupted or `count` were printed. Raises BusError, CredentialsError."""
+def tap(
+    connect: str, place: Path, only: frozenset[str], count: int, connect_timeout_s: float
+) -> Exit:
+    """Print messages until a signal arrives or `count` were printed. Raises BusError, CredentialsError."""
     if only - KINDS:
         known = ", ".join(sorted(KINDS))
         fail(Exit.USAGE, f"--only {', '.join(sorted(only - KINDS))}: use {known}")
     check_endpoint(connect)
     if not place.exists() or place.is_dir():
-        await_endpoint(connect, patience_s)
+        await_endpoint(connect, connect_timeout_s)
     identity = credentials.find(place, credentials.OBSERVER)
     init_log()
     everything = keys.everything(identity.fleet)
     started, printed = time.monotonic(), 0
     with (
         Interrupts() as interrupts,
-        observer_session(connect, identity, everything, patience_s) as watch,
+        observer_session(connect, identity, everything, connect_timeout_s) as watch,
     ):
         while not interrupts() and (not count or printed < count):
             message = watch.next(0.2)
@@ -51,7 +53,7 @@ def tap(connect: str, place: Path, only: frozenset[str], count: int, patience_s:
 
 
 def describe(payload: bytes) -> str:
-    """A message as one line: its size, and its content as msgpack says."""
+    """A message as one line: its size, and its content as msgpack decodes it."""
     try:
         content = msgpack.unpackb(payload, strict_map_key=False)
     except (ValueError, msgpack.UnpackException, RecursionError) as error:
@@ -60,9 +62,9 @@ def describe(payload: bytes) -> str:
 
 
 def _shown(value: Any) -> str:
-    """A value, shortened where it is long; radio bodies are opened."""
+    """A value as text, shortened where it is long; radio bodies are decoded too."""
     if isinstance(value, bytes):
-        inner = _opened(value)
+        inner = _radio_body(value)
         if inner is not None:
             return f"<{_shown(inner)}>"
         more = f"…({len(value)} B)" if len(value) > _BYTES_SHOWN else ""
@@ -76,8 +78,8 @@ def _shown(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else repr(value)
 
 
-def _opened(value: bytes) -> list[Any] | None:
-    """A radio body in an envelope: an array that begins with a tag and a version."""
+def _radio_body(value: bytes) -> list[Any] | None:
+    """The decoded body of an envelope, an array that begins with a tag and a version; None for other bytes."""
     try:
         inner = msgpack.unpackb(value, strict_map_key=False)
     except (ValueError, msgpack.UnpackException, RecursionError):

@@ -89,7 +89,7 @@ class Outage(NamedTuple):
 _ENDS = {"start", "resume", "free", "join"}
 
 
-class Run:
+class RunHistory:
     """What the picture needs to know of a run."""
 
     def __init__(self, opening: Opening) -> None:
@@ -118,7 +118,7 @@ class Run:
         self.metrics.observe(opening)
 
     @classmethod
-    def of(cls, records: Iterable[Record]) -> "Run | None":
+    def of(cls, records: Iterable[Record]) -> "RunHistory | None":
         """Follow records to their end; None if they do not even open."""
         following = iter(records)
         opening = next(following, None)
@@ -169,7 +169,7 @@ class Run:
                 self._follow_act(step_record)
 
     def _befall(self, incident: ProcessEvent) -> None:
-        name, what, now_s = incident.who, incident.what, incident.now_ns * 1e-9
+        name, what, now_s = incident.who, incident.kind, incident.now_ns * 1e-9
         if what in {"kill", "pause", "fill", "leave"}:
             self._away.setdefault(name, (what, now_s))
             if what == "kill" and name in self.trails:
@@ -207,7 +207,7 @@ class Run:
             np.subtract.at(self._left, *pairs)
 
 
-def draw_domain(axes: Axes, run: Run) -> None:
+def draw_domain(axes: Axes, run: RunHistory) -> None:
     """The outline that random starts are drawn from."""
     low, high = run.scenario.domain.min_m, run.scenario.domain.max_m
     outline = Rectangle(low, high[0] - low[0], high[1] - low[1], fill=False, ec=FAINT, zorder=0.5)
@@ -260,7 +260,7 @@ def draw_bumps(axes: Axes, map_tracker: MapTracker) -> None:
         _add_marks(axes, xy_m, s=size, c=MISSED, marker="1", lw=1.1, zorder=4.5, label="bump")
 
 
-def draw_trails(axes: Axes, run: Run) -> None:
+def draw_trails(axes: Axes, run: RunHistory) -> None:
     """Every robot's way, its start a cross, its end a dot."""
     few = len(run.trails) <= len(TEAM)
     colours = team_colours(len(run.trails))
@@ -285,7 +285,7 @@ def draw_trails(axes: Axes, run: Run) -> None:
     axes.plot([], [], "o", ms=7.0, mfc="white", mec=INK, mew=1.0, label="end")
 
 
-def draw_deaths(axes: Axes, run: Run) -> None:
+def draw_deaths(axes: Axes, run: RunHistory) -> None:
     """Where robots were when they were killed."""
     if run.deaths_m:
         xy_m = np.array(run.deaths_m)
@@ -294,7 +294,7 @@ def draw_deaths(axes: Axes, run: Run) -> None:
         _add_marks(axes, xy_m, s=size, c=KILLED, lw=0.8, zorder=5.5, **style)
 
 
-def draw_samples(axes: Axes, run: Run, *, scale: bool = True) -> None:
+def draw_samples(axes: Axes, run: RunHistory, *, scale: bool = True) -> None:
     """Samples by the weight that is left in them. scale: tell above the map what the colours mean."""
     xy_m = run.walked(run.site.samples_m, run.scenario.samples.diffusion_m, Purpose.SAMPLE_WALK)
     thin = thinned(xy_m.shape[0], _POINTS_SHOWN)  # they lie along a curve, so this is even
@@ -336,7 +336,7 @@ def add_scale(axes: Axes, marks: ScalarMappable, low: str, high: str) -> None:
     place.text(1.04, 0.5, high, ha="left", **words)
 
 
-def draw_targets(axes: Axes, run: Run) -> None:
+def draw_targets(axes: Axes, run: RunHistory) -> None:
     """Detected targets where they were found, the others where they are at the end."""
     finds = run.metrics.finds
     found_m = np.array([(x_m, y_m) for *_, x_m, y_m in finds]).reshape(-1, 2)
@@ -352,7 +352,7 @@ def draw_targets(axes: Axes, run: Run) -> None:
         _add_marks(axes, missed_m, s=size / 3.0, c=MISSED, zorder=3.0, label="not detected")
 
 
-def draw_supervisor(axes: Axes, run: Run) -> None:
+def draw_supervisor(axes: Axes, run: RunHistory) -> None:
     """Where the supervisor stands, if there is one."""
     placed = not run.scenario.mapping or run.scenario.supervisor.pose_m is not None
     if run.scenario.centralized and placed:
@@ -360,7 +360,7 @@ def draw_supervisor(axes: Axes, run: Run) -> None:
         axes.plot([x_m], [y_m], "*", ms=15.0, mfc="white", mec=INK, zorder=6.0, label="supervisor")
 
 
-def draw_radio(axes: Axes, run: Run) -> None:
+def draw_radio(axes: Axes, run: RunHistory) -> None:
     """How far the supervisor is heard, or else each robot from where it ended."""
     scenario = run.scenario
     centres_m = [trail.end_m for trail in run.trails.values()]

@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from kantor_fleet.report.picture import (
-    Run,
+    RunHistory,
     draw_bumps,
     draw_deaths,
     draw_domain,
@@ -70,7 +70,7 @@ def draw(records: Iterable[Record], path: Path, exact: Sequence[tuple[float, flo
     The records may stop anywhere. Without an opening there is nothing to draw, and no file.
     exact: times (s) with the exact distance (m) that was computed for them.
     """
-    run = Run.of(records)
+    run = RunHistory.of(records)
     if run is None:
         return
     layout = ConstrainedLayoutEngine(w_pad=0.12, h_pad=0.06)
@@ -85,7 +85,7 @@ def draw(records: Iterable[Record], path: Path, exact: Sequence[tuple[float, flo
     figure.savefig(path, format="png", dpi=DPI)
 
 
-def _write_title(place: SubFigure, run: Run) -> None:
+def _write_title(place: SubFigure, run: RunHistory) -> None:
     """What was run, and what came of it, whatever exchange ran it."""
     what = _what(run)
     size = TITLE_PT * min(1.0, _TITLE_LETTERS / len(what))
@@ -93,7 +93,7 @@ def _write_title(place: SubFigure, run: Run) -> None:
     place.text(0.012, 0.16, _outcome(run), size=TITLE_PT - 1.5, color=INK, va="center")
 
 
-def _what(run: Run) -> str:
+def _what(run: RunHistory) -> str:
     scenario, robots = run.scenario, run.scenario.robots.count
     merge = f"{scenario.merge} merge {'with' if scenario.claiming else 'without'} claims"
     parts = (
@@ -107,7 +107,7 @@ def _what(run: Run) -> str:
     return _GAP.join(parts)
 
 
-def _outcome(run: Run) -> str:
+def _outcome(run: RunHistory) -> str:
     result = run.metrics.result(exchange="", digest="", wall_s=0.0, record="", complaints=())
     parts = []
     if result.detection_rate is not None:
@@ -128,7 +128,7 @@ def _outcome(run: Run) -> str:
     return _GAP.join(parts)
 
 
-def _draw_map(place: SubFigure, run: Run) -> None:
+def _draw_map(place: SubFigure, run: RunHistory) -> None:
     """The map as the run left it. Every mark names itself for the legend."""
     axes = place.subplots()
     if isinstance(run.metrics, MapMetrics):
@@ -153,7 +153,7 @@ def _draw_map(place: SubFigure, run: Run) -> None:
     add_legend(place, [handle for handle in handles if handle not in ways])
 
 
-def _draw_curves(place: SubFigure, run: Run, exact: Sequence[tuple[float, float]]) -> None:
+def _draw_curves(place: SubFigure, run: RunHistory, exact: Sequence[tuple[float, float]]) -> None:
     """What the run measured, over simulated time."""
     bounds, progress, mass = place.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.2, 1.0))
     rows = run.metrics.rows
@@ -165,7 +165,7 @@ def _draw_curves(place: SubFigure, run: Run, exact: Sequence[tuple[float, float]
     _finish_curves(place, (bounds, progress, mass), run)
 
 
-def _finish_curves(place: SubFigure, diagrams: Sequence[Axes], run: Run) -> None:
+def _finish_curves(place: SubFigure, diagrams: Sequence[Axes], run: RunHistory) -> None:
     """What all diagrams of a run share: the axis of time, and moments on it."""
     diagrams[-1].set_xlabel("simulated time, s", size=TEXT_PT, color=INK)
     end_s = max(run.end_ns, run.scenario.period_ns) * 1e-9
@@ -176,7 +176,7 @@ def _finish_curves(place: SubFigure, diagrams: Sequence[Axes], run: Run) -> None
         add_legend(place, moments, widest=3)
 
 
-def _draw_exploration(place: SubFigure, run: Run, exploration: MapMetrics) -> None:
+def _draw_exploration(place: SubFigure, run: RunHistory, exploration: MapMetrics) -> None:
     """How a map became known, over simulated time."""
     explored, wtv, epv = place.subplots(3, 1, sharex=True, height_ratios=(1.7, 1.0, 1.0))
     rows = exploration.rows
@@ -193,7 +193,7 @@ def _draw_exploration(place: SubFigure, run: Run, exploration: MapMetrics) -> No
     _finish_curves(place, (explored, wtv, epv), run)
 
 
-def _draw_explored(axes: Axes, run: Run, exploration: MapMetrics, thin: slice) -> None:
+def _draw_explored(axes: Axes, run: RunHistory, exploration: MapMetrics, thin: slice) -> None:
     """What somebody has seen, tick by tick, and what each robot knows, row by row."""
     map_tracker, period_s = exploration.map_tracker, run.scenario.period_ns * 1e-9
     times_s = [row.time_s for row in exploration.rows[thin]]
@@ -220,7 +220,7 @@ def _draw_explored(axes: Axes, run: Run, exploration: MapMetrics, thin: slice) -
 
 
 def _draw_bounds(
-    axes: Axes, run: Run, rows: Sequence[DensityRow], exact: Sequence[tuple[float, float]]
+    axes: Axes, run: RunHistory, rows: Sequence[DensityRow], exact: Sequence[tuple[float, float]]
 ) -> None:
     equation = 6 if run.scenario.robots.count == 1 else 11 if run.scenario.centralized else 12
     lines = (
@@ -238,7 +238,7 @@ def _draw_bounds(
     add_caption(axes, axes.lines)
 
 
-def _draw_progress(axes: Axes, run: Run, rows: Sequence[DensityRow]) -> None:
+def _draw_progress(axes: Axes, run: RunHistory, rows: Sequence[DensityRow]) -> None:
     targets = run.site.targets_m.shape[0]
     energy = run.scenario.steps_per_robot * run.scenario.robots.count
     if targets:
@@ -260,7 +260,7 @@ def _draw_mass(axes: Axes, rows: Sequence[DensityRow]) -> None:
     add_caption(axes, axes.lines)
 
 
-def _mark_moments(diagrams: Sequence[Axes], run: Run) -> list[Line2D]:
+def _mark_moments(diagrams: Sequence[Axes], run: RunHistory) -> list[Line2D]:
     """Vertical lines where something happened; one of each for the legend."""
     moments = (("first contact", run.contact_s, ":"), ("finished", run.finish_s, "--"))
     marks = []
@@ -272,7 +272,7 @@ def _mark_moments(diagrams: Sequence[Axes], run: Run) -> list[Line2D]:
     return marks
 
 
-def _mark_cuts(diagrams: Sequence[Axes], run: Run, end_s: float) -> list[Patch]:
+def _mark_cuts(diagrams: Sequence[Axes], run: RunHistory, end_s: float) -> list[Patch]:
     """Shade the times in which a fault cut links; one patch for the legend."""
     cuts = [fault for fault in run.scenario.faults if isinstance(fault, Partition | OneWay)]
     cuts = [fault for fault in cuts if fault.from_s < end_s]
@@ -283,7 +283,7 @@ def _mark_cuts(diagrams: Sequence[Axes], run: Run, end_s: float) -> list[Patch]:
     return [Patch(color=CUT, alpha=0.25, lw=0.0, label="links cut")] if cuts else []
 
 
-def _mark_outages(diagrams: Sequence[Axes], run: Run, end_s: float) -> list[Artist]:
+def _mark_outages(diagrams: Sequence[Axes], run: RunHistory, end_s: float) -> list[Artist]:
     """When processes did nothing: a bar for each over the upper edge of the first diagram, and thin lines.
 
     What the supervisor or world-sim misses concerns everybody, so it is shaded all the way down.

@@ -31,7 +31,7 @@ def table_console() -> Console:
     return Console(width=None if sys.stdout.isatty() else _WIDTH)
 
 
-class RunsView:
+class RunProgressView:
     """Counts runs, tells of those that fail, and guesses when the last one will be done."""
 
     def __init__(self, runs: int, monotonic: Callable[[], float] = time.monotonic) -> None:

@@ -1,6 +1,6 @@
 """Burgard, Fox, Moors, Simmons, Thrun: "Collaborative Multi-Robot Exploration" (2000), figure 8.
 
-The paper says neither how the random starts lie nor when robots choose anew, and what it claims depends
+The paper says neither how the random starts lie nor when robots choose new targets, and its claims depend
 on both. Its figure is therefore drawn in four readings. Their numbers are those of an independent
 simulator in an office of the same 27 x 20 m: the paper's own is not in its text.
 """
@@ -10,37 +10,38 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from kantor_fleet.reproduce import explored
-from kantor_fleet.reproduce.claims import Claim, MeanRatio, Same
-from kantor_fleet.reproduce.figure import Figure
+from kantor_fleet.reproduce.claims import Claim, IdenticalRuns, MeanRatio
+from kantor_fleet.reproduce.figure import PaperFigure
 from kantor_fleet.reproduce.measured_runs import Setting
 from kantor_fleet.reproduce.measures import distance_m, finished, map_row
 
 TEAMS = (1, 2, 3)
 _RUNS = 20
 """The paper has ten; with ten, intervals are as wide as the effect."""
-_CLEARLY = 0.95
+_SIGNIFICANT = 0.95
 """Coordinated over uncoordinated: "significantly less time"."""
 
 
 class Reading(NamedTuple):
-    """What the paper leaves open."""
+    """A choice of what the paper leaves open."""
 
     letter: str
     text: str
     spread: str
+    """starts.spread."""
     coordinated: tuple[str, str]
     """planner.replan_on and planner.replan_whose of coordinated robots."""
     uncoordinated: tuple[str, str]
     gains: tuple[str, str]
-    """Mean times, coordinated over uncoordinated, of two and of three robots."""
+    """Ratios of mean times, coordinated over uncoordinated, of two and of three robots."""
     across: str
-    """Two coordinated robots over three uncoordinated ones."""
+    """The ratio of mean times, two coordinated robots over three uncoordinated ones."""
     across_low: float = -math.inf
     across_high: float = math.inf
     why: str = ""
 
     def setting(self, robots: int, *, coordinated: bool) -> Setting:
-        """The office explored so."""
+        """The office explored under this reading."""
         on, whose = self.coordinated if coordinated else self.uncoordinated
         overrides = (
             "coordination=centralized",
@@ -112,7 +113,7 @@ def _claims(reading: Reading) -> Iterator[Claim]:
     name = reading.letter
     alone, alone_uncoordinated = (setting(1, coordinated=how) for how in (True, False))
     if reading.coordinated[0] == reading.uncoordinated[0]:
-        yield Same(
+        yield IdenticalRuns(
             f"{name}: 1 robot, coordinated and not",
             alone,
             alone_uncoordinated,
@@ -134,9 +135,9 @@ def _claims(reading: Reading) -> Iterator[Claim]:
             setting(robots, coordinated=True),
             setting(robots, coordinated=False),
             "significantly less",
-            f"≤ {_CLEARLY} ({gain})",
+            f"≤ {_SIGNIFICANT} ({gain})",
             finished,
-            high=_CLEARLY,
+            high=_SIGNIFICANT,
         )
     judged = math.isfinite(reading.across_low)
     band = f"{reading.across_low} to {reading.across_high} ({reading.across})"
@@ -154,7 +155,7 @@ def _claims(reading: Reading) -> Iterator[Claim]:
 
 
 def _by_radio(range_m: int) -> Setting:
-    """Three robots of reading A without a supervisor, coordinated with whom they hear."""
+    """Three robots of reading A without a supervisor; robots that hear each other coordinate."""
     overrides = (
         "coordination=decentralized",
         f"radio.range_m={range_m}",
@@ -176,7 +177,7 @@ _RADIO = (
         high=1.1,
     ),
     MeanRatio(
-        "3 robots that hear nobody, over a supervisor's",
+        "3 robots that do not hear each other, over a supervisor's",
         _by_radio(0),
         _SUPERVISED,
         "",
@@ -185,16 +186,16 @@ _RADIO = (
     ),
 )
 
-FIG_8 = Figure(
+FIG_8 = PaperFigure(
     "time to explore an office, coordinated and not",
     _RUNS,
     (*(claim for reading in READINGS for claim in _claims(reading)), *_RADIO),
-    lambda flights: explored.bars(
+    lambda measured: explored.bars(
         READINGS[0].setting(1, coordinated=True).find(),
         {
             f"({reading.letter}) {reading.text}": {
                 coordinated: {
-                    robots: flights[reading.setting(robots, coordinated=coordinated)]
+                    robots: measured[reading.setting(robots, coordinated=coordinated)]
                     for robots in TEAMS
                 }
                 for coordinated in (False, True)

@@ -1,4 +1,7 @@
-"""Claims of a paper: what it publishes, what a faithful reading gives, what we measure, a verdict."""
+"""Claims of a paper: each compares a published value, that of a faithful reading, and measured runs.
+
+A *faithful reading* is an independent simulator that follows the paper.
+"""
 
 import math
 import statistics
@@ -14,19 +17,19 @@ Measure = Callable[[MeasuredRun], float]
 
 OK, MISS = "ok", "MISS"
 UNMATCHED = "ok, not the paper's"
-"""Ours agrees with the faithful reading, which cannot give what was published."""
-TOLD = "told"
-"""Neither the paper nor a reading of it says what it has to be."""
+"""The measured value agrees with the faithful reading, and no faithful reading can give the published one."""
+REPORTED = "reported"
+"""Reported, not judged: neither the paper nor a reading of it gives a bound."""
 
 
-class Verdict(NamedTuple):
-    """One line of the table."""
+class ClaimVerdict(NamedTuple):
+    """A row of the table of verdicts."""
 
     figure: str
     claim: str
     published: str
     reading: str
-    """What a faithful reading gives: a band, or a relation."""
+    """The value of a faithful reading: a band, or a relation."""
     ours: str
     verdict: str
     why: str = ""
@@ -34,19 +37,19 @@ class Verdict(NamedTuple):
 
 
 class Claim(Protocol):
-    """Something that a figure says."""
+    """A statement of a figure that runs can confirm or miss."""
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """The settings that it needs flown."""
+        """The settings whose runs it needs."""
         ...
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """The line of the table."""
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """The row of the table of verdicts."""
         ...
 
 
-class Median(NamedTuple):
+class MedianInBand(NamedTuple):
     """The median over the runs lies in a band."""
 
     text: str
@@ -61,18 +64,18 @@ class Median(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """One."""
+        """The one setting."""
         return (self.setting,)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """Median [quartiles] against the band."""
-        values = [self.measure(flight) for flight in flights[self.setting]]
+        values = [self.measure(run) for run in measured[self.setting]]
         first, median, third = quartiles(values)
         shown = [f"{value:.{self.digits}f}" for value in (median, first, third)]
         ours = f"{shown[0]} [{shown[1]}, {shown[2]}]{self.unit}"
         met = self.low <= median <= self.high
         verdict = MISS if not met else UNMATCHED if self.why else OK
-        return Verdict(figure, self.text, self.published, self._band, ours, verdict, self.why)
+        return ClaimVerdict(figure, self.text, self.published, self._band, ours, verdict, self.why)
 
     @property
     def _band(self) -> str:
@@ -82,7 +85,7 @@ class Median(NamedTuple):
         return f"≤ {high}{self.unit}" if math.isinf(self.low) else f"{low} to {high}{self.unit}"
 
 
-class Spread(NamedTuple):
+class NarrowestSpread(NamedTuple):
     """The quartiles of one setting lie closer together than those of all others."""
 
     text: str
@@ -97,20 +100,22 @@ class Spread(NamedTuple):
         """The narrow one first."""
         return (self.narrow, *self.others)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """Interquartile ranges."""
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """The interquartile ranges."""
         ranges = []
         for setting in self.settings:
-            first, _, third = quartiles([self.measure(flight) for flight in flights[setting]])
+            first, _, third = quartiles([self.measure(run) for run in measured[setting]])
             ranges.append(third - first)
         ours = f"{ranges[0]:.1f} against " + ", ".join(f"{width:.1f}" for width in ranges[1:])
         met = ranges[0] < min(ranges[1:])
         verdict = OK if met else MISS
-        return Verdict(figure, self.text, self.published, "smallest", ours + self.unit, verdict)
+        return ClaimVerdict(
+            figure, self.text, self.published, "smallest", ours + self.unit, verdict
+        )
 
 
-class Ahead(NamedTuple):
-    """One setting lies above another, seed by seed and, where asked, with intervals apart."""
+class PairedLead(NamedTuple):
+    """One setting lies above another, seed by seed and, if `apart`, with separate intervals."""
 
     text: str
     upper: Setting
@@ -120,19 +125,19 @@ class Ahead(NamedTuple):
     measure: Measure
     unit: str
     apart: bool = False
-    """Also the 95 % intervals of the two means must not overlap."""
+    """The 95 % intervals of the two means must not overlap either."""
     sure: bool = True
-    """The reading itself is significant; if not, any sign is in order."""
+    """The reading itself is significant; if it is not, either sign meets the claim."""
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Upper, lower."""
+        """The upper and the lower setting."""
         return (self.upper, self.lower)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """Means with 95 % intervals by Student's t, and the paired gap."""
         upper, lower = (
-            [self.measure(flight) for flight in flights[setting]] for setting in self.settings
+            [self.measure(run) for run in measured[setting]] for setting in self.settings
         )
         gap, half = interval([one - other for one, other in zip(upper, lower, strict=True)])
         (high, high_half), (low, low_half) = interval(upper), interval(lower)
@@ -143,32 +148,34 @@ class Ahead(NamedTuple):
             f"{high:.1f} ± {high_half:.1f} against {low:.1f} ± {low_half:.1f}{self.unit}, "
             f"paired {gap:+.1f} ± {half:.1f}"
         )
-        return Verdict(figure, self.text, self.published, self.reading, ours, OK if met else MISS)
+        return ClaimVerdict(
+            figure, self.text, self.published, self.reading, ours, OK if met else MISS
+        )
 
 
-class Range(NamedTuple):
-    """One run of each of several settings that hardly differ: how far apart the outcomes lie."""
+class WideRange(NamedTuple):
+    """One run of each of several settings that hardly differ: the outcomes lie at least so far apart."""
 
     text: str
     settings: tuple[Setting, ...]
     published: str
     least: float
-    """How far apart, at least."""
+    """The least distance from the lowest to the highest outcome."""
     measure: Measure
     unit: str
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """From the lowest to the highest."""
-        values = [self.measure(flights[setting][0]) for setting in self.settings]
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """The lowest and the highest outcome."""
+        values = [self.measure(measured[setting][0]) for setting in self.settings]
         low, high = min(values), max(values)
         ours = f"{low:.1f} to {high:.1f}{self.unit} over {len(values)} starts"
         reading = f"≥ {self.least:g} points apart"
         verdict = OK if high - low >= self.least else MISS
-        return Verdict(figure, self.text, self.published, reading, ours, verdict)
+        return ClaimVerdict(figure, self.text, self.published, reading, ours, verdict)
 
 
-class Ratio(NamedTuple):
-    """The ratio of two settings' medians, told and not judged: it depends on the implementation."""
+class MedianRatio(NamedTuple):
+    """The ratio of two settings' medians, reported and not judged: it depends on the implementation."""
 
     text: str
     over: Setting
@@ -179,20 +186,20 @@ class Ratio(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Over, under."""
+        """The settings over and under."""
         return (self.over, self.under)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """Medians, and one over the other."""
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """Both medians and their ratio."""
         over, under = (
-            statistics.median(self.measure(flight) for flight in flights[setting])
+            statistics.median(self.measure(run) for run in measured[setting])
             for setting in self.settings
         )
         ours = f"{over:.3f} s against {under:.3f} s: {over / under:.2f} times"
-        return Verdict(figure, self.text, self.published, "either", ours, UNMATCHED, self.why)
+        return ClaimVerdict(figure, self.text, self.published, "either", ours, UNMATCHED, self.why)
 
 
-class Share(NamedTuple):
+class RareShare(NamedTuple):
     """The share of runs in which something happens stays below a bound."""
 
     text: str
@@ -203,17 +210,17 @@ class Share(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """One."""
+        """The one setting."""
         return (self.setting,)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """Runs among all."""
-        runs = flights[self.setting]
-        count = sum(self.happens(flight) for flight in runs)
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """The number of runs in which it happens, among all."""
+        runs = measured[self.setting]
+        count = sum(self.happens(run) for run in runs)
         verdict = OK if count <= self.most * len(runs) else MISS
         reading = f"≤ {100.0 * self.most:.0f} %"
         ours = f"{100.0 * count / len(runs):.0f} % ({count} of {len(runs)})"
-        return Verdict(figure, self.text, self.published, reading, ours, verdict)
+        return ClaimVerdict(figure, self.text, self.published, reading, ours, verdict)
 
 
 class MeanRatio(NamedTuple):
@@ -231,17 +238,17 @@ class MeanRatio(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Over, under."""
+        """The settings over and under."""
         return (self.over, self.under)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """The ratio with its 95 % bootstrap interval, whole starts drawn again."""
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """The ratio with its 95 % bootstrap interval; whole starts are resampled."""
         over, under = (
-            [self.measure(flight) for flight in flights[setting]] for setting in self.settings
+            [self.measure(run) for run in measured[setting]] for setting in self.settings
         )
         ratio, low, high = mean_ratio(over, under)
         ours = f"{ratio:.2f} [{low:.2f}, {high:.2f}]"
-        return Verdict(
+        return ClaimVerdict(
             figure, self.text, self.published, self.reading, ours, self._verdict(ratio), self.why
         )
 
@@ -250,11 +257,11 @@ class MeanRatio(NamedTuple):
             return MISS
         if self.why:
             return UNMATCHED
-        return TOLD if math.isinf(self.low) and math.isinf(self.high) else OK
+        return REPORTED if math.isinf(self.low) and math.isinf(self.high) else OK
 
 
-class Same(NamedTuple):
-    """Two settings come to the same in every run."""
+class IdenticalRuns(NamedTuple):
+    """Two settings give equal measures in every run."""
 
     text: str
     one: Setting
@@ -264,21 +271,21 @@ class Same(NamedTuple):
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Both."""
+        """Both settings."""
         return (self.one, self.other)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """Runs that agree in every measure, among all."""
-        pairs = list(zip(*(flights[setting] for setting in self.settings), strict=True))
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """The number of runs that agree in every measure, among all."""
+        pairs = list(zip(*(measured[setting] for setting in self.settings), strict=True))
         same = sum(
             all(measure(one) == measure(other) for measure in self.measures) for one, other in pairs
         )
         verdict = OK if same == len(pairs) else MISS
         ours = f"{same} of {len(pairs)} runs the same"
-        return Verdict(figure, self.text, self.published, "every run the same", ours, verdict)
+        return ClaimVerdict(figure, self.text, self.published, "every run the same", ours, verdict)
 
 
-class Lowest(NamedTuple):
+class LowestMean(NamedTuple):
     """Among the means of several settings the first is the lowest."""
 
     text: str
@@ -286,19 +293,19 @@ class Lowest(NamedTuple):
     published: str
     measure: Measure
     above: tuple[str, ...] = ()
-    """Which ones a faithful reading has above the first; none: it is told, not judged."""
+    """The names that a faithful reading has above the first; with none the claim is reported, not judged."""
     why: str = ""
-    """Why a faithful reading does not have it below the others too."""
+    """Why a faithful reading does not have the first below the others too."""
 
     @property
     def settings(self) -> tuple[Setting, ...]:
         """The first is the one in question."""
         return tuple(setting for _, setting in self.named)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """The means in order."""
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """All means in order."""
         means = {
-            name: statistics.fmean(self.measure(flight) for flight in flights[setting])
+            name: statistics.fmean(self.measure(run) for run in measured[setting])
             for name, setting in self.named
         }
         first = means[self.named[0][0]]
@@ -308,84 +315,90 @@ class Lowest(NamedTuple):
         reading = f"below {' and '.join(self.above)}" if self.above else "either"
         lowest = first == min(means.values())
         if not self.above:
-            verdict = TOLD
+            verdict = REPORTED
         elif any(first >= means[name] for name in self.above):
             verdict = MISS
         else:
             verdict = OK if lowest else UNMATCHED
         why = "" if lowest else self.why
-        return Verdict(figure, self.text, self.published, reading, ours, verdict, why)
+        return ClaimVerdict(figure, self.text, self.published, reading, ours, verdict, why)
 
 
 Group = tuple[Setting, ...]
 """Settings whose runs are taken together."""
 
 
-class GeometricRatio(NamedTuple):
+class GeometricMeanRatio(NamedTuple):
     """The geometric mean of ratios, run by run, over several settings stays below a bound."""
 
     text: str
     over: Group
     under: Group
-    """Each beside the one of `over` that has the same place."""
+    """Compared with the setting of `over` at the same place."""
     published: str
     reading: str
     measure: Measure
     most: float = math.inf
-    """Infinite: it is told, not judged."""
+    """Infinite: the claim is reported, not judged."""
     why: str = ""
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """All of over, all of under."""
+        """The settings over and under."""
         return (*self.over, *self.under)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
         """The mean with its 95 % factor by Student's t on logarithms."""
-        ratios = list(paired_ratios(flights, self.over, self.under, self.measure))
+        ratios = list(paired_ratios(measured, self.over, self.under, self.measure))
         if not ratios:
             ours = "no runs"
-            return Verdict(figure, self.text, self.published, self.reading, ours, TOLD, self.why)
+            return ClaimVerdict(
+                figure, self.text, self.published, self.reading, ours, REPORTED, self.why
+            )
         mean, factor = geometric(ratios)
-        verdict = TOLD if math.isinf(self.most) else OK if mean <= self.most else MISS
-        ours = f"{times(mean, factor)} (n = {len(ratios)})"
-        return Verdict(figure, self.text, self.published, self.reading, ours, verdict, self.why)
+        verdict = REPORTED if math.isinf(self.most) else OK if mean <= self.most else MISS
+        ours = f"{text_of_ratio(mean, factor)} (n = {len(ratios)})"
+        return ClaimVerdict(
+            figure, self.text, self.published, self.reading, ours, verdict, self.why
+        )
 
 
-class Lower(NamedTuple):
-    """Of several pairs of groups the first lies below the second, setting by setting."""
+class LowerThroughout(NamedTuple):
+    """In each of several pairs of groups, the first lies below the second, setting by setting."""
 
     text: str
-    named: tuple[tuple[str, Group, Group], ...]
-    """Name, lower, upper; in both groups the same place stands for the same thing."""
+    pairs: tuple[tuple[str, Group, Group], ...]
+    """Name, lower, upper; settings at the same place of both groups are compared."""
     published: str
     measure: Measure
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Of all pairs."""
-        return tuple(s for _, lower, upper in self.named for s in (*lower, *upper))
+        """The settings of all pairs."""
+        return tuple(s for _, lower, upper in self.pairs for s in (*lower, *upper))
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """Lower over upper; missed if one lies above, beyond its interval if it has one."""
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """The ratios lower over upper; missed if one lies above 1, beyond its interval if it has one."""
         ratios = {
             name: geometric(found)
-            for name, lower, upper in self.named
-            if (found := list(self._ratios(flights, lower, upper)))
+            for name, lower, upper in self.pairs
+            if (found := list(self._ratios(measured, lower, upper)))
         }
-        ours = ", ".join(f"{name} {times(*ratio)}" for name, ratio in ratios.items())
+        ours = ", ".join(f"{name} {text_of_ratio(*ratio)}" for name, ratio in ratios.items())
         missed = any(
             mean > (factor if math.isfinite(factor) else 1.0) for mean, factor in ratios.values()
         )
         reading = "each below 1, or not clearly above"
-        return Verdict(figure, self.text, self.published, reading, ours, MISS if missed else OK)
+        return ClaimVerdict(
+            figure, self.text, self.published, reading, ours, MISS if missed else OK
+        )
 
-    def _ratios(self, flights: MeasuredRuns, lower: Group, upper: Group) -> Iterator[float]:
-        """Of geometric means, of settings that have runs: their starts are not the same ones."""
+    def _ratios(self, measured: MeasuredRuns, lower: Group, upper: Group) -> Iterator[float]:
+        """Ratios of geometric means, for settings with runs; their starts differ, so that runs cannot be paired."""
         for one, other in zip(lower, upper, strict=True):
-            if flights.get(one) and flights.get(other):
+            if measured.get(one) and measured.get(other):
                 low, high = (
-                    geometric(map(self.measure, flights[each]))[0] for each in (one, other)
+                    geometric(map(self.measure, measured[each]))[0] for each in (one, other)
                 )
                 yield low / high
 
@@ -393,7 +406,7 @@ class Lower(NamedTuple):
 def mean_ratio(
     over: Sequence[float], under: Sequence[float], resamples: int = 10_000
 ) -> tuple[float, float, float]:
-    """Ratio of means and its 95 % percentile interval; pairs are drawn together, the same every time."""
+    """Ratio of means and its 95 % percentile interval; pairs are resampled together, with a fixed seed."""
     pairs = np.array([over, under], dtype=np.float64)
     drawn = np.random.default_rng(0).integers(0, pairs.shape[1], (resamples, pairs.shape[1]))
     means = pairs[:, drawn].mean(axis=2)
@@ -403,11 +416,11 @@ def mean_ratio(
 
 
 def paired_ratios(
-    flights: MeasuredRuns, over: Group, under: Group, measure: Measure
+    measured: MeasuredRuns, over: Group, under: Group, measure: Measure
 ) -> Iterator[float]:
-    """Of all runs that both of a pair of settings have, and whose measures are above 0."""
+    """Ratios of the runs that both of a pair of settings have, where both measures are above 0."""
     for one, other in zip(over, under, strict=True):
-        for upper, lower in zip(flights.get(one, ()), flights.get(other, ()), strict=True):
+        for upper, lower in zip(measured.get(one, ()), measured.get(other, ()), strict=True):
             if measure(upper) > 0.0 and measure(lower) > 0.0:
                 yield measure(upper) / measure(lower)
 
@@ -418,8 +431,8 @@ def geometric(values: Iterable[float]) -> tuple[float, float]:
     return math.exp(mean), math.exp(half)
 
 
-def times(mean: float, factor: float) -> str:
-    """A geometric mean and its factor, for a person."""
+def text_of_ratio(mean: float, factor: float) -> str:
+    """A geometric mean and its factor, for printing."""
     return f"{mean:.2f} x÷ {factor:.2f}" if math.isfinite(factor) else f"{mean:.2f}"
 
 

@@ -1,4 +1,4 @@
-"""The paper's figures, drawn from records and rows. A run that is drawn has seed 0 unless told."""
+"""The figures of papers on densities, drawn from records and rows of runs, by default of seed 0."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure, FigureBase
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from kantor_fleet.report.picture import (
-    Run,
+    RunHistory,
     draw_domain,
     draw_radio,
     draw_samples,
@@ -35,24 +35,24 @@ from kantor_worldsim.observers.metrics.density import DensityRow
 from kantor_worldsim.record.records import Batch, Opening
 
 _MAP_IN = 4.4
-"""Width of one map."""
+"""Width of one map, inches."""
 
 
-def centralized(setting: Setting, flight: MeasuredRun) -> Figure:
+def centralized(setting: Setting, run: MeasuredRun) -> Figure:
     """Figure 4: snapshots (a)-(e) and the bound (f)."""
     figure, axes = _panels(2, 3)
     ticks = (0, 300, 600, 800, 1000)
     _snapshots(axes[:5], setting, ticks)
-    _bounds(axes[5], flight)
+    _bounds(axes[5], run)
     return figure
 
 
-def decentralized(setting: Setting, flights: Sequence[MeasuredRun], ended: Measure) -> Figure:
+def decentralized(setting: Setting, runs: Sequence[MeasuredRun], ended: Measure) -> Figure:
     """Figure 7: the same for two robots that meet, in the run whose end is nearest to the median."""
     figure, axes = _panels(2, 3)
-    ends = np.array([ended(flight) for flight in flights])
+    ends = np.array([ended(run) for run in runs])
     seed = int(np.abs(ends - np.median(ends)).argmin())
-    result = flights[seed].result
+    result = runs[seed].result
     assert result is not None
     end = int(ends[seed])
     _snapshots(axes[:5], setting, (0, 300, 600, 700, end), seed=seed)
@@ -60,7 +60,7 @@ def decentralized(setting: Setting, flights: Sequence[MeasuredRun], ended: Measu
         contact = f"first contact, {result.first_contact_tick}"
         axes[5].axvline(result.first_contact_tick, color=FAINT, ls=":", lw=1.2, label=contact)
     axes[5].axvline(end, color=FAINT, ls="--", lw=1.2, label=f"end, {end}")
-    _bounds(axes[5], flights[seed])
+    _bounds(axes[5], runs[seed])
     return figure
 
 
@@ -79,7 +79,7 @@ def trajectories(settings: Mapping[str, Setting]) -> Figure:
 
 
 def moving(settings: Mapping[str, Setting]) -> Figure:
-    """Figure 8: three moments of each, one above the other."""
+    """Figure 8: snapshots of two settings at three ticks, one setting above the other."""
     figure, axes = _panels(2, 3)
     for row, (name, setting) in enumerate(settings.items()):
         places = axes[3 * row : 3 * row + 3]
@@ -93,10 +93,10 @@ def comparison(
     """Figure 6: box plots of detection and bars of execution time."""
     figure = Figure(figsize=(10.5, 4.4), layout=new_layout())
     boxes, bars = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
-    _boxes(boxes, {name: [detected(f) for f in flights] for name, flights in methods.items()})
+    _boxes(boxes, {name: [detected(run) for run in runs] for name, runs in methods.items()})
     tidy(boxes, "", "detected, %")
     write_title(boxes, f"(a) detection over {len(next(iter(methods.values())))} random starts")
-    times_s = {name: [robots_s(f) for f in flights] for name, flights in methods.items()}
+    times_s = {name: [robots_s(run) for run in runs] for name, runs in methods.items()}
     medians_s = [float(np.median(values)) for values in times_s.values()]
     bars.bar(list(methods), medians_s, color=TEAM[: len(methods)], width=0.6)
     for x, median_s in enumerate(medians_s):
@@ -122,13 +122,13 @@ def diffusion(
     """Figure 9: means with 95 % intervals against the diffusion rate v."""
     figure = Figure(figsize=(6.6, 4.4), layout=new_layout())
     axes = figure.subplots()
-    for flights, label, colour in (
+    for runs_by_rate, label, colour in (
         (varying, "samples walk", SECOND),
         (invariant, "samples stand", THIRD),
     ):
-        means = [interval([detected(f) for f in runs]) for runs in flights.values()]
+        means = [interval([detected(run) for run in runs]) for runs in runs_by_rate.values()]
         axes.errorbar(
-            list(flights),
+            list(runs_by_rate),
             [mean for mean, _ in means],
             [half for _, half in means],
             color=colour,
@@ -143,20 +143,20 @@ def diffusion(
     return figure
 
 
-class Course(NamedTuple):
-    """A line of means."""
+class Curve(NamedTuple):
+    """A line of means with their intervals."""
 
     x: Sequence[float]
     estimates: Sequence[tuple[float, float, float]]
-    """Mean, and the ends of its interval."""
+    """The mean and the ends of its interval, for each x."""
 
 
 class Panel(NamedTuple):
-    """A diagram of lines."""
+    """A diagram of curves."""
 
     x_label: str
     y_label: str
-    courses: Mapping[str, Course]
+    curves: Mapping[str, Curve]
 
 
 def resilience(panels: Sequence[Panel], columns: int) -> Figure:
@@ -166,11 +166,11 @@ def resilience(panels: Sequence[Panel], columns: int) -> Figure:
     )
     places = figure.subplots(len(panels) // columns, columns, squeeze=False, sharey="row")
     for letter, axes, panel in zip("abcdefgh", places.flat, panels, strict=False):
-        for (name, course), colour in zip(panel.courses.items(), (SECOND, THIRD), strict=False):
-            mean, low, high = np.array(course.estimates).T
-            axes.fill_between(course.x, low, high, color=colour, alpha=0.22, lw=0.0)
-            axes.plot(course.x, mean, color=colour, marker="o", ms=4.0, lw=1.6, label=name)
-        axes.set_xticks(panel.courses[next(iter(panel.courses))].x)
+        for (name, curve), colour in zip(panel.curves.items(), (SECOND, THIRD), strict=False):
+            mean, low, high = np.array(curve.estimates).T
+            axes.fill_between(curve.x, low, high, color=colour, alpha=0.22, lw=0.0)
+            axes.plot(curve.x, mean, color=colour, marker="o", ms=4.0, lw=1.6, label=name)
+        axes.set_xticks(panel.curves[next(iter(panel.curves))].x)
         tidy(axes, panel.x_label, panel.y_label if axes in places[:, 0] else "")
         write_title(axes, f"({letter})")
     for row in places:
@@ -186,7 +186,7 @@ def _panels(rows: int, columns: int) -> tuple[Figure, list[Axes]]:
 
 
 def new_layout() -> ConstrainedLayoutEngine:
-    """Of a picture of several diagrams."""
+    """The layout of a picture of several diagrams."""
     return ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
 
 
@@ -208,21 +208,21 @@ def _snapshots(
     legend_below(figure, places[min(1, len(places) - 1)])
 
 
-def _runs_at(setting: Setting, ticks: Sequence[int], seed: int = 0) -> Iterator[Run]:
-    """The run at each of some ticks; it goes on when the next one is asked for."""
+def _runs_at(setting: Setting, ticks: Sequence[int], seed: int = 0) -> Iterator[RunHistory]:
+    """The history of a run up to each of some ticks: one object, which advances with the iterator."""
     records = iter(records_of(setting, seed))
     opening = next(records)
     assert isinstance(opening, Opening)
-    run, waiting = Run(opening), next(records, None)
+    run, waiting = RunHistory(opening), next(records, None)
     for tick in ticks:
-        until_ns = (tick + 1) * run.scenario.period_ns  # robots act at any phase of a period
+        until_ns = (tick + 1) * run.scenario.period_ns  # robots step at any phase of a period
         while isinstance(waiting, Batch) and waiting.now_ns < until_ns:
             run.follow(waiting)
             waiting = next(records, None)
         yield run
 
 
-def _map(axes: Axes, run: Run) -> None:
+def _map(axes: Axes, run: RunHistory) -> None:
     draw_domain(axes, run)
     draw_trails(axes, run)
     draw_samples(axes, run, scale=False)
@@ -234,12 +234,12 @@ def _map(axes: Axes, run: Run) -> None:
 
 
 def write_title(axes: Axes, text: str) -> None:
-    """Above a diagram."""
+    """Write a title above a diagram."""
     axes.set_title(text, size=TEXT_PT + 0.5, color=INK, loc="left")
 
 
 def legend_below(figure: FigureBase, axes: Axes) -> None:
-    """One legend for all diagrams, below them. axes: one that has all there is."""
+    """Add one legend for all diagrams, below them. axes: a diagram that has every label."""
     handles, labels = axes.get_legend_handles_labels()
     known = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
     if not set(labels) - known:
@@ -256,18 +256,18 @@ def legend_below(figure: FigureBase, axes: Axes) -> None:
     )
 
 
-def _bounds(axes: Axes, flight: MeasuredRun) -> None:
-    ticks = [row.tick for row in flight.rows]
+def _bounds(axes: Axes, run: MeasuredRun) -> None:
+    ticks = [row.tick for row in run.rows]
     lines: tuple[tuple[str, Callable[[DensityRow], float | None], str, float], ...] = (
         ("bound", lambda row: row.w_ub_paper, FIRST, 2.2),
         ("tight bound", lambda row: row.w_ub_tight, SECOND, 1.4),
         ("last tick's shipping and pending", lambda row: row.w_ub_instant, THIRD, 1.1),
     )
     for label, measure, colour, width in lines:
-        values = np.array([measure(row) for row in flight.rows], dtype=np.float64)
+        values = np.array([measure(row) for row in run.rows], dtype=np.float64)
         at_end = "" if np.isnan(values[-1]) else f", {values[-1]:.3g} m at the end"
         axes.plot(ticks, values, color=colour, lw=width, label=label + at_end)
-    exact = [(row.tick, row.w1_exact) for row in flight.rows if row.w1_exact is not None]
+    exact = [(row.tick, row.w1_exact) for row in run.rows if row.w1_exact is not None]
     if exact:
         label = f"exact distance, {exact[-1][1]:.3g} m at the end"
         axes.plot(*zip(*exact, strict=True), "o", ms=4.0, color=FOUND, label=label)
@@ -278,7 +278,7 @@ def _bounds(axes: Axes, flight: MeasuredRun) -> None:
 
 
 def _boxes(axes: Axes, groups: Mapping[str, Sequence[float]]) -> None:
-    """Boxes with every run beside them."""
+    """Draw boxes with every run beside them."""
     plot = axes.boxplot(
         list(groups.values()),
         tick_labels=list(groups),
@@ -290,5 +290,7 @@ def _boxes(axes: Axes, groups: Mapping[str, Sequence[float]]) -> None:
     for box, colour in zip(plot["boxes"], TEAM, strict=False):
         box.set(facecolor=colour, alpha=0.75, edgecolor=INK, linewidth=0.8)
     for place, values in enumerate(groups.values(), 1):
-        shift = 0.12 * np.sin(2.4 * np.arange(len(values)))  # apart, the same every time
+        shift = 0.12 * np.sin(
+            2.4 * np.arange(len(values))
+        )  # spread over the box, the same every time
         axes.scatter(place + shift, values, s=7.0, c=INK, alpha=0.35, linewidths=0.0, zorder=3.0)

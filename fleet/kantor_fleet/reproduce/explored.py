@@ -1,4 +1,4 @@
-"""The figures of papers that explore a map."""
+"""The figures of papers on maps, drawn from measured runs."""
 
 from collections.abc import Mapping, Sequence
 from textwrap import fill
@@ -30,20 +30,20 @@ _LINES = (
 )
 """Colour, style and width of planners, in the order in which they are given."""
 _LETTERS = 46
-"""What fits on a line above a diagram of bars."""
+"""Letters that fit on a line above a diagram of bars."""
 _CURVES = {
     "wtv": "waiting time variance, tick²",
     "epv": "variance of the explored share, %²",
 }
 
-Runs = Mapping[int, Sequence[MeasuredRun]]
-"""By number of robots."""
+RunsByTeam = Mapping[int, Sequence[MeasuredRun]]
+"""Runs by number of robots."""
 
 
 def bars(
-    scenario: Scenario, panels: Mapping[str, Mapping[bool, Runs]], finished: Measure
+    scenario: Scenario, panels: Mapping[str, Mapping[bool, RunsByTeam]], finished: Measure
 ) -> Figure:
-    """The map, and for each reading means with 95 % intervals, uncoordinated beside coordinated."""
+    """The map, and for each reading the mean times with 95 % intervals, uncoordinated beside coordinated."""
     figure = Figure(figsize=(13.2, 6.8), layout=new_layout())
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=(0.72, 1.0))[0]
     _draw_map(left.subplots(), scenario)
@@ -51,7 +51,7 @@ def bars(
     for axes, (title, sides) in zip(places.flat, panels.items(), strict=True):
         _draw_bars(axes, sides, finished, scenario.clock.period_s)
         write_title(axes, fill(title, _LETTERS))
-    places[0, 0].set_ylim(bottom=0.0)  # of all; two runs may have an interval beyond
+    places[0, 0].set_ylim(bottom=0.0)  # shared by all; the interval of two runs may reach below
     for axes in places[:, 0]:
         axes.set_ylabel("time to explore, s", size=TEXT_PT, color=INK)
     for axes in places[1]:
@@ -66,12 +66,14 @@ def curves(panels: Mapping[int, Mapping[str, Sequence[MeasuredRun]]], name: str)
     places = figure.subplots(2, 2)
     for letter, axes, (robots, lines) in zip("abcd", places.flat, panels.items(), strict=True):
         for (label, runs), (colour, style, width) in zip(lines.items(), _LINES, strict=False):
-            ticks, mean = mean_curve([flight.course for flight in runs], name)
+            ticks, mean = mean_curve([run.course for run in runs], name)
             axes.plot(ticks, mean, color=colour, ls=style, lw=width, label=label)
             axes.plot(ticks[-1], mean[-1], "o", color=colour, ms=4.0)
         axes.set_xlim(left=0.0)
         if name == "wtv":
-            axes.set_yscale("log")  # robots that start together may never part, and hide the others
+            axes.set_yscale(
+                "log"
+            )  # robots that start together may never part, and would hide the others
         else:
             axes.set_ylim(bottom=0.0)
         tidy(axes, "tick", _CURVES[name])
@@ -109,7 +111,7 @@ def ratios(
 def mean_curve(
     courses: Sequence[Sequence[Moment]], name: str
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Ticks up to the last end, and the mean; a run that has ended stays where it ended."""
+    """Ticks up to the last end, and the mean over the runs; a run that has ended keeps its last value."""
     end = max(course[-1].tick for course in courses)
     ticks = np.append(np.arange(0.0, end, _EVERY), end)
     values = [
@@ -124,7 +126,7 @@ def mean_curve(
 
 
 def _draw_map(axes: Axes, scenario: Scenario) -> None:
-    """What is true of it: white is free."""
+    """Draw the true map: white is free."""
     ground = WorldSetup.of(scenario, 0).ground
     assert ground is not None
     colours = ListedColormap([FAINT, "white", INK])
@@ -137,13 +139,14 @@ def _draw_map(axes: Axes, scenario: Scenario) -> None:
     )
 
 
-def _draw_bars(axes: Axes, sides: Mapping[bool, Runs], finished: Measure, period_s: float) -> None:
+def _draw_bars(
+    axes: Axes, sides: Mapping[bool, RunsByTeam], finished: Measure, period_s: float
+) -> None:
     for (coordinated, runs), shift, colour in zip(
         sides.items(), (-0.2, 0.2), (TEAM[1], TEAM[0]), strict=True
     ):
         means = [
-            interval([period_s * finished(flight) for flight in flights])
-            for flights in runs.values()
+            interval([period_s * finished(run) for run in team_runs]) for team_runs in runs.values()
         ]
         axes.bar(
             np.array(list(runs)) + shift,
@@ -166,7 +169,7 @@ def _draw_ratios(
     colour: str,
     label: str,
 ) -> None:
-    """Points with intervals; a factor that nothing is known of leaves the point alone."""
+    """Draw points with intervals; a point whose factor is not finite has none."""
     robots, means, factors = np.array(found, dtype=np.float64).reshape(-1, 3).T
     known = np.where(np.isfinite(factors), factors, 1.0)
     axes.errorbar(
@@ -184,7 +187,7 @@ def _draw_ratios(
 
 
 def _ratio_scale(axes: Axes, low: float, high: float) -> None:
-    """Room for the means; intervals of a few runs reach out of any picture."""
+    """Set the scale by the means: intervals of few runs would reach beyond any picture."""
     axes.set_yscale("log")
     axes.set_ylim(0.5 * min(low, 1.0), 2.0 * max(high, 1.0))
     axes.yaxis.set_major_locator(

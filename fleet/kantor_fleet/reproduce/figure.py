@@ -1,4 +1,4 @@
-"""A figure of a paper: what it needs flown, what it claims, how it is drawn and told."""
+"""A figure of a paper: the runs that it needs, its claims, its drawing and its table."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -11,40 +11,40 @@ from kantor_fleet.sweep.table import Row
 from kantor_worldsim.observers.metrics.result import Result
 
 RunRequests = Mapping[Setting, Sequence[int]]
-"""The seeds that each setting is flown with."""
+"""The seeds to run of each setting."""
 
 
 class ResultTable(NamedTuple):
-    """Numbers that a figure tells beside its claims."""
+    """Numbers that a figure prints beside its claims."""
 
     title: str
     rows: list[Row]
-    """As in the CSV."""
+    """The rows of the CSV file."""
     shown: list[Row]
-    """For a person, a text in every column."""
+    """The rows that are printed, with a text in every column."""
 
 
-class Figure(NamedTuple):
+class PaperFigure(NamedTuple):
     """A figure of a paper."""
 
     title: str
     runs: int
-    """For each setting, as in the paper where it says so."""
+    """Runs of each setting, as in the paper where it gives a number."""
     claims: tuple[Claim, ...]
     draw: Callable[[MeasuredRuns], Picture]
     row: Callable[[Result], Row]
-    """What the CSV says of a run."""
+    """The columns of a run in the CSV file."""
     drawn: tuple[Setting, ...] = ()
-    """Settings that are drawn, though nothing is claimed of them."""
-    part: Callable[[int], RunRequests] | None = None
-    """What is flown if `runs` counts something else than the runs for each setting."""
+    """Settings that are drawn without a claim about them."""
+    select: Callable[[int], RunRequests] | None = None
+    """The runs that it needs, where `runs` counts something else than the runs of each setting."""
     table: Callable[[MeasuredRuns], ResultTable] | None = None
     kept: bool = False
-    """Finished runs are kept in the folder, so that the same command goes on from there."""
+    """Finished runs are kept in the folder, so that the same command resumes from there."""
 
-    def orders(self) -> RunRequests:
-        """What it needs flown."""
-        if self.part is not None:
-            return self.part(self.runs)
+    def requests(self) -> RunRequests:
+        """What it needs run."""
+        if self.select is not None:
+            return self.select(self.runs)
         claimed = (setting for claim in self.claims for setting in claim.settings)
         return {setting: range(min(self.runs, setting.most)) for setting in (*claimed, *self.drawn)}

@@ -1,4 +1,4 @@
-"""Kabir & Lee, section VI: figures 4 to 9, what they claim, and what a faithful reading gives.
+"""Kabir & Lee, section VI: figures 4 to 9, their claims, and the values of a faithful reading.
 
 The readings (bands) are those of an independent simulator that follows the paper, not of this code:
 robots one after another within a tick, a step of 10 m, three samples in a plan.
@@ -7,8 +7,15 @@ robots one after another within a tick, a step of 10 m, three samples in a plan.
 import math
 
 from kantor_fleet.reproduce import drawing
-from kantor_fleet.reproduce.claims import Ahead, Median, Range, Ratio, Share, Spread
-from kantor_fleet.reproduce.figure import Figure
+from kantor_fleet.reproduce.claims import (
+    MedianInBand,
+    MedianRatio,
+    NarrowestSpread,
+    PairedLead,
+    RareShare,
+    WideRange,
+)
+from kantor_fleet.reproduce.figure import PaperFigure
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, Setting
 from kantor_fleet.reproduce.measures import finished
 from kantor_fleet.sweep.table import Row
@@ -18,7 +25,7 @@ _CONCURRENT = ("clock.order=concurrent",)
 _LEDGER = ("merge=ledger", "claims=true")
 _MINIMUM = ("merge=min", "claims=false")
 _FEW_ROWS = ("metrics.every=1000",)
-"""For settings of which only the outcome counts."""
+"""For settings whose curves are not drawn."""
 _ANYWHERE = ("starts.random=true", *_FEW_ROWS)
 
 
@@ -27,7 +34,7 @@ def _spectral(modes: int) -> tuple[str, ...]:
 
 
 def _moved(number: int) -> str:
-    """Section VI-A's starts, each moved by up to 2 mm, another way for every number."""
+    """Section VI-A's starts, each moved by up to 2 mm, in another direction for every number."""
     starts_m = ((1000, 1200), (1600, 800), (1400, 1300), (300, 800), (600, 1200))
     moved_m = [
         [x + 0.001 * ((number + i) % 5 - 2), y + 0.001 * ((number // 5 + i) % 5 - 2)]
@@ -43,7 +50,7 @@ A_SPECTRAL = Setting("paper-centralized", _spectral(15))
 A_NEARBY = tuple(
     Setting("paper-centralized", (*_spectral(15), *_FEW_ROWS, _moved(i)), most=1) for i in range(24)
 )
-"""The same from starts that are moved by a millimetre or two."""
+"""The same mission from starts that are moved by up to 2 mm."""
 A_MINIMUM = Setting("paper-centralized-concurrent", _FEW_ROWS)
 A_LEDGER = Setting("paper-centralized-concurrent", _LEDGER + _FEW_ROWS)
 
@@ -58,7 +65,7 @@ FLEET_MINIMUM = Setting("fleet", _MINIMUM + _FEW_ROWS)
 FLEET_LEDGER = Setting("fleet", _FEW_ROWS)
 
 DIFFUSIONS_M = (1, 3, 5, 7, 9, 12, 15)
-"""The paper does not list its v; these span its plot."""
+"""Diffusion rates v in m a tick. The paper does not list its v; these span its plot."""
 D_VARYING = {
     v: Setting(
         "paper-timevarying", (f"targets.diffusion_m={v}", f"samples.diffusion_m={v}", *_FEW_ROWS)
@@ -80,54 +87,54 @@ _D_READING = {
 }
 
 
-def detected(flight: MeasuredRun) -> float:
-    """Per cent of the targets."""
-    assert flight.result is not None
-    return 100.0 * (flight.result.detection_rate or 0.0)
+def detected(run: MeasuredRun) -> float:
+    """Targets detected, per cent."""
+    assert run.result is not None
+    return 100.0 * (run.result.detection_rate or 0.0)
 
 
-def first_contact(flight: MeasuredRun) -> float:
+def first_contact(run: MeasuredRun) -> float:
     """The tick in which a robot first heard another."""
-    assert flight.result is not None
-    contact = flight.result.first_contact_tick
+    assert run.result is not None
+    contact = run.result.first_contact_tick
     return math.inf if contact is None else float(contact)
 
 
-def drop_at_contact(flight: MeasuredRun) -> float:
-    """Fall of the bound's current part from before the first contact until both have heard, per cent.
+def drop_at_contact(run: MeasuredRun) -> float:
+    """Fall of the bound's current part, from before the first contact until both robots have heard, per cent.
 
     The paper merges both vectors in one tick; here each robot's message takes its own step.
     """
-    contact = first_contact(flight)
-    by_tick = {row.tick: row.w_ub_instant for row in flight.rows}
+    contact = first_contact(run)
+    by_tick = {row.tick: row.w_ub_instant for row in run.rows}
     if contact - 1 not in by_tick or contact + 1 not in by_tick:
         return 0.0
     return 100.0 * (1.0 - by_tick[int(contact) + 1] / by_tick[int(contact) - 1])
 
 
-def loosest(flight: MeasuredRun) -> float:
-    """The tight bound over the exact distance, at its loosest over the mission."""
+def loosest(run: MeasuredRun) -> float:
+    """The largest ratio of the tight bound to the exact distance in a mission."""
     return max(
         row.w_ub_tight / row.w1_exact
-        for row in flight.rows
+        for row in run.rows
         if row.w1_exact is not None and row.w_ub_tight is not None
     )
 
 
-def _bound_at_start(flight: MeasuredRun) -> float:
-    return flight.rows[0].w_ub_paper
+def _bound_at_start(run: MeasuredRun) -> float:
+    return run.rows[0].w_ub_paper
 
 
-def _bound_at_end(flight: MeasuredRun) -> float:
-    return flight.rows[-1].w_ub_paper
+def _bound_at_end(run: MeasuredRun) -> float:
+    return run.rows[-1].w_ub_paper
 
 
-def _instant_at_end(flight: MeasuredRun) -> float:
-    return flight.rows[-1].w_ub_instant
+def _instant_at_end(run: MeasuredRun) -> float:
+    return run.rows[-1].w_ub_instant
 
 
-def _robots_s(flight: MeasuredRun) -> float:
-    return flight.robots_s
+def _robots_s(run: MeasuredRun) -> float:
+    return run.robots_s
 
 
 def _row(result: Result) -> Row:
@@ -149,14 +156,16 @@ _NO_BOUND = (
 )
 _NO_PLAN_A, _NO_PLAN_C = _NO_BOUND.format("0.2421", "0.69"), _NO_BOUND.format("0.1847", "0.34")
 
-FIG_4 = Figure(
+FIG_4 = PaperFigure(
     "centralized: five robots and a supervisor",
     20,
     (
-        Median("VI-A: W_UB at the start", A, "3600", 3600, 3700, _bound_at_start, 1, " m"),
-        Median("VI-A: detected", A, "91.3 % (one run)", 88, 91, detected, 1, " %"),
-        Median("VI-A: W_UB at the end", A, "0.2421", 30, 42, _bound_at_end, 1, " m", _NO_PLAN_A),
-        Median(
+        MedianInBand("VI-A: W_UB at the start", A, "3600", 3600, 3700, _bound_at_start, 1, " m"),
+        MedianInBand("VI-A: detected", A, "91.3 % (one run)", 88, 91, detected, 1, " %"),
+        MedianInBand(
+            "VI-A: W_UB at the end", A, "0.2421", 30, 42, _bound_at_end, 1, " m", _NO_PLAN_A
+        ),
+        MedianInBand(
             "VI-A: last tick's shipping and pending",
             A,
             "0.2421",
@@ -166,12 +175,12 @@ FIG_4 = Figure(
             3,
             " m",
         ),
-        Median("VI-A: tight W_UB over exact W_1, loosest", A_EXACT, "", 1.0, 1.8, loosest, 2),
-        Median(
-            "VI-A, everybody at once, minimum: detected", A_MINIMUM, "", 64, 73, detected, 1, " %"
+        MedianInBand("VI-A: tight W_UB over exact W_1, loosest", A_EXACT, "", 1.0, 1.8, loosest, 2),
+        MedianInBand(
+            "VI-A, all robots at once, minimum: detected", A_MINIMUM, "", 64, 73, detected, 1, " %"
         ),
-        Median(
-            "VI-A, everybody at once, ledger and claims: detected",
+        MedianInBand(
+            "VI-A, all robots at once, ledger and claims: detected",
             A_LEDGER,
             "",
             86.5,
@@ -181,16 +190,16 @@ FIG_4 = Figure(
             " %",
         ),
     ),
-    lambda flights: drawing.centralized(A, flights[A_EXACT if A_EXACT in flights else A][0]),
+    lambda measured: drawing.centralized(A, measured[A_EXACT if A_EXACT in measured else A][0]),
     _row,
 )
 
-FIG_5 = Figure(
+FIG_5 = PaperFigure(
     "trajectories of SMC and of optimal transport",
     20,
     (
-        Median("VI-B: OT, detected", A, "91.3 % (one run)", 88, 91, detected, 1, " %"),
-        Median(
+        MedianInBand("VI-B: OT, detected", A, "91.3 % (one run)", 88, 91, detected, 1, " %"),
+        MedianInBand(
             "VI-B: SMC, K = 15, detected",
             A_SPECTRAL,
             "81 % (one run)",
@@ -202,7 +211,7 @@ FIG_5 = Figure(
             "every run from these starts has the same ways; hardly different starts lead to others, so "
             "one run says little",
         ),
-        Range(
+        WideRange(
             "VI-B: SMC, K = 15, starts moved by up to 2 mm: detected",
             A_NEARBY,
             "",
@@ -210,7 +219,7 @@ FIG_5 = Figure(
             detected,
             " %",
         ),
-        Ahead(
+        PairedLead(
             "VI-B: OT against SMC, from the same starts",
             A,
             A_SPECTRAL,
@@ -220,19 +229,25 @@ FIG_5 = Figure(
             " %",
         ),
     ),
-    lambda _flights: drawing.trajectories({"SMC, K = 15": A_SPECTRAL, "optimal transport": A}),
+    lambda _measured: drawing.trajectories({"SMC, K = 15": A_SPECTRAL, "optimal transport": A}),
     _row,
 )
 
-FIG_6 = Figure(
+FIG_6 = PaperFigure(
     "detection and execution time over 50 random starts",
     50,
     (
-        Median("VI-B: OT, detected", B_TRANSPORT, "89 %", 88, 90, detected, 1, " %"),
-        Median("VI-B: SMC, K = 10, detected", B_SPECTRAL[10], "< 82 %", 66, 73, detected, 1, " %"),
-        Median("VI-B: SMC, K = 15, detected", B_SPECTRAL[15], "< 82 %", 74, 80, detected, 1, " %"),
-        Median("VI-B: SMC, K = 20, detected", B_SPECTRAL[20], "< 82 %", 78, 84, detected, 1, " %"),
-        Spread(
+        MedianInBand("VI-B: OT, detected", B_TRANSPORT, "89 %", 88, 90, detected, 1, " %"),
+        MedianInBand(
+            "VI-B: SMC, K = 10, detected", B_SPECTRAL[10], "< 82 %", 66, 73, detected, 1, " %"
+        ),
+        MedianInBand(
+            "VI-B: SMC, K = 15, detected", B_SPECTRAL[15], "< 82 %", 74, 80, detected, 1, " %"
+        ),
+        MedianInBand(
+            "VI-B: SMC, K = 20, detected", B_SPECTRAL[20], "< 82 %", 78, 84, detected, 1, " %"
+        ),
+        NarrowestSpread(
             "VI-B: spread between quartiles, OT against SMC",
             B_TRANSPORT,
             tuple(B_SPECTRAL.values()),
@@ -240,7 +255,7 @@ FIG_6 = Figure(
             detected,
             " points",
         ),
-        Ratio(
+        MedianRatio(
             "VI-B: CPU time of the robots in a run, SMC 15 against OT",
             B_SPECTRAL[15],
             B_TRANSPORT,
@@ -249,30 +264,34 @@ FIG_6 = Figure(
             "it depends on how each is written; here both are compiled kernels in the same robot",
         ),
     ),
-    lambda flights: drawing.comparison(
-        {"OT": flights[B_TRANSPORT]} | {f"SMC {k}": flights[B_SPECTRAL[k]] for k in MODES},
+    lambda measured: drawing.comparison(
+        {"OT": measured[B_TRANSPORT]} | {f"SMC {k}": measured[B_SPECTRAL[k]] for k in MODES},
         detected,
         _robots_s,
     ),
     _row,
 )
 
-FIG_7 = Figure(
+FIG_7 = PaperFigure(
     "decentralized: two robots that meet",
     50,
     (
-        Median("VI-C: first contact, tick", C, "693", 685, 705, first_contact),
-        Median("VI-C: end, tick", C, "1057", 1025, 1060, finished),
-        Median("VI-C: fall of the bound at contact", C, "sudden", 20, 40, drop_at_contact, 0, " %"),
-        Share(
+        MedianInBand("VI-C: first contact, tick", C, "693", 685, 705, first_contact),
+        MedianInBand("VI-C: end, tick", C, "1057", 1025, 1060, finished),
+        MedianInBand(
+            "VI-C: fall of the bound at contact", C, "sudden", 20, 40, drop_at_contact, 0, " %"
+        ),
+        RareShare(
             "VI-C: robots miss each other and end after tick 1200",
             C,
             "",
             0.2,
-            lambda flight: finished(flight) > 1200,
+            lambda run: finished(run) > 1200,
         ),
-        Median("VI-C: W_UB at the end", C, "0.1847", 45, 60, _bound_at_end, 1, " m", _NO_PLAN_C),
-        Median(
+        MedianInBand(
+            "VI-C: W_UB at the end", C, "0.1847", 45, 60, _bound_at_end, 1, " m", _NO_PLAN_C
+        ),
+        MedianInBand(
             "VI-C: last tick's shipping and pending",
             C,
             "0.1847",
@@ -282,8 +301,10 @@ FIG_7 = Figure(
             3,
             " m",
         ),
-        Median("VI-C, both at once, minimum: end, tick", C_MINIMUM, "", 1130, math.inf, finished),
-        Median(
+        MedianInBand(
+            "VI-C, both at once, minimum: end, tick", C_MINIMUM, "", 1130, math.inf, finished
+        ),
+        MedianInBand(
             "VI-C, both at once, ledger and claims: end, tick",
             C_LEDGER,
             "",
@@ -291,7 +312,7 @@ FIG_7 = Figure(
             1055,
             finished,
         ),
-        Median(
+        MedianInBand(
             "five robots, range 100 m, at once, minimum: end, tick",
             FLEET_MINIMUM,
             "",
@@ -299,7 +320,7 @@ FIG_7 = Figure(
             math.inf,
             finished,
         ),
-        Median(
+        MedianInBand(
             "five robots, range 100 m, at once, ledger and claims: end, tick",
             FLEET_LEDGER,
             "",
@@ -308,28 +329,32 @@ FIG_7 = Figure(
             finished,
         ),
     ),
-    lambda flights: drawing.decentralized(C, flights[C], finished),
+    lambda measured: drawing.decentralized(C, measured[C], finished),
     _row,
 )
 
-FIG_8 = Figure(
+FIG_8 = PaperFigure(
     "moving targets, v = 7: samples that stand and samples that walk",
     10,
     (
-        Median("VI-D: samples stand, detected", D_INVARIANT[7], "fewer", 57, 63, detected, 1, " %"),
-        Median("VI-D: samples walk, detected", D_VARYING[7], "more", 71, 77, detected, 1, " %"),
+        MedianInBand(
+            "VI-D: samples stand, detected", D_INVARIANT[7], "fewer", 57, 63, detected, 1, " %"
+        ),
+        MedianInBand(
+            "VI-D: samples walk, detected", D_VARYING[7], "more", 71, 77, detected, 1, " %"
+        ),
     ),
-    lambda _flights: drawing.moving(
+    lambda _measured: drawing.moving(
         {"samples stand": D_INVARIANT[7], "samples walk": D_VARYING[7]}
     ),
     _row,
 )
 
-FIG_9 = Figure(
+FIG_9 = PaperFigure(
     "detection against the diffusion rate",
     10,
     tuple(
-        Ahead(
+        PairedLead(
             f"VI-D: v = {v}: detected, samples walk against stand",
             D_VARYING[v],
             D_INVARIANT[v],
@@ -342,9 +367,9 @@ FIG_9 = Figure(
         )
         for v in DIFFUSIONS_M
     ),
-    lambda flights: drawing.diffusion(
-        {v: flights[D_VARYING[v]] for v in DIFFUSIONS_M},
-        {v: flights[D_INVARIANT[v]] for v in DIFFUSIONS_M},
+    lambda measured: drawing.diffusion(
+        {v: measured[D_VARYING[v]] for v in DIFFUSIONS_M},
+        {v: measured[D_INVARIANT[v]] for v in DIFFUSIONS_M},
         detected,
     ),
     _row,

@@ -1,10 +1,10 @@
-"""Puig, Garcia, Wu: exploration of regions by K-means (KME) beside three other ways: figures 6 to 8.
+"""Puig, Garcia, Wu: exploration of regions by K-means (KME) compared with three other planners: figures 6 to 8.
 
-KME beside Yamauchi's nearest frontier, Burgard et al.'s coordinated frontiers and Zlot et al.'s market,
-by how evenly eight regions of a map are explored. Configurations are 3 maps x 2 kinds of starts x 2 to 8
+KME is compared with Yamauchi's nearest frontier, Burgard et al.'s coordinated frontiers and Zlot et al.'s
+market, by how evenly eight regions of a map are explored. Configurations are 3 maps x 2 kinds of starts x 2 to 8
 robots x 15 spots. Neither the maps, nor the sensor, nor how Zlot's robots propose goals are in the paper;
 readings are those of an independent simulator on maps of these kinds with goals by quadtree. All four
-choose anew whenever a robot arrives, and a way costs its length.
+choose new targets whenever a robot arrives, and a way costs its length.
 """
 
 import functools
@@ -16,16 +16,16 @@ from typing import NamedTuple
 from kantor_fleet.reproduce import explored
 from kantor_fleet.reproduce.claims import (
     Claim,
-    GeometricRatio,
+    GeometricMeanRatio,
     Group,
-    Lower,
-    Lowest,
+    LowerThroughout,
+    LowestMean,
     Measure,
     geometric,
     paired_ratios,
-    times,
+    text_of_ratio,
 )
-from kantor_fleet.reproduce.figure import Figure, ResultTable, RunRequests
+from kantor_fleet.reproduce.figure import PaperFigure, ResultTable, RunRequests
 from kantor_fleet.reproduce.measured_runs import MeasuredRuns, Setting
 from kantor_fleet.reproduce.measures import epv_mean, finished, map_row, wtv_final, wtv_mean
 from kantor_fleet.sweep.table import Row
@@ -57,26 +57,26 @@ _BY_GOALS = (
 
 
 class Configuration(NamedTuple):
-    """What all planners are compared under."""
+    """The conditions under which all planners are compared."""
 
     map: str
     starts: str
     robots: int
     spot: int
-    """Also the seed: of robots that start together it is the number of their spot."""
+    """The seed too: for robots that start together it is the number of their spot."""
 
 
 def setting(planner: str, place: str, starts: str, robots: int) -> Setting:
-    """A map explored by a planner."""
+    """The exploration of a map by a planner."""
     overrides = (f"starts.spread={starts}", f"robots.count={robots}", *_PLANNERS[planner])
     return Setting(place, overrides)
 
 
 @functools.cache
 def configurations() -> tuple[Configuration, ...]:
-    """All 630, in an order whose beginnings are even.
+    """All 630 configurations, in an order of which every beginning is balanced.
 
-    The first n are what `--runs n` takes. Any 6 in a row have every map with every kind of starts, any
+    `--runs n` takes the first n. Any 6 in a row have every map with every kind of starts, any
     7 every number of robots, any 42 all of these together; 42 later the same come with another spot.
     """
     return tuple(
@@ -90,13 +90,13 @@ def configurations() -> tuple[Configuration, ...]:
     )
 
 
-def part(runs: int) -> RunRequests:
-    """The first configurations, under all four planners."""
-    orders: dict[Setting, list[int]] = {}
+def requests(runs: int) -> RunRequests:
+    """The first configurations, each with all four planners."""
+    requested: dict[Setting, list[int]] = {}
     for place, starts, robots, spot in configurations()[:runs]:
         for planner in PLANNERS:
-            orders.setdefault(setting(planner, place, starts, robots), []).append(spot)
-    return {flown: sorted(seeds) for flown, seeds in orders.items()}
+            requested.setdefault(setting(planner, place, starts, robots), []).append(spot)
+    return {each: sorted(seeds) for each, seeds in requested.items()}
 
 
 def group(planner: str, teams: tuple[int, ...] = _MANY, starts: tuple[str, ...] = STARTS) -> Group:
@@ -137,18 +137,18 @@ _MOST = {
 def _over_all() -> Iterator[Claim]:
     for (name, measure), other in itertools.product(MEASURES.items(), OTHERS):
         most = _MOST.get((name, other), math.inf)
-        told = f"4, 8 robots: {_READING[name, other]}"
-        yield GeometricRatio(
+        reading = f"4, 8 robots: {_READING[name, other]}"
+        yield GeometricMeanRatio(
             f"4 to 8 robots, {name}: KME over {other}",
             group(KME),
             group(other),
             "" if name == "completion" else "lowest",
-            told if math.isinf(most) else f"≤ {most} ({told})",
+            reading if math.isinf(most) else f"≤ {most} ({reading})",
             measure,
             most,
             _BY_GOALS if (name, other) == ("final WTV", ZLOT) else "",
         )
-    yield Lower(
+    yield LowerThroughout(
         "mean WTV, separate starts over together",
         tuple(
             (planner, group(planner, starts=("separate",)), group(planner, starts=("together",)))
@@ -161,8 +161,8 @@ def _over_all() -> Iterator[Claim]:
 
 def _lowest(
     starts: str, measure_name: str, robots: int, planners: tuple[str, ...] = PLANNERS
-) -> Lowest:
-    return Lowest(
+) -> LowestMean:
+    return LowestMean(
         f"{robots} robots, {starts}: {measure_name}",
         tuple((name, setting(name, "unstructured", starts, robots)) for name in planners),
         "" if robots == 2 and "WTV" in measure_name else "KME lowest",
@@ -172,8 +172,8 @@ def _lowest(
     )
 
 
-def _more_robots(starts: str) -> Lower:
-    return Lower(
+def _more_robots(starts: str) -> LowerThroughout:
+    return LowerThroughout(
         f"{starts}: mean WTV, 8 robots over 2",
         tuple(
             (
@@ -190,19 +190,19 @@ def _more_robots(starts: str) -> Lower:
 
 def _curves(
     title: str, starts: str, curve: str, planners: tuple[str, ...], *claims: Claim
-) -> Figure:
-    """A panel for every team, a line for every planner."""
+) -> PaperFigure:
+    """A figure with a panel for every size of team and a line for every planner."""
     panels = {
         robots: {name: setting(name, "unstructured", starts, robots) for name in planners}
         for robots in _PLOTTED
     }
-    return Figure(
+    return PaperFigure(
         title,
         SPOTS,
         claims,
-        lambda flights: explored.curves(
+        lambda measured: explored.curves(
             {
-                robots: {name: flights[line] for name, line in panel.items()}
+                robots: {name: measured[line] for name, line in panel.items()}
                 for robots, panel in panels.items()
             },
             curve,
@@ -219,11 +219,11 @@ def _wtv_claims(starts: str, planners: tuple[str, ...]) -> Iterator[Claim]:
     yield _more_robots(starts)
 
 
-def _ratio_rows(flights: MeasuredRuns) -> Iterator[Row]:
+def _ratio_rows(measured: MeasuredRuns) -> Iterator[Row]:
     teams = {str(team): (team,) for team in TEAMS} | {"4 to 8": _MANY}
     for (name, measure), (text, team) in itertools.product(MEASURES.items(), teams.items()):
         for other in OTHERS:
-            ratios = list(paired_ratios(flights, group(KME, team), group(other, team), measure))
+            ratios = list(paired_ratios(measured, group(KME, team), group(other, team), measure))
             if ratios:
                 mean, factor = geometric(ratios)
                 yield {
@@ -235,7 +235,7 @@ def _ratio_rows(flights: MeasuredRuns) -> Iterator[Row]:
                     "factor_95": factor,
                     "kme_lowest": None,
                 }
-        lows = list(_lows(flights, team, measure))
+        lows = list(_kme_lowest(measured, team, measure))
         if lows:
             yield {
                 "measure": name,
@@ -248,17 +248,17 @@ def _ratio_rows(flights: MeasuredRuns) -> Iterator[Row]:
             }
 
 
-def _lows(flights: MeasuredRuns, team: tuple[int, ...], measure: Measure) -> Iterator[bool]:
+def _kme_lowest(measured: MeasuredRuns, team: tuple[int, ...], measure: Measure) -> Iterator[bool]:
     """Whether KME is below all others, configuration by configuration."""
     for settings in zip(*(group(planner, team) for planner in PLANNERS), strict=True):
-        for runs in zip(*(flights.get(one, ()) for one in settings), strict=True):
+        for runs in zip(*(measured.get(one, ()) for one in settings), strict=True):
             kme, *others = map(measure, runs)
             yield kme < min(others)
 
 
-def ratios(flights: MeasuredRuns) -> ResultTable:
-    """KME beside the others, by number of robots."""
-    rows = list(_ratio_rows(flights))
+def ratios(measured: MeasuredRuns) -> ResultTable:
+    """The table of KME over the others, by number of robots."""
+    rows = list(_ratio_rows(measured))
     columns = [*map(str, TEAMS), "4 to 8"]
     shown: dict[tuple[str, str], Row] = {}
     for row in rows:
@@ -269,13 +269,13 @@ def ratios(flights: MeasuredRuns) -> ResultTable:
         line[row["robots"]] = (
             f"{100.0 * row['kme_lowest']:.0f} %"
             if row["ratio"] is None
-            else times(row["ratio"], row["factor_95"])
+            else text_of_ratio(row["ratio"], row["factor_95"])
         )
         if row["ratio"] is None:
             line["KME over"] = "lowest of four"
     title = (
         f"KME over the others, geometric mean x÷ 95 % by number of robots; "
-        f"{sum(len(runs) for runs in flights.values()) // len(PLANNERS)} of {CONFIGURATIONS} configurations"
+        f"{sum(len(runs) for runs in measured.values()) // len(PLANNERS)} of {CONFIGURATIONS} configurations"
     )
     return ResultTable(title, rows, list(shown.values()))
 
@@ -301,13 +301,13 @@ FIG_8 = _curves(
     PLANNERS,
     *(_lowest("separate", "mean EPV", robots) for robots in _PLOTTED),
 )
-ALL = Figure(
+ALL = PaperFigure(
     "all configurations",
     CONFIGURATIONS,
     tuple(_over_all()),
-    lambda flights: explored.ratios(ratios(flights).rows, tuple(MEASURES), OTHERS, TEAMS),
+    lambda measured: explored.ratios(ratios(measured).rows, tuple(MEASURES), OTHERS, TEAMS),
     map_row,
-    part=part,
+    select=requests,
     table=ratios,
     kept=True,
 )

@@ -1,4 +1,4 @@
-"""The runs behind a figure: settings in, measured flights out."""
+"""The runs behind a figure: settings in, measured measured out."""
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -7,7 +7,7 @@ from typing import NamedTuple
 from kantor_fleet.execution.experiment import Case, Outcome, reason
 from kantor_fleet.execution.in_process_team import play, team
 from kantor_fleet.scenarios.catalog import find
-from kantor_fleet.sweep.plan import Key, plan
+from kantor_fleet.sweep.plan import RunKey, plan
 from kantor_protocol.base.machine import SUPERVISOR, Inputs, Outputs, StateMachine
 from kantor_protocol.node.recovery import KillableNode
 from kantor_protocol.scenario.schema import Scenario
@@ -17,7 +17,7 @@ from kantor_worldsim.record.records import Record
 from kantor_worldsim.world.world import WorldSetup
 
 EXACT_EVERY = 100
-"""Periods from one exact distance to the next, in the flights that have them."""
+"""Periods from one exact distance to the next, in the measured that have them."""
 
 
 class Setting(NamedTuple):
@@ -27,25 +27,25 @@ class Setting(NamedTuple):
     overrides: tuple[str, ...] = ()
     exact: bool = False
     most: int = 1_000_000
-    """Runs that are enough, however many a figure wants."""
+    """The most runs that are useful, however many a figure asks for."""
 
     @property
     def text(self) -> str:
-        """As on a command line."""
+        """The setting as on a command line."""
         return " ".join((self.scenario, *self.overrides))
 
     def find(self) -> Scenario:
-        """The scenario itself."""
+        """The scenario. Raises ScenarioError."""
         return find(self.scenario, self.overrides)
 
-    def cases(self, seeds: Iterable[int]) -> list[tuple[Key, Case]]:
-        """Runs of it, each with what it is kept under."""
+    def cases(self, seeds: Iterable[int]) -> list[tuple[RunKey, Case]]:
+        """Its runs with these seeds, each with its key in the journal."""
         text = ",".join(map(str, seeds))
         return list(plan(self.scenario, (), text, self.overrides, exact=self.exact).cases())
 
 
 class Moment(NamedTuple):
-    """A point of the curves over a map, of eight regions."""
+    """A point of the curves of a run on a map, over eight regions."""
 
     tick: int
     wtv: float
@@ -53,21 +53,21 @@ class Moment(NamedTuple):
 
 
 class MeasuredRun(Outcome, frozen=True, kw_only=True):
-    """An outcome with the course of the run."""
+    """An outcome with the rows and the curves of the run."""
 
     rows: tuple[DensityRow, ...] = ()
-    """Over a density."""
+    """Rows of a run on a density."""
     course: tuple[Moment, ...] = ()
-    """Over a map."""
+    """Curves of a run on a map."""
     robots_s: float = 0.0
     """CPU seconds inside the robots' steps: planning, weights and messages."""
 
 
 MeasuredRuns = Mapping[Setting, Sequence[MeasuredRun]]
-"""By setting, in the order of the seeds."""
+"""Runs by setting, in the order of the seeds."""
 
 
-class _Timed:
+class _TimedParticipant:
     """A participant whose steps are timed."""
 
     def __init__(self, machine: StateMachine) -> None:
@@ -81,11 +81,11 @@ class _Timed:
         return outputs
 
 
-def run_all(case: Case) -> MeasuredRun:
-    """Run a case with every referee, and keep how it went."""
+def run_measured(case: Case) -> MeasuredRun:
+    """Run a case with every checker, and keep its rows and curves."""
     try:
         return _run_one(case)
-    except Exception as error:  # noqa: BLE001  told with the others at the end
+    except Exception as error:  # noqa: BLE001  reported with the others at the end
         return MeasuredRun(failed=reason(error))
 
 
@@ -94,15 +94,15 @@ def _run_one(case: Case) -> MeasuredRun:
     site = WorldSetup.of(scenario, seed)
     machines = team(scenario, seed, site)
     timed = {
-        name: _Timed(machine)
+        name: _TimedParticipant(machine)
         for name, machine in machines.items()
-        if not isinstance(machine, KillableNode)  # one that is killed is told so by its own name
+        if not isinstance(machine, KillableNode)  # the killed are recognised by this type
     }
     recording = Recording(
         scenario, seed, "in-process", exact_every=EXACT_EVERY if case.exact else None
     )
     play(scenario, seed, site, [recording.observe], machines=machines | timed)
-    spent_ns = sum(each.spent_ns for name, each in timed.items() if name != SUPERVISOR)
+    spent_ns = sum(robot.spent_ns for name, robot in timed.items() if name != SUPERVISOR)
     result = recording.finish()
     rows = recording.metrics.rows
     mapping = scenario.map is not None
@@ -116,7 +116,7 @@ def _run_one(case: Case) -> MeasuredRun:
 
 
 def records_of(setting: Setting, seed: int) -> list[Record]:
-    """The whole record of one run, for a picture."""
+    """All records of one run, for a picture."""
     scenario = setting.find()
     site = WorldSetup.of(scenario, seed)
     records: list[Record] = []

@@ -1,4 +1,4 @@
-"""What is read off a flight, and what the CSV says of one that explored a map."""
+"""Measures of a run, and the CSV columns of a run on a map."""
 
 import msgspec
 
@@ -7,42 +7,42 @@ from kantor_fleet.sweep.table import Row
 from kantor_worldsim.observers.metrics.result import MapResult, Result
 
 
-def finished(flight: MeasuredRun) -> float:
-    """The tick at which the team finished; the last one for a run that was cut."""
-    assert flight.result is not None
-    done = flight.result.finished_tick
-    return float(flight.result.ticks if done is None else done)
+def finished(run: MeasuredRun) -> float:
+    """The tick at which the team finished; the last tick of a run that was cut."""
+    assert run.result is not None
+    done = run.result.finished_tick
+    return float(run.result.ticks if done is None else done)
 
 
-def surveyed(flight: MeasuredRun) -> MapResult:
-    """What a flight over a map came to."""
-    assert flight.result is not None
-    assert flight.result.map is not None
-    return flight.result.map
+def map_result_of(run: MeasuredRun) -> MapResult:
+    """The result of a run on a map."""
+    assert run.result is not None
+    assert run.result.map is not None
+    return run.result.map
 
 
-def distance_m(flight: MeasuredRun) -> float:
-    """Driven by all robots together."""
-    return surveyed(flight).distance_m
+def distance_m(run: MeasuredRun) -> float:
+    """Distance driven by all robots together, m."""
+    return map_result_of(run).distance_m
 
 
-def wtv_final(flight: MeasuredRun) -> float:
+def wtv_final(run: MeasuredRun) -> float:
     """Variance of the waiting times of eight regions at the end, squared ticks."""
-    return surveyed(flight).wtv_final.r8
+    return map_result_of(run).wtv_final.r8
 
 
-def wtv_mean(flight: MeasuredRun) -> float:
-    """The same over the run, with the waits that are expected of unknown cells."""
-    return surveyed(flight).wtv_mean.r8
+def wtv_mean(run: MeasuredRun) -> float:
+    """The same variance, averaged over the run, with the expected waits of unknown cells."""
+    return map_result_of(run).wtv_mean.r8
 
 
-def epv_mean(flight: MeasuredRun) -> float:
-    """Variance of the explored share of eight regions over the run, squared per cent."""
-    return surveyed(flight).epv_mean.r8
+def epv_mean(run: MeasuredRun) -> float:
+    """Variance of the explored shares of eight regions, averaged over the run, squared per cent."""
+    return map_result_of(run).epv_mean.r8
 
 
 def map_row(result: Result) -> Row:
-    """A run over a map: ticks, and all that was measured of the map."""
+    """The columns of a run on a map: ticks, and all measures of the map."""
     assert result.map is not None
     measured: Row = {}
     for name, value in msgspec.to_builtins(result.map).items():

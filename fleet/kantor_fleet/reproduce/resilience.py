@@ -1,10 +1,10 @@
-"""Quality under loss: what faults cost a team, by the paper's minimum and by the ledger with claims.
+"""Quality under loss: what faults cost a team with the paper's minimum merge, and with the ledger and claims.
 
-No paper's figure: its claims are ours. Ten robots of the default mission, all in range of one another, with
+This is no figure of a paper: its claims are kantor's. Ten robots of the default mission, all in range of one another, with
 random starts. Detection is measured where energy is scarce: every robot has 5 % more than its share of the
 M points, which suffices while nothing fails. Finishing is measured where energy is plenty: then it says
 how long a team works that does not know what is done. Every seed has the same starts and targets
-under all conditions, so that differences are taken in pairs.
+under all conditions, so that differences are paired.
 """
 
 from collections.abc import Callable, Iterator
@@ -15,9 +15,9 @@ import numpy.typing as npt
 from matplotlib.figure import Figure as Picture
 
 from kantor_fleet.reproduce import drawing
-from kantor_fleet.reproduce.claims import MISS, OK, TOLD, Measure, Verdict
-from kantor_fleet.reproduce.drawing import Course, Panel
-from kantor_fleet.reproduce.figure import Figure, ResultTable, RunRequests
+from kantor_fleet.reproduce.claims import MISS, OK, REPORTED, ClaimVerdict, Measure
+from kantor_fleet.reproduce.drawing import Curve, Panel
+from kantor_fleet.reproduce.figure import PaperFigure, ResultTable, RunRequests
 from kantor_fleet.reproduce.kabir_lee import detected
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, MeasuredRuns, Setting
 from kantor_fleet.reproduce.measures import finished
@@ -42,17 +42,17 @@ _TEAM = (
 )
 
 
-class Scourge(NamedTuple):
+class GradedFault(NamedTuple):
     """A kind of fault in several degrees."""
 
     name: str
     unit: str
     degrees: tuple[float, ...]
-    """The first one is none."""
+    """The first is 0: no fault."""
     faults: Callable[[float, int], list[str]]
-    """Entries of a scenario's list for a degree above 0 and a seed."""
+    """Entries of a scenario's `faults`, for a degree above 0 and a seed."""
     seeded: bool = False
-    """They differ from seed to seed."""
+    """The faults differ from seed to seed."""
 
 
 def _dropping(percent: float, _seed: int) -> list[str]:
@@ -66,7 +66,7 @@ def _parted(percent: float, _seed: int) -> list[str]:
 
 
 def _losing(robots: float, seed: int) -> list[str]:
-    """The same robots at the same times for every number, one more each."""
+    """Robots killed for good: one degree higher kills one more, and the others at the same times."""
     draws = np.random.default_rng(seed)
     lost, times_s = draws.permutation(ROBOTS) + 1, draws.uniform(0.0, SHARE_S, ROBOTS)
     return [
@@ -74,59 +74,62 @@ def _losing(robots: float, seed: int) -> list[str]:
     ]
 
 
-SCOURGES = (
-    Scourge("drop rate", "%", (0, 10, 20, 30, 40, 50, 60), _dropping),
-    Scourge("halves parted, share of the mission", "%", (0, 12.5, 25, 37.5, 50), _parted),
-    Scourge("robots lost for good", "of 10", (0, 1, 2, 3, 4), _losing, seeded=True),
+GRADED_FAULTS = (
+    GradedFault("drop rate", "%", (0, 10, 20, 30, 40, 50, 60), _dropping),
+    GradedFault("halves parted, share of the mission", "%", (0, 12.5, 25, 37.5, 50), _parted),
+    GradedFault("robots lost for good", "of 10", (0, 1, 2, 3, 4), _losing, seeded=True),
 )
 
 
-class Aim(NamedTuple):
-    """Something that is measured, and with how many points for each robot."""
+class Objective(NamedTuple):
+    """A measure of quality, and the energy with which it is measured."""
 
     name: str
     unit: str
     measure: Measure
     steps: int
+    """Points of each robot."""
 
 
-DETECTION = Aim("detected", " points", detected, _SCARCE)
-FINISHING = Aim("finishing", " ticks", finished, _PLENTY)
-AIMS = (DETECTION, FINISHING)
+DETECTION = Objective("detected", " points", detected, _SCARCE)
+FINISHING = Objective("finishing", " ticks", finished, _PLENTY)
+OBJECTIVES = (DETECTION, FINISHING)
 
 
-def setting(merge: str, aim: Aim, scourge: Scourge, degree: float, seed: int) -> Setting:
-    """What is flown with a seed."""
-    faults = ", ".join(scourge.faults(degree, seed)) if degree else ""
+def setting(
+    merge: str, objective: Objective, graded: GradedFault, degree: float, seed: int
+) -> Setting:
+    """The setting that is run with a seed."""
+    faults = ", ".join(graded.faults(degree, seed)) if degree else ""
     return Setting(
         "fleet",
-        (*_TEAM, f"energy.steps={aim.steps}", *MERGES[merge], *((f"faults=[{faults}]",) if faults else ())),
+        (*_TEAM, f"energy.steps={objective.steps}", *MERGES[merge], *((f"faults=[{faults}]",) if faults else ())),
     )  # fmt: skip
 
 
-def part(runs: int) -> RunRequests:
-    """Every condition with every seed."""
-    orders: dict[Setting, set[int]] = {}
-    for aim in AIMS:
-        for scourge in SCOURGES:
-            for degree in scourge.degrees:
+def requests(runs: int) -> RunRequests:
+    """All conditions with all seeds."""
+    requested: dict[Setting, set[int]] = {}
+    for objective in OBJECTIVES:
+        for graded in GRADED_FAULTS:
+            for degree in graded.degrees:
                 for merge in MERGES:
                     for seed in range(runs):
-                        flown = setting(merge, aim, scourge, degree, seed)
-                        orders.setdefault(flown, set()).add(seed)
-    return {flown: sorted(seeds) for flown, seeds in orders.items()}
+                        condition = setting(merge, objective, graded, degree, seed)
+                        requested.setdefault(condition, set()).add(seed)
+    return {condition: sorted(seeds) for condition, seeds in requested.items()}
 
 
 def values(
-    flights: MeasuredRuns, merge: str, aim: Aim, scourge: Scourge, degree: float
+    measured: MeasuredRuns, merge: str, objective: Objective, graded: GradedFault, degree: float
 ) -> npt.NDArray[np.float64]:
-    """(runs,) what was measured, in the order of the seeds."""
-    runs = len(flights[setting(merge, aim, scourge, 0, 0)])
+    """(runs,) measures in the order of the seeds."""
+    runs = len(measured[setting(merge, objective, graded, 0, 0)])
     found: list[MeasuredRun] = []
     for seed in range(runs):
-        flown = flights[setting(merge, aim, scourge, degree, seed)]
-        found.append(flown[0 if scourge.seeded and degree else seed])
-    return np.array([aim.measure(flight) for flight in found])
+        runs_there = measured[setting(merge, objective, graded, degree, seed)]
+        found.append(runs_there[0 if graded.seeded and degree else seed])
+    return np.array([objective.measure(run) for run in found])
 
 
 class Estimate(NamedTuple):
@@ -138,122 +141,127 @@ class Estimate(NamedTuple):
 
     @classmethod
     def of(cls, sample: npt.NDArray[np.float64]) -> "Estimate":
-        """The same every time."""
+        """The estimate of a sample; its resampling is seeded, so that it is the same every time."""
         drawn = np.random.default_rng(0).integers(0, sample.size, (_RESAMPLES, sample.size))
         low, high = np.quantile(sample[drawn].mean(axis=1), (0.025, 0.975)).tolist()
         return cls(float(sample.mean()), low, high)
 
     def text(self, sign: str = "") -> str:
-        """For a person."""
+        """The estimate for printing."""
         digits = 0 if abs(self.mean) >= 100.0 else 1
         mean, low, high = (f"{value:{sign}.{digits}f}" for value in self)
         return f"{mean} [{low}, {high}]"
 
 
-class Better(NamedTuple):
-    """The ledger is better than the minimum in every degree of a scourge, seed by seed."""
+class LedgerLead(NamedTuple):
+    """The ledger is better than the minimum merge in every degree of a fault, seed by seed."""
 
-    aim: Aim
-    scourge: Scourge
+    objective: Objective
+    graded: GradedFault
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Of no fault; the figure knows the others."""
-        return tuple(setting(merge, self.aim, self.scourge, 0, 0) for merge in MERGES)
+        """The settings without faults; the figure adds the others."""
+        return tuple(setting(merge, self.objective, self.graded, 0, 0) for merge in MERGES)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """The smallest gap, with its interval; ahead if every interval lies above 0."""
-        sign = 1.0 if self.aim is DETECTION else -1.0
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """The smallest lead, with its interval; met if every interval lies above 0."""
+        sign = 1.0 if self.objective is DETECTION else -1.0
         gaps = {
-            degree: Estimate.of(sign * (self._values(flights, "ledger", degree) - self._values(flights, "min", degree)))
-            for degree in self.scourge.degrees
+            degree: Estimate.of(sign * (self._values(measured, "ledger", degree) - self._values(measured, "min", degree)))
+            for degree in self.graded.degrees
         }  # fmt: skip
         degree, least = min(gaps.items(), key=lambda item: item[1].low)
         met = all(gap.low > 0.0 for gap in gaps.values())
-        what = "more detected" if self.aim is DETECTION else "sooner finished"
-        return Verdict(
+        lead = "more detected" if self.objective is DETECTION else "sooner finished"
+        return ClaimVerdict(
             figure,
-            f"{self.scourge.name}: ledger over min, {what}, in every degree",
+            f"{self.graded.name}: ledger over min, {lead}, in every degree",
             "",
             "above 0",
-            f"least {least.text('+')}{self.aim.unit} at {degree:g} {self.scourge.unit}",
+            f"least {least.text('+')}{self.objective.unit} at {degree:g} {self.graded.unit}",
             OK if met else MISS,
         )
 
-    def _values(self, flights: MeasuredRuns, merge: str, degree: float) -> npt.NDArray[np.float64]:
-        return values(flights, merge, self.aim, self.scourge, degree)
+    def _values(self, measured: MeasuredRuns, merge: str, degree: float) -> npt.NDArray[np.float64]:
+        return values(measured, merge, self.objective, self.graded, degree)
 
 
-class Price(NamedTuple):
-    """What the worst degree of a scourge costs; told as measured."""
+class CostOfFault(NamedTuple):
+    """The cost of the highest degree of a fault: reported, not judged."""
 
     merge: str
-    aim: Aim
-    scourge: Scourge
+    objective: Objective
+    graded: GradedFault
 
     @property
     def settings(self) -> tuple[Setting, ...]:
-        """Of no fault; the figure knows the others."""
-        return (setting(self.merge, self.aim, self.scourge, 0, 0),)
+        """The settings without faults; the figure adds the others."""
+        return (setting(self.merge, self.objective, self.graded, 0, 0),)
 
-    def judge(self, figure: str, flights: MeasuredRuns) -> Verdict:
-        """The paired change."""
-        worst = self.scourge.degrees[-1]
+    def judge(self, figure: str, measured: MeasuredRuns) -> ClaimVerdict:
+        """The paired change from no fault to the highest degree."""
+        worst = self.graded.degrees[-1]
         none, much = (
-            values(flights, self.merge, self.aim, self.scourge, degree) for degree in (0, worst)
+            values(measured, self.merge, self.objective, self.graded, degree)
+            for degree in (0, worst)
         )
-        text = f"{self.scourge.name}: {self.merge}, {self.aim.name}, {worst:g} {self.scourge.unit} against none"
-        ours = f"{Estimate.of(much - none).text('+')}{self.aim.unit}"
-        return Verdict(figure, text, "", "as measured", ours, TOLD)
+        text = f"{self.graded.name}: {self.merge}, {self.objective.name}, {worst:g} {self.graded.unit} against none"
+        ours = f"{Estimate.of(much - none).text('+')}{self.objective.unit}"
+        return ClaimVerdict(figure, text, "", "as measured", ours, REPORTED)
 
 
-def _estimates(flights: MeasuredRuns, merge: str, aim: Aim, scourge: Scourge) -> Iterator[Estimate]:
-    for degree in scourge.degrees:
-        yield Estimate.of(values(flights, merge, aim, scourge, degree))
+def _estimates(
+    measured: MeasuredRuns, merge: str, objective: Objective, graded: GradedFault
+) -> Iterator[Estimate]:
+    for degree in graded.degrees:
+        yield Estimate.of(values(measured, merge, objective, graded, degree))
 
 
-def _draw(flights: MeasuredRuns) -> Picture:
+def _draw(measured: MeasuredRuns) -> Picture:
     panels = [
         Panel(
-            f"{scourge.name}, {scourge.unit}",
-            "detected, % (energy scarce)" if aim is DETECTION else "finished, tick (energy plenty)",
+            f"{graded.name}, {graded.unit}",
+            "detected, % (energy scarce)"
+            if objective is DETECTION
+            else "finished, tick (energy plenty)",
             {
-                merge: Course(scourge.degrees, tuple(_estimates(flights, merge, aim, scourge)))
+                merge: Curve(graded.degrees, tuple(_estimates(measured, merge, objective, graded)))
                 for merge in MERGES
             },
         )
-        for aim in AIMS
-        for scourge in SCOURGES
+        for objective in OBJECTIVES
+        for graded in GRADED_FAULTS
     ]
-    return drawing.resilience(panels, len(SCOURGES))
+    return drawing.resilience(panels, len(GRADED_FAULTS))
 
 
-def _table(flights: MeasuredRuns) -> ResultTable:
-    rows = list(_rows(flights))
+def _table(measured: MeasuredRuns) -> ResultTable:
+    rows = list(_rows(measured))
     shown: list[Row] = []
-    columns = [f"{merge}: {aim.name}" for aim in AIMS for merge in MERGES]
-    for scourge in SCOURGES:
-        for degree in scourge.degrees:
-            here = [r for r in rows if (r["fault"], r["degree"]) == (scourge.name, degree)]
+    columns = [f"{merge}: {objective.name}" for objective in OBJECTIVES for merge in MERGES]
+    for graded in GRADED_FAULTS:
+        for degree in graded.degrees:
+            here = [r for r in rows if (r["fault"], r["degree"]) == (graded.name, degree)]
             cells = [Estimate(r["mean"], r["low_95"], r["high_95"]).text() for r in here]
-            fault = f"{scourge.name}: {degree:g} {scourge.unit}"
-            shown.append({"fault": fault} | dict(zip(columns, cells, strict=True)))
+            condition = f"{graded.name}: {degree:g} {graded.unit}"
+            shown.append({"fault": condition} | dict(zip(columns, cells, strict=True)))
     runs = rows[0]["runs"]
     title = f"{ROBOTS} robots, N = {SAMPLES}, M = {POINTS}, mean [95 %] over {runs} seeds: detected, %; finished, tick"
     return ResultTable(title, rows, shown)
 
 
-def _rows(flights: MeasuredRuns) -> Iterator[Row]:
-    for scourge in SCOURGES:
-        for degree in scourge.degrees:
-            for aim in AIMS:
+def _rows(measured: MeasuredRuns) -> Iterator[Row]:
+    for graded in GRADED_FAULTS:
+        for degree in graded.degrees:
+            for objective in OBJECTIVES:
                 for merge in MERGES:
-                    sample = values(flights, merge, aim, scourge, degree)
+                    sample = values(measured, merge, objective, graded, degree)
                     mean, low, high = Estimate.of(sample)
                     yield {
-                        "fault": scourge.name,
+                        "fault": graded.name,
                         "degree": degree,
-                        "measure": aim.name,
+                        "measure": objective.name,
                         "merge": merge,
                         "runs": sample.size,
                         "mean": mean,
@@ -276,21 +284,26 @@ def _row(result: Result) -> Row:
     }
 
 
-def _claims() -> Iterator[Better | Price]:
-    yield from (Better(aim, scourge) for aim in AIMS for scourge in SCOURGES)
+def _claims() -> Iterator[LedgerLead | CostOfFault]:
     yield from (
-        Price(merge, aim, scourge) for aim in AIMS for scourge in SCOURGES for merge in MERGES
+        LedgerLead(objective, graded) for objective in OBJECTIVES for graded in GRADED_FAULTS
+    )
+    yield from (
+        CostOfFault(merge, objective, graded)
+        for objective in OBJECTIVES
+        for graded in GRADED_FAULTS
+        for merge in MERGES
     )
 
 
 FIGURES = {
-    "resilience": Figure(
+    "resilience": PaperFigure(
         "quality under loss: drop rate, partitions, lost robots",
         RUNS,
         tuple(_claims()),
         _draw,
         _row,
-        part=part,
+        select=requests,
         table=_table,
         kept=True,
     )

@@ -1,11 +1,11 @@
-"""A fleet's private authority: it issues the certificates of its members and keeps the register of them.
+"""A fleet's private authority: it issues the certificates of its members and keeps the member list.
 
 Everything is in one folder on the operator's machine: `authority.toml`, which never leaves it, and an identity
-file for each member, to be handed to whoever runs it. The identities of routers, world-sim's and those of sites,
-carry a copy of the register.
+file for each member, to be brought to the machine of that member. The identities of routers, world-sim's and those
+of sites, carry a copy of the member list (error messages call it the register).
 
-A file is written whole or not at all, the identities first, then the authority's register, then the routers' copies.
-So whatever interrupts this, running it again makes good what is missing.
+A file is written in one step or not at all: the identities first, then the authority's member list, then the
+routers' copies. After any interruption, running the command again completes what is missing.
 """
 
 import fcntl
@@ -43,13 +43,13 @@ from kantor_protocol.transport.credentials import (
 ROBOTS_MAX = 1000
 DAYS_MAX = 3650
 _AUTHORITY_DAYS = 7300
-"""How long an authority issues: longer than any certificate of it lasts."""
+"""Validity of an authority's own certificate: longer than that of any certificate it issues."""
 _EARLIER = timedelta(days=1)
 """Certificates are valid from a day before they are made, for clocks that are behind."""
 _HOSTS = ("localhost", "127.0.0.1", "::1")
 """Names that every router's certificate has, beside its id."""
 _SITE = "site-"
-"""What the id of a site's router begins with."""
+"""The prefix of the id of a site's router."""
 _SITE_PATTERN = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
 _ROBOT_PATTERN = re.compile(r"r[1-9][0-9]{0,3}")
 _HOST_PATTERN = re.compile(r"(?!-)[A-Za-z0-9-]{1,63}(\.(?!-)[A-Za-z0-9-]{1,63})*")
@@ -59,7 +59,7 @@ Sites = dict[ParticipantId, tuple[ParticipantId, ...]]
 
 
 class Authority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What `authority.toml` holds. certificate, key: PEM."""
+    """The content of `authority.toml`. certificate, key: PEM."""
 
     fleet: str
     certificate: str
@@ -68,10 +68,10 @@ class Authority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     members: dict[ParticipantId, Member] = {}
     sites: Sites = {}
     hosts: dict[ParticipantId, tuple[str, ...]] = {}
-    """Names by which others reach a router, beside those that it has anyway."""
+    """Names by which others reach a router, in addition to `_HOSTS` and its id."""
 
-    def register(self, router: ParticipantId) -> dict[str, Any]:
-        """The fields of a router's identity that say whom it lets in."""
+    def member_list(self, router: ParticipantId) -> dict[str, Any]:
+        """The fields of a router's identity by which it admits members."""
         if router == HOST:
             return {"revoked": self.revoked, "members": self.members, "sites": self.sites}
         names = (HOST, *self.sites.get(router, ()))
@@ -81,7 +81,7 @@ class Authority(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Wanted(msgspec.Struct, frozen=True):
-    """What an operator asks of the authority."""
+    """A request of the operator to the authority."""
 
     fleet: str
     robots: int = 0
@@ -96,23 +96,24 @@ class Wanted(msgspec.Struct, frozen=True):
 
 
 def issue(folder: Path, wanted: Wanted, now: datetime) -> list[str]:
-    """Do what is wanted; a line for each thing that was done. Raises CredentialsError, OSError.
+    """Carry out a request; a line for each change. Raises CredentialsError, OSError.
 
-    now: with its zone. Members that the register has are kept, whether their files are here or have been
-    handed out.
+    now: with its time zone. Members on the list are kept, whether their files are here or on their machines.
     """
     _check(wanted)
     with _locked(folder):
         before = _open(folder, wanted.fleet)
-        authority = _asked(before or _found(wanted.fleet, now), wanted)
+        authority = _updated(before or _new_authority(wanted.fleet, now), wanted)
         fresh = _fresh(before, authority, wanted)
         made = {user: _certify(authority, user, wanted.days, now) for user in fresh}
         issued = {user: Member(identity.name, identity.until) for user, identity in made.items()}
-        members = dict(sorted((authority.members | issued).items(), key=lambda row: _order(row[0])))
+        members = dict(
+            sorted((authority.members | issued).items(), key=lambda row: _sort_key(row[0]))
+        )
         authority = msgspec.structs.replace(authority, members=members)
         routers = _routers(folder, before, authority, made)
 
-        if before is None:  # first of all: whatever it has signed is worth nothing without it
+        if before is None:  # first: without it, what it has signed cannot be used
             _save(folder / f"{AUTHORITY}.toml", msgspec.structs.replace(authority, members={}))
         for user, identity in made.items():
             if user not in routers:
@@ -120,22 +121,22 @@ def issue(folder: Path, wanted: Wanted, now: datetime) -> list[str]:
         _save(folder / f"{AUTHORITY}.toml", authority)
         for user, identity in routers.items():
             _save(folder / f"{user}.toml", identity)
-    return _news(
+    return _changes(
         folder, wanted, fresh, [] if before is None else list(routers), first=before is None
     )
 
 
-def _asked(authority: Authority, wanted: Wanted) -> Authority:
-    """The authority without who is revoked, and with the sites and the names that are wanted.
+def _updated(authority: Authority, wanted: Wanted) -> Authority:
+    """The authority without revoked members, and with the sites and names of the request.
 
     Raises CredentialsError.
     """
     _check_known(authority, wanted)
     withdrawn = tuple(authority.members[user].name for user in wanted.revoke)
-    placed = _placed(wanted)
-    everywhere = {name for there in placed.values() for name in there}
+    placed = _placements(wanted)
+    moved = {name for there in placed.values() for name in there}
     sites = {
-        site: tuple(name for name in there if name not in everywhere)
+        site: tuple(name for name in there if name not in moved)
         for site, there in authority.sites.items()
         if site not in wanted.revoke
     } | placed
@@ -157,11 +158,11 @@ def _asked(authority: Authority, wanted: Wanted) -> Authority:
 
 
 def _fresh(before: Authority | None, authority: Authority, wanted: Wanted) -> list[ParticipantId]:
-    """Who gets a new certificate. Whoever was revoked gets one only by its name. Raises CredentialsError."""
+    """The members that get a new certificate; a revoked member only if it is named. Raises CredentialsError."""
     robots = [f"r{number}" for number in range(1, wanted.robots + 1)]
     supervisor = [SUPERVISOR] if wanted.supervisor else []
     users = (HOST, OBSERVER, *authority.sites, *supervisor, *robots)
-    named = {*_placed(wanted), *wanted.renew}
+    named = {*_placements(wanted), *wanted.renew}
     without = (_withdrawn(authority) - named) | set(authority.members)
     renamed = [
         user
@@ -169,7 +170,7 @@ def _fresh(before: Authority | None, authority: Authority, wanted: Wanted) -> li
         if before and authority.hosts[user] != before.hosts.get(user)
     ]
     missing = [user for user in users if user not in without]
-    fresh = sorted({*missing, *renamed, *wanted.renew}, key=_order)
+    fresh = sorted({*missing, *renamed, *wanted.renew}, key=_sort_key)
     for site, there in authority.sites.items():
         for name in there:
             if name not in {*authority.members, *fresh, *_withdrawn(authority)}:
@@ -186,29 +187,31 @@ def _routers(
     authority: Authority,
     made: dict[ParticipantId, Certificate],
 ) -> dict[ParticipantId, Certificate]:
-    """The identities of routers that are to be written, each with its copy of the register.
+    """The identities of routers that must be written, each with its copy of the member list.
 
-    Raises CredentialsError if one is needed that is not here.
+    Raises CredentialsError if one of them is not in the folder.
     """
     changed = {}
     for router in (HOST, *authority.sites):
         path = folder / f"{router}.toml"
         old = made.get(router) or read(path, Certificate)
         if old is None or old.name != authority.members[router].name:
-            same = before is not None and before.register(router) == authority.register(router)
+            same = before is not None and before.member_list(router) == authority.member_list(
+                router
+            )
             if same and not path.exists():
-                continue  # it has been handed out
+                continue  # it is on its machine
             raise CredentialsError(
-                f"{path}: not here or no use, and it carries the register; bring it back, "
+                f"{path}: missing or not usable, and it carries the register; bring it back, "
                 f"or `kantor keys {authority.fleet} --renew {router}`"
             )
-        new = msgspec.structs.replace(old, **authority.register(router))
+        new = msgspec.structs.replace(old, **authority.member_list(router))
         if router in made or new != old:
             changed[router] = new
     return changed
 
 
-def _news(
+def _changes(
     folder: Path,
     wanted: Wanted,
     fresh: list[ParticipantId],
@@ -228,7 +231,7 @@ def _news(
 
 
 def listing(folder: Path, fleet: str, now: datetime) -> list[str]:
-    """A line for each certificate: whose, which, until when, and whether it counts. Raises CredentialsError."""
+    """A line for each certificate: member, name, and expiry or revocation. Raises CredentialsError."""
     authority = _open(folder, fleet)
     if authority is None:
         raise CredentialsError(
@@ -243,7 +246,7 @@ def listing(folder: Path, fleet: str, now: datetime) -> list[str]:
 
 
 def _check(wanted: Wanted) -> None:
-    """Raises CredentialsError."""
+    """Check the form of a request. Raises CredentialsError."""
     if not FLEET_PATTERN.fullmatch(wanted.fleet):
         raise CredentialsError(f"{wanted.fleet}: use lower-case letters, digits and dashes")
     if not 0 <= wanted.robots <= ROBOTS_MAX:
@@ -253,22 +256,22 @@ def _check(wanted: Wanted) -> None:
     for _, host in map(_host_of, wanted.hosts):
         if not _is_address(host) and not _HOST_PATTERN.fullmatch(host):
             raise CredentialsError(f"--host {host}: give a name or an IP address, without a port")
-    _placed(wanted)
+    _placements(wanted)
     both = sorted(set(wanted.renew) & set(wanted.revoke))
     if both:
         raise CredentialsError(
-            f"--renew {both[0]} --revoke {both[0]}: renewed, the old one ceases to count"
+            f"--renew {both[0]} --revoke {both[0]}: a renewal revokes the old one already"
         )
 
 
 def _host_of(text: str) -> tuple[ParticipantId, str]:
-    """NAME, of world-sim, or SITE=NAME."""
+    """The router and the name in NAME, which is world-sim's, or SITE=NAME."""
     site, equals, host = text.rpartition("=")
     return (f"{_SITE}{site}" if equals else HOST), host
 
 
-def _placed(wanted: Wanted) -> Sites:
-    """Which robots stand behind which site. Raises CredentialsError."""
+def _placements(wanted: Wanted) -> Sites:
+    """The robots of each site in the request. Raises CredentialsError."""
     placed: Sites = {}
     for text in wanted.sites:
         site, _, names = text.partition("=")
@@ -276,15 +279,15 @@ def _placed(wanted: Wanted) -> Sites:
         if not _SITE_PATTERN.fullmatch(site) or not all(map(_ROBOT_PATTERN.fullmatch, there)):
             raise CredentialsError(f"--site {text}: write it as --site north=r1,r2")
         placed[f"{_SITE}{site}"] = there
-    everybody = [name for there in placed.values() for name in there]
-    for name in everybody:
-        if everybody.count(name) > 1:
-            raise CredentialsError(f"--site: {name} stands behind one site only")
+    robots = [name for there in placed.values() for name in there]
+    for name in robots:
+        if robots.count(name) > 1:
+            raise CredentialsError(f"--site: {name} can be behind one site only")
     return placed
 
 
 def _check_known(authority: Authority, wanted: Wanted) -> None:
-    """Raises CredentialsError."""
+    """Check that the named members exist. Raises CredentialsError."""
     withdrawn, see = _withdrawn(authority), f"see `kantor keys {wanted.fleet} --list`"
     for user in wanted.revoke:
         if user == HOST:
@@ -293,26 +296,26 @@ def _check_known(authority: Authority, wanted: Wanted) -> None:
             state = "is revoked already" if user in withdrawn else "is not in the register"
             raise CredentialsError(f"--revoke {user}: {state}; {see}")
     for user in wanted.renew:
-        if user.startswith(_SITE) and user not in authority.sites | _placed(wanted):
+        if user.startswith(_SITE) and user not in authority.sites | _placements(wanted):
             raise CredentialsError(f"--renew {user}: no such site; {see}")
         if user not in authority.members and user not in withdrawn:
             raise CredentialsError(f"--renew {user}: is not in the register; {see}")
 
 
 def _withdrawn(authority: Authority) -> set[ParticipantId]:
-    """Who has been revoked and has no other certificate since."""
+    """Members whose certificate was revoked without a new one since."""
     return {name.partition(".")[0] for name in authority.revoked} - set(authority.members)
 
 
-def _order(user: ParticipantId) -> tuple[bool, int, str]:
-    """Robots last, by number."""
+def _sort_key(user: ParticipantId) -> tuple[bool, int, str]:
+    """The sorting key of members: robots last, by number."""
     number = user[1:] if user[:1] == "r" else ""
     return (number.isdecimal(), int(number) if number.isdecimal() else 0, user)
 
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """One at a time."""
+    """Hold the folder: one command works in it at a time."""
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     descriptor = os.open(folder, os.O_RDONLY)
     try:
@@ -323,7 +326,7 @@ def _locked(folder: Path) -> Iterator[None]:
 
 
 def _open(folder: Path, fleet: str) -> Authority | None:
-    """The folder's authority, or None where there is none and nothing in its place."""
+    """The authority in a folder; None if the folder has no TOML file. Raises CredentialsError."""
     path = folder / f"{AUTHORITY}.toml"
     if not path.exists():
         others = sorted(found.name for found in folder.glob("*.toml"))
@@ -346,8 +349,8 @@ def _save(path: Path, content: Authority | Certificate) -> None:
     write(path, to_toml(msgspec.to_builtins(content, builtin_types=(datetime,))))
 
 
-def _found(fleet: str, now: datetime) -> Authority:
-    """A new authority."""
+def _new_authority(fleet: str, now: datetime) -> Authority:
+    """A new authority with a key of its own."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name(
         [x509.NameAttribute(NameOID.COMMON_NAME, f"{fleet[:48]}-{secrets.token_hex(4)}")]
@@ -378,7 +381,7 @@ _USAGES = (
 
 
 def _certify(authority: Authority, user: ParticipantId, days: int, now: datetime) -> Certificate:
-    """A certificate for a member, with a key of its own. Only world-sim's is a server's."""
+    """Issue a certificate for a member, with a key of its own; those of routers are for servers too."""
     key = ec.generate_private_key(ec.SECP256R1())
     issuer = x509.load_pem_x509_certificate(authority.certificate.encode())
     issuer_key = serialization.load_pem_private_key(authority.key.encode(), password=None)
@@ -464,5 +467,5 @@ def _secret(key: ec.EllipticCurvePrivateKey) -> str:
 
 
 def today() -> datetime:
-    """Now, with its zone."""
+    """The time now, with its time zone."""
     return datetime.now(UTC)

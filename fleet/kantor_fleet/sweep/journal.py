@@ -1,7 +1,7 @@
-"""runs.jsonl: every finished run of a sweep, kept as soon as it is finished.
+"""runs.jsonl: every finished run of a sweep, written as soon as it is finished.
 
-The first line tells who wrote the file; every other line is a run. Lines are only ever added. A line
-that was torn, because the machine went down, is as if it had not been written.
+The first line names the format and the version of kantor; every other line is a run. Lines are only ever added.
+A line that was torn, because the machine went down, is dropped.
 """
 
 import fcntl
@@ -13,7 +13,7 @@ from typing import Self
 import msgspec
 
 from kantor_fleet.execution.experiment import Outcome
-from kantor_fleet.sweep.plan import Key, SweepError
+from kantor_fleet.sweep.plan import RunKey, SweepError
 
 _FORMAT = 1
 _UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
@@ -24,7 +24,7 @@ class _Header(msgspec.Struct, frozen=True):
     kantor: str
 
 
-class _Line(msgspec.Struct, frozen=True):
+class _RunLine(msgspec.Struct, frozen=True):
     scenario: str
     code: str
     seed: int
@@ -32,14 +32,14 @@ class _Line(msgspec.Struct, frozen=True):
     outcome: msgspec.Raw
 
 
-class Journal:
-    """What is known of runs, in memory and on disk; one sweep writes at a time."""
+class RunsJournal:
+    """Outcomes of runs, in memory and on disk; one process writes at a time."""
 
     def __init__(self, path: Path, kind: type[Outcome] = Outcome) -> None:
-        """Read what is there, or begin. kind: of the outcomes. Raises SweepError, OSError."""
+        """Read the file, or begin one. kind: the type of the outcomes. Raises SweepError, OSError."""
         self._kind = kind
-        self.outcomes: dict[Key, Outcome] = {}
-        """The last one that was added under each key."""
+        self.outcomes: dict[RunKey, Outcome] = {}
+        """The outcome that was added last under each key."""
         self._path = path
         self._header = _Header(_FORMAT, version("kantor"))
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -62,9 +62,9 @@ class Journal:
     ) -> None:
         self._file.close()
 
-    def add(self, key: Key, outcome: Outcome) -> None:
-        """Keep a run. The operating system has it when this returns."""
-        self._write(_Line(*key, msgspec.Raw(msgspec.json.encode(outcome))))
+    def add(self, key: RunKey, outcome: Outcome) -> None:
+        """Add a run. It has been handed to the operating system when this returns."""
+        self._write(_RunLine(*key, msgspec.Raw(msgspec.json.encode(outcome))))
         self.outcomes[key] = outcome
 
     def _lock(self) -> None:
@@ -104,14 +104,14 @@ class Journal:
 
     def _restore(self, number: int, line: bytes) -> None:
         try:
-            run = msgspec.json.decode(line, type=_Line)
+            run = msgspec.json.decode(line, type=_RunLine)
             outcome = msgspec.json.decode(run.outcome, type=self._kind)
         except _UNREADABLE as error:
             raise SweepError(
                 f"{self._path}: line {number} is no run ({error}); remove it"
             ) from None
-        self.outcomes[Key(run.scenario, run.code, run.seed, run.exact)] = outcome
+        self.outcomes[RunKey(run.scenario, run.code, run.seed, run.exact)] = outcome
 
-    def _write(self, line: _Header | _Line) -> None:
+    def _write(self, line: _Header | _RunLine) -> None:
         self._file.write(msgspec.json.encode(line) + b"\n")
         self._file.flush()

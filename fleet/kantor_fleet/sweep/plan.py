@@ -1,4 +1,4 @@
-"""What a sweep is to run: variants of a scenario, each with the same seeds."""
+"""The plan of a sweep: variants of a scenario, each with the same seeds."""
 
 import hashlib
 import itertools
@@ -25,27 +25,27 @@ class SweepError(ScenarioError):
     """A sweep that cannot be run; the message is one line with the place and the remedy."""
 
 
-class Key(NamedTuple):
-    """What a run is known by, whatever sweep asked for it."""
+class RunKey(NamedTuple):
+    """The identity of a run, the same in every sweep."""
 
     scenario: str
     """Digest of the resolved scenario and of the files that it names."""
     code: str
-    """Digest of the sources: whoever changes a planner wants new runs."""
+    """Digest of the sources: after a change of a planner, its runs are other runs."""
     seed: int
     exact: bool
 
 
 class Variant(NamedTuple):
-    """A scenario of the sweep."""
+    """One of the scenarios of a sweep."""
 
     values: tuple[Value, ...]
-    """One for each varied key."""
+    """A value for each varied key."""
     scenario: Scenario
     digest: str
 
     def settings(self, keys: Iterable[str]) -> dict[str, str]:
-        """Its values as a user writes them."""
+        """Its values by key, as a user writes them."""
         return dict(zip(keys, map(text_of, self.values), strict=True))
 
 
@@ -53,7 +53,7 @@ class SweepPlan(NamedTuple):
     """A sweep before it runs."""
 
     keys: tuple[str, ...]
-    """The varied ones."""
+    """The varied keys."""
     variants: tuple[Variant, ...]
     """The product of all values, the last key fastest."""
     seeds: tuple[int, ...]
@@ -62,14 +62,14 @@ class SweepPlan(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The scenario's."""
+        """The name of the scenario."""
         return self.variants[0].scenario.name
 
-    def key(self, variant: Variant, seed: int) -> Key:
-        """What the journal has a run under."""
-        return Key(variant.digest, code(), seed, self.exact)
+    def key(self, variant: Variant, seed: int) -> RunKey:
+        """The key of a run in the journal."""
+        return RunKey(variant.digest, code(), seed, self.exact)
 
-    def cases(self) -> Iterator[tuple[Key, Case]]:
+    def cases(self) -> Iterator[tuple[RunKey, Case]]:
         """All runs, seed by seed: a sweep that is cut short has every variant with the same seeds."""
         for seed in self.seeds:
             for variant in self.variants:
@@ -85,10 +85,10 @@ def plan(
     *,
     exact: bool = False,
 ) -> SweepPlan:
-    """A sweep in which every variant is known to be a scenario.
+    """The plan of a sweep; every variant has been checked.
 
     scenario: as `catalog.find` takes it. vary: each `key.sub=value,value`. seeds: see `parse_seeds`.
-    overrides: for all variants alike. chaos: a file of faults, for all as well. Raises ScenarioError.
+    overrides: for all variants alike. chaos: a file of faults, for all alike. Raises ScenarioError.
     """
     varied = dict(_axis(text) for text in vary)
     keys = [text.partition("=")[0].strip() for text in vary]
@@ -133,7 +133,7 @@ def text_of(value: Value) -> str:
 
 
 def _axis(text: str) -> tuple[str, list[str]]:
-    """A key and its values, as they are written."""
+    """A varied key and its values as texts."""
     key, separator, values = text.partition("=")
     key = key.strip()
     if not separator or not key:
@@ -170,7 +170,7 @@ def _variant(
 
 
 def _value(text: str) -> Value:
-    """What a value is, for a table: a plain TOML value, or else the text."""
+    """The value of a text in a table: a plain TOML value, or else the text itself."""
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except ValueError:
@@ -179,7 +179,7 @@ def _value(text: str) -> Value:
 
 
 def _digest(scenario: Scenario) -> str:
-    """Tells scenarios apart by what they say and by what is in their files, not by where those are."""
+    """Digest of a scenario and of the contents of its files, wherever these are."""
     tree = to_tree(scenario)
     for key, name in (("samples", scenario.samples.file), ("targets", scenario.targets.file)):
         if name is not None:
@@ -198,7 +198,7 @@ def _file_digest(path: Path) -> str:
 
 
 def _refuse_twins(variants: Sequence[Variant], keys: Sequence[str]) -> None:
-    """Two variants that are one would be compared with each other."""
+    """Refuse variants that are the same scenario. Raises SweepError."""
     first: dict[str, Variant] = {}
     for variant in variants:
         twin = first.setdefault(variant.digest, variant)

@@ -1,4 +1,4 @@
-"""plot.png: one measure of a sweep over what was varied.
+"""plot.png: one measure of a sweep over the varied keys.
 
 The first varied key whose values are numbers lies on x; every combination of the others is a line, the
 median of its runs, in a band from the first to the third quartile. Without such a key every variant is
@@ -16,21 +16,21 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from kantor_fleet.report.style import FAINT, INK, TEXT_PT, TITLE_PT, add_caption, team_colours, tidy
 from kantor_fleet.sweep.plan import SweepPlan, Variant
-from kantor_fleet.sweep.summary import Line
-from kantor_fleet.sweep.table import Run, measures, replace
+from kantor_fleet.sweep.summary import SummaryRow
+from kantor_fleet.sweep.table import SweepRun, measures, replace
 
 SIZE_IN = (8.0, 5.0)
 DPI = 110
 
 _GAP = "   ·   "
 _BOX_IN = 1.1
-"""Width of a picture for each box beyond what fits."""
+"""Width of a picture for each box, if that is wider than SIZE_IN."""
 _CAPTION_LETTERS = 66
-"""What fits on a line above the axes."""
-_BY_RATIO = 20.0
-"""The largest value to the least, from which on x is logarithmic."""
-_MARKED = 8
-"""Values that x has room to name each."""
+"""Letters that fit on a line above the axes."""
+_LOG_RATIO = 20.0
+"""The ratio of the largest to the least value from which on x is logarithmic."""
+_LABELLED_MAX = 8
+"""The most values that each get a label on x."""
 _PERCENT = frozenset({"detection_rate", "mass_left", "mass_double_counted"})
 """Shares, shown in percent."""
 _NAMES = {
@@ -46,11 +46,11 @@ _NAMES = {
 
 
 def draw(
-    plan: SweepPlan, runs: Sequence[Run], lines: Sequence[Line], measure: str, path: Path
+    plan: SweepPlan, runs: Sequence[SweepRun], lines: Sequence[SummaryRow], measure: str, path: Path
 ) -> None:
     """Write the picture of a measure as PNG; no file if no run has it."""
-    ours = [line for line in lines if line.measure == measure and line.runs.n]
-    if not ours:
+    rows = [row for row in lines if row.measure == measure and row.runs.n]
+    if not rows:
         path.unlink(missing_ok=True)  # it may be of another plan
         return
     axis = _axis(plan)
@@ -60,16 +60,16 @@ def draw(
     _write_title(figure.add_subfigure(grid[0]), plan, runs, lines=axis is not None)
     axes = figure.add_subfigure(grid[1]).subplots()
     if axis is None:
-        figure.set_figwidth(max(SIZE_IN[0], _BOX_IN * len(ours)))
-        _draw_boxes(axes, plan, runs, ours)
+        figure.set_figwidth(max(SIZE_IN[0], _BOX_IN * len(rows)))
+        _draw_boxes(axes, plan, runs, rows)
     else:
-        _draw_lines(axes, plan, ours, axis)
+        _draw_lines(axes, plan, rows, axis)
     tidy(axes, "" if axis is None else plan.keys[axis], _NAMES.get(measure, measure))
     replace(path, lambda draft: figure.savefig(draft, format="png", dpi=DPI))
 
 
 def _axis(plan: SweepPlan) -> int | None:
-    """Which key lies on x: the first that takes several values, all of them numbers."""
+    """The index of the key on x: the first that takes several values, all of them numbers."""
     for index in range(len(plan.keys)):
         values = {variant.values[index] for variant in plan.variants}
         if len(values) > 1 and all(type(value) in {int, float} for value in values):
@@ -77,9 +77,9 @@ def _axis(plan: SweepPlan) -> int | None:
     return None
 
 
-def _draw_lines(axes: Axes, plan: SweepPlan, lines: Sequence[Line], axis: int) -> None:
+def _draw_lines(axes: Axes, plan: SweepPlan, lines: Sequence[SummaryRow], axis: int) -> None:
     places = _place_values(axes, sorted({_number(line.variant, axis) for line in lines}))
-    groups: dict[str, list[Line]] = {}
+    groups: dict[str, list[SummaryRow]] = {}
     for line in lines:
         groups.setdefault(_label(plan, line.variant, axis), []).append(line)
     for (label, group), colour in zip(groups.items(), team_colours(len(groups)), strict=True):
@@ -99,13 +99,13 @@ def _draw_lines(axes: Axes, plan: SweepPlan, lines: Sequence[Line], axis: int) -
 
 
 def _place_values(axes: Axes, values: Sequence[float]) -> dict[float, float]:
-    """Where each value lies on x: by ratios if they span many, side by side if one is infinite."""
+    """The place of each value on x, which is logarithmic for a large span; equal steps if a value is infinite."""
     axes.margins(x=0.03)
     finite = all(map(math.isfinite, values))
     places = dict(zip(values, values if finite else range(len(values)), strict=True))
-    if finite and 0.0 < _BY_RATIO * values[0] <= values[-1]:
+    if finite and 0.0 < _LOG_RATIO * values[0] <= values[-1]:
         axes.set_xscale("log")
-    if len(values) <= _MARKED or not finite:
+    if len(values) <= _LABELLED_MAX or not finite:
         axes.set_xticks(list(places.values()), [f"{value:g}" for value in values])
         axes.set_xticks([], minor=True)
     return places
@@ -115,7 +115,9 @@ def _number(variant: Variant, axis: int) -> float:
     return float(variant.values[axis])
 
 
-def _draw_boxes(axes: Axes, plan: SweepPlan, runs: Sequence[Run], lines: Sequence[Line]) -> None:
+def _draw_boxes(
+    axes: Axes, plan: SweepPlan, runs: Sequence[SweepRun], lines: Sequence[SummaryRow]
+) -> None:
     measure = lines[0].measure
     scale = _scale(measure)
     for place, (line, colour) in enumerate(zip(lines, team_colours(len(lines)), strict=True)):
@@ -141,7 +143,7 @@ def _draw_boxes(axes: Axes, plan: SweepPlan, runs: Sequence[Run], lines: Sequenc
 
 
 def _label(plan: SweepPlan, variant: Variant, axis: int | None) -> str:
-    """What a variant is, without what lies on x and what does not vary."""
+    """The values of a variant, without the key on x and those that do not vary."""
     words = [
         f"{key} {text}"
         for index, (key, text) in enumerate(variant.settings(plan.keys).items())
@@ -150,13 +152,15 @@ def _label(plan: SweepPlan, variant: Variant, axis: int | None) -> str:
     return _GAP.join(words)
 
 
-def _write_title(place: SubFigure, plan: SweepPlan, runs: Sequence[Run], *, lines: bool) -> None:
-    """What was run, and what the marks are."""
+def _write_title(
+    place: SubFigure, plan: SweepPlan, runs: Sequence[SweepRun], *, lines: bool
+) -> None:
+    """Write the scenario's name, the number of seeds and the meaning of the marks."""
     seeds = len({run.seed for run in runs})
     marks = "median of the runs, in a band of their quartiles" if lines else "every dot a run"
-    told = _GAP.join((f"{seeds} seeds" if seeds > 1 else "1 seed", marks))
+    caption = _GAP.join((f"{seeds} seeds" if seeds > 1 else "1 seed", marks))
     place.text(0.02, 0.66, plan.name, size=TITLE_PT, weight="bold", color=INK, va="center")
-    place.text(0.02, 0.14, told, size=TEXT_PT, color=INK, va="center")
+    place.text(0.02, 0.14, caption, size=TEXT_PT, color=INK, va="center")
 
 
 def _scale(measure: str) -> float:

@@ -1,4 +1,4 @@
-"""`kantor sweep`: from a plan to a table, and on from where it was left."""
+"""`kantor sweep`: runs the plan, resumes where it was stopped, and writes the tables."""
 
 import difflib
 import importlib.util
@@ -16,11 +16,11 @@ from kantor_fleet.execution.pools import ClusterError, Pool
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.report.progress import printable
-from kantor_fleet.report.run_progress import RunsView, table_console
+from kantor_fleet.report.run_progress import RunProgressView, table_console
 from kantor_fleet.sweep import summary, table
-from kantor_fleet.sweep.journal import Journal
-from kantor_fleet.sweep.plan import Key, SweepError, SweepPlan
-from kantor_fleet.sweep.table import Run
+from kantor_fleet.sweep.journal import RunsJournal
+from kantor_fleet.sweep.plan import RunKey, SweepError, SweepPlan
+from kantor_fleet.sweep.table import SweepRun
 from kantor_protocol.scenario.dump import to_tree
 
 RUNS = "runs.jsonl"
@@ -33,7 +33,7 @@ Format = Literal["csv", "parquet"]
 
 
 class SweepConfig(NamedTuple):
-    """A sweep, and what is wanted of it."""
+    """A sweep and the form of its results."""
 
     plan: SweepPlan
     folder: Path
@@ -44,13 +44,13 @@ class SweepConfig(NamedTuple):
 
 
 def sweep(config: SweepConfig, start: Callable[[Iterable[Case]], Pool]) -> Exit:
-    """Run what is not yet done, write what there is; what to exit with.
+    """Run what is missing in the journal and write the tables; the exit code.
 
-    start: the pool. Raises SweepError before anything is written; OSError.
+    start: the pool that runs the cases. Raises SweepError before anything is written; OSError.
     """
     _check(config)
     plan = config.plan
-    with Interrupts() as interrupts, Journal(config.folder / RUNS) as journal:
+    with Interrupts() as interrupts, RunsJournal(config.folder / RUNS) as journal:
         _write_plan(config)
         left = {case: key for key, case in plan.cases() if _is_due(config, journal, key)}
         code = _run(left, journal, start, interrupts)
@@ -72,21 +72,21 @@ def _check(config: SweepConfig) -> None:
         raise SweepError("--format parquet: needs PyArrow; pip install 'kantor[parquet]'")
 
 
-def _is_due(config: SweepConfig, journal: Journal, key: Key) -> bool:
+def _is_due(config: SweepConfig, journal: RunsJournal, key: RunKey) -> bool:
     outcome = journal.outcomes.get(key)
     return outcome is None or (outcome.failed is not None and config.retry_failed)
 
 
 def _run(
-    left: Mapping[Case, Key],
-    journal: Journal,
+    left: Mapping[Case, RunKey],
+    journal: RunsJournal,
     start: Callable[[Iterable[Case]], Pool],
     interrupts: Interrupts,
 ) -> Exit | None:
-    """Run cases into the journal; why that was cut short, if it was."""
+    """Run cases into the journal; the exit code if that was cut short."""
     if not left:
         return None
-    with RunsView(len(left)) as view, closing(start(left)) as pool:
+    with RunProgressView(len(left)) as view, closing(start(left)) as pool:
         view.note("starting workers (the first time, kernels are compiled: about half a minute)")
         try:
             for done in pool:
@@ -102,12 +102,12 @@ def _run(
     return interrupts.code
 
 
-def _verdict(runs: Iterable[Run]) -> Exit:
+def _verdict(runs: Iterable[SweepRun]) -> Exit:
     sound = all(run.outcome.result and not run.outcome.result.violations for run in runs)
     return Exit.DONE if sound else Exit.NOT_MET
 
 
-def _conclude(config: SweepConfig, runs: Sequence[Run]) -> None:
+def _conclude(config: SweepConfig, runs: Sequence[SweepRun]) -> None:
     """Write the tables and the picture, and print the main measures."""
     from kantor_fleet.sweep.plot import draw  # noqa: PLC0415  matplotlib is slow to import
 
@@ -119,12 +119,14 @@ def _conclude(config: SweepConfig, runs: Sequence[Run]) -> None:
     console = table_console()
     for measure in shown:
         console.print(summary.table_of(plan, lines, measure), markup=False)
-    _complain(runs)
+    _print_failures(runs)
     draw(plan, runs, lines, shown[0], folder / PLOT)
     print(f"  {folder}/  ({', '.join(sorted(path.name for path in folder.iterdir()))})")
 
 
-def _write_tables(config: SweepConfig, runs: Sequence[Run], lines: Sequence[summary.Line]) -> None:
+def _write_tables(
+    config: SweepConfig, runs: Sequence[SweepRun], lines: Sequence[summary.SummaryRow]
+) -> None:
     plan, folder = config.plan, config.folder
     whole = table.rows(plan, runs)
     if config.format == "parquet":
@@ -139,7 +141,7 @@ def _write_tables(config: SweepConfig, runs: Sequence[Run], lines: Sequence[summ
 
 
 def _write_plan(config: SweepConfig) -> None:
-    """What was asked for, every scenario resolved."""
+    """Write the plan, with every scenario resolved."""
     plan = config.plan
     tree = {
         "seeds": plan.seeds,
@@ -157,8 +159,8 @@ def _write_plan(config: SweepConfig) -> None:
     table.replace(config.folder / PLAN, lambda draft: draft.write_bytes(text + b"\n"))
 
 
-def _complain(runs: Iterable[Run]) -> None:
-    """Why runs failed, each reason once, and which rules were broken."""
+def _print_failures(runs: Iterable[SweepRun]) -> None:
+    """Print the reasons of failed runs, each once, and the number of runs that broke a rule."""
     reasons = Counter(run.outcome.failed for run in runs if run.outcome.failed is not None)
     for reason, times in reasons.most_common():
         print(f"  {times} failed: {printable(reason)}")

@@ -1,4 +1,4 @@
-"""What the runs of a sweep amount to: each variant by itself, and beside the first one.
+"""Statistics of a sweep: each variant by itself, and compared with the first one.
 
 Runs of the same seed share samples, targets, starts and draws, so variants are compared run by run:
 the differences scatter less than the runs do.
@@ -14,13 +14,13 @@ from rich.table import Table
 from scipy.stats import bootstrap
 
 from kantor_fleet.sweep.plan import SweepPlan, Variant
-from kantor_fleet.sweep.table import MEASURES, Row, Run, applies, measures
+from kantor_fleet.sweep.table import MEASURES, Row, SweepRun, applies, measures
 
 MAIN = (
     *("detection_rate", "finished_tick", "w_ub_paper", "w1_exact", "mass_left"),
     *("map_completed_tick", "map_distance_m", "map_wtv_final_r8", "map_epv_mean_r8"),
 )
-"""What is printed, and the first of them drawn, where it varies."""
+"""The measures that are printed if they vary; the first of them is drawn."""
 
 _RESAMPLES = 2_000
 _LEVEL = 0.95
@@ -28,54 +28,54 @@ _LEVEL = 0.95
 Numbers = npt.NDArray[np.float64]
 
 
-class Spread(NamedTuple):
-    """How numbers lie; None where there are too few."""
+class Distribution(NamedTuple):
+    """Median, quartiles and interval of numbers; None where there are too few."""
 
     n: int
     median: float | None = None
     quartile_1: float | None = None
     quartile_3: float | None = None
     low: float | None = None
-    """Of the 95 % bootstrap interval of the median."""
+    """The lower end of the 95 % bootstrap interval of the median."""
     high: float | None = None
 
     @classmethod
-    def of(cls, numbers: Numbers) -> "Spread":
-        """The same numbers give the same interval: its draws are seeded."""
+    def of(cls, numbers: Numbers) -> "Distribution":
+        """The distribution of numbers; the resampling is seeded, so that it is the same every time."""
         if not numbers.size:
             return cls(0)
         first, median, third = np.quantile(numbers, (0.25, 0.5, 0.75)).tolist()
         return cls(numbers.size, median, first, third, *_interval(numbers))
 
 
-class Line(NamedTuple):
+class SummaryRow(NamedTuple):
     """One measure of one variant."""
 
     variant: Variant
     measure: str
     failed: int
     """Runs without a result."""
-    runs: Spread
-    difference: Spread
-    """Of the runs to those of the first variant with the same seeds."""
+    runs: Distribution
+    difference: Distribution
+    """Differences of the runs to those of the first variant with the same seeds."""
 
 
-def summarize(plan: SweepPlan, runs: Iterable[Run]) -> list[Line]:
-    """A line for every variant and measure."""
+def summarize(plan: SweepPlan, runs: Iterable[SweepRun]) -> list[SummaryRow]:
+    """A row for every variant and measure."""
     by_variant: dict[str, dict[int, Row]] = {variant.digest: {} for variant in plan.variants}
     for run in runs:
         by_variant[run.variant.digest][run.seed] = measures(run.outcome.result)
     first = by_variant[plan.variants[0].digest]
     return [
-        _line(variant, name, by_variant[variant.digest], first)
+        _summary_row(variant, name, by_variant[variant.digest], first)
         for variant in plan.variants
         for name in MEASURES
         if applies(plan, name)
     ]
 
 
-def rows(plan: SweepPlan, lines: Iterable[Line]) -> list[Row]:
-    """summary.csv."""
+def rows(plan: SweepPlan, lines: Iterable[SummaryRow]) -> list[Row]:
+    """The rows of summary.csv."""
     return [
         dict(zip(plan.keys, line.variant.values, strict=True))
         | {"measure": line.measure, "failed": line.failed}
@@ -86,19 +86,19 @@ def rows(plan: SweepPlan, lines: Iterable[Line]) -> list[Row]:
 
 
 def columns(plan: SweepPlan) -> list[str]:
-    """Of summary.csv."""
-    differences = [f"difference_{name}" for name in Spread._fields]
-    return [*plan.keys, "measure", "failed", *Spread._fields, *differences]
+    """The columns of summary.csv."""
+    differences = [f"difference_{name}" for name in Distribution._fields]
+    return [*plan.keys, "measure", "failed", *Distribution._fields, *differences]
 
 
-def varying(runs: Iterable[Run], names: Sequence[str]) -> list[str]:
-    """Those measures that are not the same in all runs."""
+def varying(runs: Iterable[SweepRun], names: Sequence[str]) -> list[str]:
+    """The measures that differ between runs."""
     found = [measures(run.outcome.result) for run in runs]
     return [name for name in names if len({row[name] for row in found if row} - {None}) > 1]
 
 
-def table_of(plan: SweepPlan, lines: Iterable[Line], measure: str) -> Table:
-    """One measure for a person; in brackets 95 % intervals."""
+def table_of(plan: SweepPlan, lines: Iterable[SummaryRow], measure: str) -> Table:
+    """A printed table of one measure; 95 % intervals are in brackets."""
     table = Table(
         title=measure,
         title_style="bold",
@@ -118,39 +118,41 @@ def table_of(plan: SweepPlan, lines: Iterable[Line], measure: str) -> Table:
 
 
 def _shown(value: float | None) -> str:
-    """A number for a person."""
+    """A number for printing."""
     if value is None:
         return "-"
     return f"{value:.0f}" if abs(value) >= 1000.0 else f"{value:.3g}"
 
 
-def _cells(plan: SweepPlan, line: Line) -> list[str]:
+def _cells(plan: SweepPlan, line: SummaryRow) -> list[str]:
     first = line.variant is plan.variants[0]
     return [
         *line.variant.settings(plan.keys).values(),
         f"{line.runs.n}, {line.failed} failed" if line.failed else f"{line.runs.n}",
-        _told(line.runs),
+        _median_of(line.runs),
         f"{_shown(line.runs.quartile_1)} to {_shown(line.runs.quartile_3)}",
-        "" if first else _told(line.difference),
+        "" if first else _median_of(line.difference),
     ]
 
 
-def _told(spread: Spread) -> str:
-    if spread.low is None:
-        return _shown(spread.median)
-    return f"{_shown(spread.median)} [{_shown(spread.low)}, {_shown(spread.high)}]"
+def _median_of(numbers: Distribution) -> str:
+    if numbers.low is None:
+        return _shown(numbers.median)
+    return f"{_shown(numbers.median)} [{_shown(numbers.low)}, {_shown(numbers.high)}]"
 
 
-def _line(variant: Variant, name: str, mine: Mapping[int, Row], first: Mapping[int, Row]) -> Line:
-    values = {seed: row[name] for seed, row in mine.items() if row.get(name) is not None}
+def _summary_row(
+    variant: Variant, name: str, own: Mapping[int, Row], first: Mapping[int, Row]
+) -> SummaryRow:
+    values = {seed: row[name] for seed, row in own.items() if row.get(name) is not None}
     others = {seed: row[name] for seed, row in first.items() if row.get(name) is not None}
     differences = [value - others[seed] for seed, value in values.items() if seed in others]
-    return Line(
+    return SummaryRow(
         variant,
         name,
-        sum(not row for row in mine.values()),
-        Spread.of(np.array([*values.values()], dtype=np.float64)),
-        Spread.of(np.array(differences, dtype=np.float64)),
+        sum(not row for row in own.values()),
+        Distribution.of(np.array([*values.values()], dtype=np.float64)),
+        Distribution.of(np.array(differences, dtype=np.float64)),
     )
 
 

@@ -1,6 +1,6 @@
 """The table of a sweep: a row for each run, in the order of the plan.
 
-It depends on the runs alone, not on who ran them or when: the times are in a table of their own.
+It depends on the runs alone, not on the workers or the time: these are in a table of their own.
 """
 
 import csv
@@ -13,14 +13,14 @@ from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 import msgspec
 
 from kantor_fleet.execution.experiment import Outcome
-from kantor_fleet.sweep.plan import Key, SweepPlan, Value, Variant, text_of
+from kantor_fleet.sweep.plan import RunKey, SweepPlan, Value, Variant, text_of
 from kantor_worldsim.observers.metrics.result import Result
 
 Row = dict[str, Any]
 """A value for each column, None where there is none."""
 
 
-class Run(NamedTuple):
+class SweepRun(NamedTuple):
     """A finished run in its place in the plan."""
 
     variant: Variant
@@ -28,10 +28,10 @@ class Run(NamedTuple):
     outcome: Outcome
 
 
-def finished(plan: SweepPlan, outcomes: Mapping[Key, Outcome]) -> list[Run]:
-    """What is there of a plan, in its order."""
+def finished(plan: SweepPlan, outcomes: Mapping[RunKey, Outcome]) -> list[SweepRun]:
+    """The finished runs of a plan, in its order."""
     return [
-        Run(variant, seed, outcomes[plan.key(variant, seed)])
+        SweepRun(variant, seed, outcomes[plan.key(variant, seed)])
         for variant in plan.variants
         for seed in plan.seeds
         if plan.key(variant, seed) in outcomes
@@ -39,9 +39,9 @@ def finished(plan: SweepPlan, outcomes: Mapping[Key, Outcome]) -> list[Run]:
 
 
 def _leaves(kind: type[msgspec.Struct], before: str = "") -> Iterator[tuple[str, type]]:
-    """Names and types of a result, those of what is in it with its name before theirs.
+    """Names and types of the fields of a result; nested fields have the outer name as a prefix.
 
-    Mappings are left out: what is in them differs from variant to variant.
+    Mappings are left out: their keys differ from variant to variant.
     """
     for name, hint in get_type_hints(kind).items():
         if get_origin(hint) is dict:
@@ -54,19 +54,19 @@ def _leaves(kind: type[msgspec.Struct], before: str = "") -> Iterator[tuple[str,
 
 
 RESULT = {name: kind for name, kind in _leaves(Result) if name not in {"seed", "wall_s"}}
-"""Columns of a result, and what is in them."""
+"""Columns of a result and their types."""
 MEASURES = tuple(name for name, kind in RESULT.items() if kind in {int, float})
-"""Those that are numbers."""
-_OF_MAPS = "map_"
+"""The columns that are numbers."""
+_MAP_PREFIX = "map_"
 
 
 def applies(plan: SweepPlan, name: str) -> bool:
-    """Whether a column of a result says anything in a plan: those of maps need a mission with one."""
-    return not name.startswith(_OF_MAPS) or any(v.scenario.mapping for v in plan.variants)
+    """Whether a plan has a column of a result: those of maps need a mission on a map."""
+    return not name.startswith(_MAP_PREFIX) or any(v.scenario.mapping for v in plan.variants)
 
 
 def columns(plan: SweepPlan) -> dict[str, type]:
-    """The table's, and what is in them. A varied key that the result has too stands once, in front."""
+    """The columns of the table and their types. A varied key that the result has too appears once, in front."""
     axes = zip(*(variant.values for variant in plan.variants), strict=True)
     varied = {key: _kind(values) for key, values in zip(plan.keys, axes, strict=True)}
     found = {
@@ -75,8 +75,8 @@ def columns(plan: SweepPlan) -> dict[str, type]:
     return {**varied, "seed": int, **found, "failed": str}
 
 
-def rows(plan: SweepPlan, runs: Iterable[Run]) -> list[Row]:
-    """The table's."""
+def rows(plan: SweepPlan, runs: Iterable[SweepRun]) -> list[Row]:
+    """The rows of the table."""
     blank = dict.fromkeys(columns(plan))
     return [
         blank
@@ -88,15 +88,15 @@ def rows(plan: SweepPlan, runs: Iterable[Run]) -> list[Row]:
 
 
 def measures(result: Result | None) -> Row:
-    """A result in columns; nothing of what is not there."""
+    """A result in columns; empty without a result."""
     if result is None:
         return {}
     flat = dict(_flat(msgspec.to_builtins(result)))
     return {name: flat.get(name) for name in RESULT}
 
 
-def timings(plan: SweepPlan, runs: Iterable[Run]) -> list[Row]:
-    """Who ran what, and for how long."""
+def timings(plan: SweepPlan, runs: Iterable[SweepRun]) -> list[Row]:
+    """The rows of the table of times: the worker and the duration of each run."""
     return [
         dict(zip(plan.keys, run.variant.values, strict=True))
         | {"seed": run.seed, "wall_s": run.outcome.wall_s, "worker": run.outcome.worker}
@@ -105,7 +105,7 @@ def timings(plan: SweepPlan, runs: Iterable[Run]) -> list[Row]:
 
 
 def write_csv(path: Path, names: Sequence[str], table: Iterable[Row]) -> None:
-    """Replace a file whole. Numbers are written so that they read back as they are."""
+    """Replace a file in one step. Numbers are written so that they read back exactly."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(names)
@@ -114,7 +114,7 @@ def write_csv(path: Path, names: Sequence[str], table: Iterable[Row]) -> None:
 
 
 def write_parquet(path: Path, plan: SweepPlan, table: list[Row]) -> None:
-    """Replace a file whole; a column has one type, whatever is in it."""
+    """Replace a file in one step; every column has its declared type."""
     import pyarrow as pa  # noqa: PLC0415  an extra
     from pyarrow import parquet  # noqa: PLC0415
 
@@ -156,7 +156,7 @@ def _flat(tree: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]
 
 
 def _cell(value: Any) -> Any:
-    """A value as CSV has it: nothing, true and false, or as Python writes it."""
+    """A value in CSV: empty for None, true or false, or as Python writes it."""
     if value is None:
         return ""
     return text_of(value) if isinstance(value, bool) else value

@@ -1,4 +1,4 @@
-"""What a robot believes: shipping a point exactly (Kabir & Lee, Prop. 1), samples that move."""
+"""The belief: shipping a point exactly (Kabir & Lee, Prop. 1), samples that move."""
 
 import math
 
@@ -30,11 +30,11 @@ def belief_over(
     ledger: bool = True,
     diffusion_m: float = 0.0,
 ) -> Belief:
-    """A robot's belief before anybody has spent anything."""
+    """A robot's belief before any spending."""
     units = Units.of(points, samples_m.shape[0])
-    walk = RandomWalk(samples_m, diffusion_m, 1, 1, Purpose.SAMPLE_WALK)
+    random_walk = RandomWalk(samples_m, diffusion_m, 1, 1, Purpose.SAMPLE_WALK)
     replica = Replica(me, origins, samples_m.shape[0], units, ledger=ledger, claims=False)
-    return Belief(walk, units, replica)
+    return Belief(random_walk, units, replica)
 
 
 def spend(belief: Belief, x_m: float, y_m: float) -> Plan:
@@ -165,7 +165,7 @@ def test_last_point_ships_what_is_left() -> None:
     for _ in range(4):
         spend(other, 0.0, 0.0)
     version_vector, logs, claims = other.replica.compose(0)
-    one.replica.learn(1, version_vector, logs, claims)
+    one.replica.merge(1, version_vector, logs, claims)
     one.advance(0)
 
     assert one.weights.tolist() == [1]
@@ -174,7 +174,7 @@ def test_last_point_ships_what_is_left() -> None:
 
 
 @pytest.mark.parametrize("ledger", [True, False], ids=["ledger", "min"])
-def test_belief_holds_when_logs_outgrow_their_room(*, ledger: bool) -> None:
+def test_belief_stays_exact_when_logs_outgrow_their_arrays(*, ledger: bool) -> None:
     """A long log of one's own and a long one that comes in at once: nothing is lost of either."""
     one, other = (
         belief_over(scattered(5), 2000, me=me, origins=2, ledger=ledger) for me in range(2)
@@ -186,7 +186,7 @@ def test_belief_holds_when_logs_outgrow_their_room(*, ledger: bool) -> None:
             belief.advance(0)
             belief.replica.end_step()
     version_vector, logs, claims = other.replica.compose(0)
-    assert one.replica.learn(1, version_vector, logs, claims)
+    assert one.replica.merge(1, version_vector, logs, claims)
     one.advance(0)
     left = [min(a, b) for a, b in zip(one.weights.tolist(), other.weights.tolist(), strict=True)]
     if ledger:
@@ -205,8 +205,9 @@ def test_belief_holds_when_logs_outgrow_their_room(*, ledger: bool) -> None:
     count=st.integers(1, 12),
     ledger=st.booleans(),
     diffusion_m=st.sampled_from([0.0, 30.0]),
-    step_records=st.lists(
-        st.tuples(st.sampled_from(["spend", "other", "news", "time"]), PLACES_M), max_size=25
+    actions=st.lists(
+        st.tuples(st.sampled_from(["spend", "other spends", "message", "time"]), PLACES_M),
+        max_size=25,
     ),
 )
 def test_exactly_the_samples_with_weight_can_be_found(
@@ -214,24 +215,25 @@ def test_exactly_the_samples_with_weight_can_be_found(
     count: int,
     ledger: bool,
     diffusion_m: float,
-    step_records: list[tuple[str, tuple[float, float]]],
+    actions: list[tuple[str, tuple[float, float]]],
 ) -> None:
-    """The invariant of a belief, through spending, news, and samples that walk."""
+    """The invariants of a belief, through spending, messages, and samples that move."""
     belief, other = (
         belief_over(scattered(count), 10, me=me, origins=2, ledger=ledger, diffusion_m=diffusion_m)
         for me in range(2)
     )
-    for now_ns, (step_record, (x_m, y_m)) in enumerate(step_records):
-        if step_record == "spend":
+    for now_ns, (action, (x_m, y_m)) in enumerate(actions):
+        if action == "spend":
             belief.spend(x_m, y_m)
-        elif step_record == "other":
+        elif action == "other spends":
             other.spend(x_m, y_m)
-        elif step_record == "news":
+        elif action == "message":
             version_vector, logs, claims = other.replica.compose(0)
-            belief.replica.learn(1, version_vector, logs, claims)
+            belief.replica.merge(1, version_vector, logs, claims)
         belief.advance(now_ns)
         alive = {j for j, weight in enumerate(belief.weights.tolist()) if weight > 0}
 
+        belief.validate()
         assert in_grid(belief) == alive
         assert belief.empty == (not alive)
         belief.replica.end_step()

@@ -1,4 +1,4 @@
-"""Samples in space: every answer of the bucket grid equals a full scan."""
+"""The sample index: every answer of the bucket grid equals a full scan."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def scan(xy_m: Points, alive: set[int], x: float, y: float, skip: list[int], k: 
 
 
 def ask(grid: SampleIndex, x: float, y: float, skip: list[int], k: int) -> Answer:
-    """What the grid answers."""
+    """The answer of the grid."""
     best, near = np.zeros(k), np.zeros(k, dtype=np.int64)
     count = nearest(grid, x, y, np.array(skip, dtype=np.int64), best, near)
 
@@ -72,6 +72,7 @@ def check_pyramid(grid: SampleIndex, alive: set[int]) -> None:
         below = grid.alive[level_start : level_start + 4 * width * width]
         blocks = below.reshape(width, 2, width, 2)
         assert here.tolist() == blocks.sum(axis=(1, 3)).tolist()
+    grid.validate(weights_of(grid.xy_m.shape[0], set(range(grid.xy_m.shape[0])) - alive))
     cells = members(grid)
 
     assert int(grid.alive[0]) == len(alive)

@@ -1,4 +1,4 @@
-"""Dispatch: who gets a target, when, and on what knowledge; the same in supervisor and robot."""
+"""Assignment: which robots get a target, when, and on what knowledge; the same in supervisor and robot."""
 
 from collections.abc import Sequence
 
@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from kantor_agent.coordination import assignment
 from kantor_agent.coordination.assignment import (
     Assignment,
-    ProgressMonitor,
-    member_of,
-    order_in,
-    orders_of,
-    register_of,
+    ContactLimits,
+    assigned_target,
+    read_member,
+    robot_register,
+    supervisor_register,
     visible_team,
 )
 from kantor_agent.mapping.cost_map import CostMap
@@ -45,7 +45,7 @@ def mission(*overrides: str) -> Scenario:
 
 
 class Asked:
-    """A strategy that notes what it is asked, and sends everybody to the first frontier."""
+    """A planner that notes the situations, and sends all members to the first frontier."""
 
     negotiates = False
 
@@ -59,7 +59,7 @@ class Asked:
 
 
 class World:
-    """A chart whose frontiers a test chooses, and a dispatch over it."""
+    """A fused map whose frontiers a test chooses, and an assignment over it."""
 
     def __init__(
         self, monkeypatch: pytest.MonkeyPatch, *overrides: str, me: int | None = None
@@ -69,7 +69,7 @@ class World:
         scenario = mission(*overrides)
         self.fused_map = FusedMap(FRAME, 3)
         self.log = Replica(0, 3, entries(FRAME), None, ledger=True, claims=False)
-        self.dispatch = Assignment(scenario, CostMap(scenario, self.fused_map), 0, me)
+        self.assignment = Assignment(scenario, CostMap(scenario, self.fused_map), 0, me)
 
     def see(self, *cells: int) -> None:
         """Cells are free."""
@@ -78,7 +78,7 @@ class World:
 
     def decide(self, *group: Member, tick: int = 10) -> dict[int, Task]:
         """New tasks."""
-        return self.dispatch.decide(group, (), tick)
+        return self.assignment.decide(group, (), tick)
 
 
 def robot(place: int, target: int = NOWHERE, since: int = 0, *, arrived: bool = False) -> Member:
@@ -94,7 +94,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
     return made
 
 
-def test_nobody_is_asked_while_everybody_is_on_the_way(world: World) -> None:
+def test_the_planner_is_not_asked_while_all_robots_are_on_the_way(world: World) -> None:
     """A target that still is a frontier is kept."""
     assert world.decide(robot(0, 21), robot(1, 23)) == {}
     assert world.asked.situations == []
@@ -112,14 +112,16 @@ def test_an_event_at_one_gives_all_new_targets(world: World, event: str) -> None
     assert set(world.decide(robot(0, 21), eventful)) == {0, 1}
 
 
-def test_between_two_assignments_lies_a_gap(world: World) -> None:
-    """Of planner.replan_gap ticks since anybody in the group got its task."""
+def test_a_gap_lies_between_two_assignments(world: World) -> None:
+    """Of planner.replan_gap ticks since any robot of the team got its task."""
     assert world.decide(robot(0, 21, since=8), robot(1), tick=10) == {}
     assert set(world.decide(robot(0, 21, since=8), robot(1), tick=11)) == {0, 1}
 
 
-def test_a_robot_on_its_own_gets_a_target_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """replan_whose = own: the others are told to the strategy as others."""
+def test_a_robot_may_get_a_target_without_the_rest_of_the_team(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """replan_whose = own: the rest of the team is given to the planner as others."""
     world = World(monkeypatch, "planner.replan_whose=own")
     world.see(21, 22, 23)
 
@@ -136,7 +138,7 @@ def test_arrivals_alone_count_if_asked_for(monkeypatch: pytest.MonkeyPatch) -> N
     assert set(world.decide(robot(0, 21, arrived=True))) == {0}
 
 
-def test_who_was_out_of_contact_gets_a_target_though_nothing_is_new(world: World) -> None:
+def test_a_robot_back_in_contact_gets_a_target_though_the_map_is_the_same(world: World) -> None:
     """Its old one was forgotten meanwhile; it may have none to explore by, and would wait for ever."""
     assert set(world.decide(robot(0), robot(1), tick=10)) == {0, 1}
     assert world.decide(robot(0), robot(1), tick=20) == {}, "asked in vain is asked once"
@@ -145,14 +147,14 @@ def test_who_was_out_of_contact_gets_a_target_though_nothing_is_new(world: World
     assert set(world.decide(robot(0, 21), robot(1), tick=40)) == {0, 1}
 
 
-def test_where_somebody_has_looked_around_nobody_is_sent(world: World) -> None:
-    """It would be the nearest frontier of whoever stands on it, for ever."""
+def test_no_robot_is_sent_where_one_has_looked_around(world: World) -> None:
+    """It would be the nearest frontier of the robot that stands on it, for ever."""
     world.decide(robot(0, 21, arrived=True))
 
     assert world.asked.situations[0].frontiers.tolist() == [22, 23]
 
 
-def test_an_idle_robot_asks_again_only_when_the_chart_has_changed(
+def test_an_idle_robot_asks_again_only_when_the_map_has_changed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """There is nothing new to decide on the same map."""
@@ -165,7 +167,7 @@ def test_an_idle_robot_asks_again_only_when_the_chart_has_changed(
 
 
 def test_a_negotiating_robot_is_asked_in_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For itself alone; whoever it hears stands beside it."""
+    """For itself alone; the robots in contact are the others."""
     world = World(monkeypatch, me=1)
     world.asked.negotiates = True
     world.see(21, 22)
@@ -174,7 +176,7 @@ def test_a_negotiating_robot_is_asked_in_every_step(monkeypatch: pytest.MonkeyPa
     assert [m.robot for m in world.asked.situations[0].others] == [0]
 
 
-# What they tell one another.
+# Registers.
 
 
 @given(
@@ -184,7 +186,7 @@ def test_a_negotiating_robot_is_asked_in_every_step(monkeypatch: pytest.MonkeyPa
     arrived=st.booleans(),
     memo=st.lists(st.integers(-(2**51), 2**51), max_size=8),
 )
-def test_a_robot_is_known_as_it_is(
+def test_a_register_holds_the_whole_member(
     cell: int, target: int, since: int, memo: list[int], *, arrived: bool
 ) -> None:
     """Register and back; a memo loses zeros at its end."""
@@ -192,57 +194,57 @@ def test_a_robot_is_known_as_it_is(
         memo.pop()
     me = Member(1, cell, Task(target, tuple(memo)), since, arrived)
     register = np.zeros(20, dtype=np.int64)
-    told = register_of(me, resting=False)
-    register[: len(told)] = told
+    numbers = robot_register(me, resting=False)
+    register[: len(numbers)] = numbers
 
-    assert member_of(1, register, FRAME.cells, 100) == me
+    assert read_member(1, register, FRAME.cells, 100) == me
     register[1] += 2
-    assert member_of(1, register, FRAME.cells, 100) is None
+    assert read_member(1, register, FRAME.cells, 100) is None
 
 
 @examples(200)
 @given(numbers=st.lists(st.integers(-(2**52), 2**52), min_size=12, max_size=12))
-def test_whatever_a_register_holds_it_names_cells_of_the_map(numbers: Sequence[int]) -> None:
-    """Hostile numbers give nobody, or somebody within the map and not in the future."""
+def test_any_register_names_cells_of_the_map(numbers: Sequence[int]) -> None:
+    """Hostile numbers give no member, or one within the map and not in the future."""
     register = np.array(numbers, dtype=np.int64)
-    member = member_of(0, register, FRAME.cells, 7)
+    member = read_member(0, register, FRAME.cells, 7)
 
-    assert NOWHERE <= order_in(register, 2, FRAME.cells) < FRAME.cells
+    assert NOWHERE <= assigned_target(register, 2, FRAME.cells) < FRAME.cells
     if member is not None:
         assert 0 <= member.cell < FRAME.cells
         assert NOWHERE <= member.task.target < FRAME.cells
         assert member.since <= 7
 
 
-def test_orders_name_a_target_for_every_robot() -> None:
-    """Nowhere for whom there is none."""
-    told = orders_of({0: Task(4), 2: Task(0)}, 3, 9)
+def test_the_supervisors_register_has_a_target_for_every_robot() -> None:
+    """NOWHERE for a robot without a task."""
+    numbers = supervisor_register({0: Task(4), 2: Task(0)}, 3, 9)
     register = np.zeros(20, dtype=np.int64)
-    register[: len(told)] = told
+    register[: len(numbers)] = numbers
 
-    assert [order_in(register, i, FRAME.cells) for i in range(3)] == [4, NOWHERE, 0]
+    assert [assigned_target(register, i, FRAME.cells) for i in range(3)] == [4, NOWHERE, 0]
 
 
-def test_who_is_silent_leaves_the_group_and_then_memory() -> None:
+def test_a_silent_robot_leaves_the_team_and_later_its_target_is_free() -> None:
     """First its target counts as taken, then it is free again."""
     held = Registers(0, 2, 12, sums=False)
     other = Registers(1, 2, 12, sums=False, beacon=True)
-    held.write(register_of(robot(0, 3), resting=False))
-    other.write(register_of(robot(1, 5), resting=False))
-    held.learn(1, other.compose(), 2)
-    patience = ProgressMonitor(contact_steps=2, remember_steps=5)
+    held.write(robot_register(robot(0, 3), resting=False))
+    other.write(robot_register(robot(1, 5), resting=False))
+    held.merge(1, other.compose(), 2)
+    limits = ContactLimits(contact_timeout_steps=2, remember_steps=5)
     seen = []
     for _ in range(8):
-        group, absent = visible_team(held, 2, FRAME, 0, patience)
+        group, absent = visible_team(held, 2, FRAME, 0, limits)
         seen.append(([m.robot for m in group], absent))
         held.end_step()
 
     assert seen == [([0, 1], [])] * 3 + [([0], [5])] * 3 + [([0], [])] * 2
 
 
-def test_patience_is_counted_in_own_steps() -> None:
+def test_contact_limits_are_counted_in_own_steps() -> None:
     """A supervisor that steps twice a period waits twice as many steps."""
     scenario = mission("planner.remember_s=3", "clock.period_s=0.5")
 
-    assert ProgressMonitor.of(scenario, scenario.period_ns) == (8, 6)
-    assert ProgressMonitor.of(scenario, scenario.period_ns // 2) == (16, 12)
+    assert ContactLimits.of(scenario, scenario.period_ns) == (8, 6)
+    assert ContactLimits.of(scenario, scenario.period_ns // 2) == (16, 12)

@@ -34,7 +34,7 @@ def drive(floor: Floor, start: int, target: int, stride_m: float) -> list[tuple[
 
 @examples(100)
 @given(data=st.data(), stride_m=st.floats(0.05, 3.0))
-def test_a_robot_gets_there_and_what_is_left_never_rises(
+def test_a_robot_arrives_and_the_way_left_never_gets_longer(
     data: st.DataObject, stride_m: float
 ) -> None:
     """However slow it is, and however far ahead it sees: otherwise it would seem to be stuck."""
@@ -55,7 +55,7 @@ def test_a_robot_gets_there_and_what_is_left_never_rises(
         assert cell == start or floor.fused_map.cells[cell] == FREE
 
 
-def test_what_is_left_is_measured_along_the_way() -> None:
+def test_the_way_left_is_measured_along_the_way() -> None:
     """A long diagonal is as long as it is, not as many cells as it has."""
     floor = drawn(["." * 100] * 100)
     left = [cells for _, cells in drive(floor, 0, 9999, 1.0)]
@@ -63,12 +63,10 @@ def test_what_is_left_is_measured_along_the_way() -> None:
     assert left[:5] == pytest.approx([99 * math.sqrt(2.0) - i for i in range(5)])
 
 
-def test_there_is_no_way_through_walls_or_the_unknown() -> None:
+def test_no_way_leads_through_walls_or_unknown_cells() -> None:
     """Nor to where nothing leads."""
     for kind in (OCCUPIED, UNKNOWN):
-        floor = drawn(["...", "...", "..."])
-        floor.fused_map.cells[3:6] = kind
-        floor.fused_map.revision += 1
+        floor = drawn(["...", {OCCUPIED: "###", UNKNOWN: "   "}[kind], "..."])
         assert Navigator(floor.cost_map).head(Pose(0.5, 0.5), 8) is None
 
 
@@ -77,7 +75,6 @@ def test_a_wall_that_appears_is_driven_round() -> None:
     floor = drawn(["...", "...", "..."])
     navigator, pose = Navigator(floor.cost_map), Pose(0.5, 0.5)
     assert navigator.head(pose, 6) == (0.5, 2.5)
-    floor.fused_map.cells[3:5] = OCCUPIED
-    floor.fused_map.revision += 1
+    floor.see([3, 4], OCCUPIED)
 
     assert navigator.head(pose, 6) == (2.5, 0.5)

@@ -126,14 +126,14 @@ def test_buckets_and_heap_settle_the_same(floor: Floor) -> None:
     """Which of the two is used cannot be seen from the values."""
     _, value = spread(floor)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(routes, "_RATIO_MAX", 0.0)
+        patch.setattr(routes, "RATIO_MAX", 0.0)
         assert spread(floor)[1].tolist() == value.tolist()
 
 
 def test_costs_as_far_apart_as_the_buckets_hold_are_settled_by_them() -> None:
     """At the limit of the ratio the longest step comes just before the ring's beginning."""
     draws = np.random.default_rng(3)
-    cost = draws.choice([1.0, routes._RATIO_MAX], (40, 40))
+    cost = draws.choice([1.0, routes.RATIO_MAX], (40, 40))
     cost[0, 0] = 1.0
 
     assert spread(Floor(cost, 0))[1].tolist() == iterated(cost, 0).tolist()

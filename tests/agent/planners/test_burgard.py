@@ -77,7 +77,7 @@ def test_of_equal_pairs_it_is_the_shorter_way_then_the_robot_then_the_cell() -> 
     assert targets(floor, floor.situation([robot(0, 5)])) == [2]
 
 
-def test_more_robots_than_frontiers_all_get_one() -> None:
+def test_with_more_robots_than_frontiers_every_robot_gets_one() -> None:
     """A worth of 0 is still something to go for."""
     floor = drawn(CORRIDOR)
 
@@ -90,7 +90,7 @@ def test_more_robots_than_frontiers_all_get_one() -> None:
     ]
 
 
-def test_who_reaches_nothing_gets_nothing() -> None:
+def test_a_robot_that_reaches_no_frontier_gets_no_target() -> None:
     """Behind a wall, in a wall, or when there is no frontier at all."""
     floor = drawn(["###.....", "#.#####."])
     sealed, inside, free = robot(0, 9), robot(1, 0), robot(2, 7)
@@ -105,7 +105,7 @@ def test_who_reaches_nothing_gets_nothing() -> None:
 
 
 @pytest.mark.parametrize("taken", ["others", "absent"])
-def test_what_others_head_for_is_worth_less_before_anybody_chooses(taken: str) -> None:
+def test_targets_of_others_reduce_utilities_before_the_first_choice(taken: str) -> None:
     """From 4 it is 2 cells to 2, but somebody is on the way there; who stands there stays all the same."""
     floor = drawn(["  ......  "])
     others = [robot(1, 5, 2)] if taken == "others" else []
@@ -144,8 +144,8 @@ def test_utilities_are_multiplied_or_lessened() -> None:
 def test_coverage_is_learned_from_measured_ranges() -> None:
     """Eq. 4: three of four were at least as long as bin 10, two came back from the end or not at all."""
     floor = drawn(CORRIDOR)
-    floor.fused_map.ranges[[0, 10, RANGE_BINS - 1]] = 1, 1, 2
-    shares = Burgard(floor.scenario, 0, None)._shares(floor.fused_map.ranges)
+    floor.measure(0, 10, RANGE_BINS - 1, RANGE_BINS - 1)
+    shares = Burgard(floor.scenario, 0, None).shares(floor.fused_map.ranges)
     ten = 10 / RANGE_BINS
 
     assert coverage(0.0, 1.0, shares) == 1.0
@@ -157,7 +157,7 @@ def test_coverage_is_learned_from_measured_ranges() -> None:
 def test_where_nothing_was_measured_coverage_falls_evenly() -> None:
     """The same as without learning."""
     floor = drawn(CORRIDOR)
-    shares = Burgard(floor.scenario, 0, None)._shares(floor.fused_map.ranges)
+    shares = Burgard(floor.scenario, 0, None).shares(floor.fused_map.ranges)
 
     assert [coverage(d, 4.0, shares) for d in (0.0, 1.0, 4.0, 5.0)] == [1.0, 0.75, 0.0, 0.0]
 
@@ -166,14 +166,14 @@ def test_where_nothing_was_measured_coverage_falls_evenly() -> None:
 def test_coverage_that_is_not_learned(kind: str, at_2: float) -> None:
     """Whatever was measured."""
     floor = drawn(CORRIDOR, f"planner.coverage={kind}")
-    floor.fused_map.ranges[0] = 7
-    shares = Burgard(floor.scenario, 0, None)._shares(floor.fused_map.ranges)
+    floor.measure(*[0] * 7)
+    shares = Burgard(floor.scenario, 0, None).shares(floor.fused_map.ranges)
 
     assert coverage(2.0, 3.0, shares) == pytest.approx(at_2)
     assert coverage(3.1, 3.0, shares) == 0.0
 
 
-def test_a_wall_in_between_saves_what_lies_behind_it() -> None:
+def test_a_wall_in_between_keeps_the_utility_behind_it() -> None:
     """Cell 23 is 2 cells from a target at 1: worth 0 in the disc, unless sight counts."""
     options = ("planner.coverage=disc", "planner.beta=0.5")
     blind, seeing = drawn(ROOMS, *options), drawn(ROOMS, *options, "planner.sight=true")
@@ -213,7 +213,7 @@ def test_the_assignment_is_that_of_the_table(
 ) -> None:
     """On any floor, to the last bit: the kernel against the paper's loop in plain numbers."""
     floor, situation = data.draw(crowded(*options))
-    floor.fused_map.ranges[: len(ranges)] = ranges
+    floor.measure(*np.repeat(np.arange(len(ranges)), ranges).tolist())
 
     assert targets(floor, situation) == by_the_table(floor, situation)
 

@@ -28,7 +28,7 @@ def explorer(floor: Floor, me: int | None = None) -> Frontier:
 
 @examples(100)
 @given(data=st.data())
-def test_everybody_takes_the_cheapest_frontier(data: st.DataObject) -> None:
+def test_every_robot_takes_the_cheapest_frontier(data: st.DataObject) -> None:
     """Of equal ones the lowest; nobody cares for targets of others."""
     floor, situation = data.draw(crowded())
     expected = []
@@ -58,7 +58,7 @@ def test_a_frontier_that_was_visited_is_not_chosen_again() -> None:
     assert targets(planner, floor.situation([robot(0, 2, 7), robot(1, 2)])) == [7, 1]
 
 
-def test_one_that_was_only_headed_for_may_be_chosen_again() -> None:
+def test_a_target_that_was_not_reached_may_be_chosen_again() -> None:
     """Visited is where the robot has arrived."""
     floor = drawn(CORRIDOR)
     planner = explorer(floor)
@@ -92,27 +92,25 @@ def test_a_robot_asks_for_itself_alone() -> None:
 
 @pytest.mark.parametrize("replan_on", ["events", "arrivals"])
 def test_an_inaccessible_frontier_is_left_for_another(replan_on: str) -> None:
-    """It is void as soon as a robot has made no progress for a while: nobody heads for it any more."""
+    """It is dead as soon as a robot has made no progress for a while: no robot heads for it any more."""
     floor = drawn(CORRIDOR, "planner=frontier", f"planner.replan_on={replan_on}")
-    dispatch = Assignment(floor.scenario, floor.cost_map, 0, None)
+    assignment = Assignment(floor.scenario, floor.cost_map, 0, None)
     stuck = robot(0, 2, 1)
-    assert dispatch.decide([stuck], (), 10) == {}
-    floor.fused_map.void[1] = True
-    floor.fused_map.revision += 1
+    assert assignment.decide([stuck], (), 10) == {}
+    floor.find_dead(1)
 
-    assert dispatch.decide([stuck], (), 10)[0].target == 7
-    floor.fused_map.void[7] = True
-    floor.fused_map.revision += 1
-    assert dispatch.decide([stuck], (), 20)[0].target == NOWHERE
+    assert assignment.decide([stuck], (), 10)[0].target == 7
+    floor.find_dead(7)
+    assert assignment.decide([stuck], (), 20)[0].target == NOWHERE
 
 
-def test_a_robot_has_been_everywhere_before_it_returns() -> None:
+def test_a_robot_visits_every_frontier_before_it_returns_to_one() -> None:
     """Four frontiers that stay what they are, and a robot that arrives at one after the other."""
     floor = drawn(["## ##", "##.##", " ... ", "##.##", "## ##"], "planner=frontier")
-    dispatch = Assignment(floor.scenario, floor.cost_map, 0, 0)
+    assignment = Assignment(floor.scenario, floor.cost_map, 0, 0)
     member, visits = robot(0, 12), []
     for tick in range(10, 60, 10):
-        task = dispatch.decide([member], (), tick)[0]
+        task = assignment.decide([member], (), tick)[0]
         visits.append(task.target)
         member = Member(0, task.target, task, tick, arrived=True)
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_agent.planners.hungarian import Hungarian, _cheapest, spread_out
+from kantor_agent.planners.hungarian import Hungarian, cheapest_pairs, spread_out
 from kantor_agent.planners.map_base import Situation
 from kantor_protocol.base.grid import NOWHERE
 from support.floors import Floor, crowded, drawn, robot
@@ -32,7 +32,7 @@ def test_the_total_cost_is_least() -> None:
 
 
 @pytest.mark.parametrize("taken", ["others", "absent"])
-def test_where_others_head_for_nobody_is_sent(taken: str) -> None:
+def test_no_robot_is_sent_where_others_head_for(taken: str) -> None:
     """Nor half a sensor range around, while there is something else."""
     floor = drawn(CORRIDOR)
     others = [robot(1, 5, 3)] if taken == "others" else []
@@ -42,7 +42,7 @@ def test_where_others_head_for_nobody_is_sent(taken: str) -> None:
     assert targets(floor, floor.situation([robot(0, 4)], others, [*absent, 9])) == [2]
 
 
-def test_robots_without_a_frontier_of_their_own_take_the_cheapest() -> None:
+def test_robots_without_a_frontier_of_their_own_take_thecheapest_pairs() -> None:
     """Three robots and two frontiers: the one in the middle is left over."""
     floor = drawn(CORRIDOR)
 
@@ -58,7 +58,7 @@ def test_frontiers_side_by_side_are_one_to_choose_from() -> None:
     assert min(abs(a - b) for a, b in itertools.combinations(found, 2)) >= 2
 
 
-def test_who_reaches_nothing_gets_nothing() -> None:
+def test_a_robot_that_reaches_no_frontier_gets_no_target() -> None:
     """And takes nothing from those who do."""
     floor = drawn(["###.... ", "#.#####."])
 
@@ -83,7 +83,7 @@ def test_no_assignment_is_cheaper(seed: int, robots: int, spots: int, closed: fl
     dice = np.random.default_rng(seed)
     travel = dice.integers(0, 20, (robots, spots)).astype(float)
     travel[dice.random((robots, spots)) < closed] = math.inf
-    pairs = _cheapest(travel)
+    pairs = cheapest_pairs(travel)
 
     def rated(choice: tuple[int | None, ...]) -> tuple[int, float]:
         costs = [travel[i, spot] for i, spot in enumerate(choice) if spot is not None]
@@ -123,7 +123,7 @@ def test_spots_lie_apart(seed: int, columns: int, taken: int, apart: float) -> N
 
 @examples(150)
 @given(data=st.data())
-def test_everybody_that_can_reach_something_gets_something(data: st.DataObject) -> None:
+def test_every_robot_that_can_reach_a_frontier_gets_one(data: st.DataObject) -> None:
     """Its cheapest frontier, or one that lies half a sensor range from all that is taken."""
     floor, situation = data.draw(crowded())
     held = [member.task.target for member in situation.others if member.task.target != NOWHERE]

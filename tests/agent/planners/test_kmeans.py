@@ -1,4 +1,4 @@
-"""KME: regions of what is unknown, whose they are, and targets on the way (Puig, Garcia, Wu)."""
+"""KME: regions of unknown cells, their robots, and targets on the way (Puig, Garcia, Wu)."""
 
 import itertools
 import math
@@ -12,17 +12,17 @@ from scipy.ndimage import label
 from scipy.optimize import linear_sum_assignment
 
 from kantor_agent.mapping.cost_map import CostMap
-from kantor_agent.mapping.fused_map import FusedMap
 from kantor_agent.planners import kmeans
 from kantor_agent.planners.kmeans import NO_REGION, PARTS, ROUNDS, KMeans, Regions, blocked, choose
 from kantor_agent.planners.map_base import Member, Situation, Task
 from kantor_fleet.execution.in_process_team import play, team
 from kantor_protocol.base.counter_rng import Purpose, uniform
-from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.world.starts import observable
 from kantor_worldsim.world.world import WorldSetup, ground_of
+from support.floors import Floor
 from support.strategies import examples
 
 MISSION = """
@@ -43,22 +43,22 @@ def mission(*overrides: str) -> Scenario:
     return parse(MISSION, "regions", overrides)
 
 
-def terrain_of(kinds: np.ndarray, range_m: float = 3.0) -> CostMap:
-    """A chart of these kinds, (rows, columns), for a sensor that sees so far; cells of a metre."""
-    fused_map = FusedMap(Frame(1.0, (0.0, 0.0), *kinds.shape), 1)
-    fused_map.cells[:] = kinds.ravel()
-    fused_map.revision += 1
-    return CostMap(mission(f"sensor.range_m={range_m}"), fused_map)
+def cost_map_of(kinds: np.ndarray, range_m: float = 3.0) -> CostMap:
+    """The cost map of these kinds, (rows, columns), for a sensor of this range; cells of a metre."""
+    return Floor(kinds, f"sensor.range_m={range_m}").cost_map
 
 
-def scene(*rows: str, memos: tuple[tuple[int, ...], ...] = ()) -> Situation:
-    """Row 0 first: free floor, #, ?, and robots a, b, c … on free floor."""
+def scene(*rows: str, memos: tuple[tuple[int, ...], ...] = (), dead: int = NOWHERE) -> Situation:
+    """Row 0 first: free floor, #, ?, and robots a, b, c … on free floor. dead: a dead frontier."""
     drawn = np.array([list(row) for row in rows])
-    cost_map = terrain_of(np.vectorize(lambda sign: KINDS.get(sign, FREE))(drawn))
+    floor = Floor(np.vectorize(lambda sign: KINDS.get(sign, FREE))(drawn))
+    if dead != NOWHERE:
+        floor.find_dead(dead)
+    cost_map = floor.cost_map
     signs = sorted(set(drawn.ravel()) - set(KINDS))
     cells = [int(np.flatnonzero(drawn.ravel() == sign)[0]) for sign in signs]
-    told = [*memos, *[()] * len(cells)]
-    members = tuple(member(i, cell, memo=told[i]) for i, cell in enumerate(cells))
+    memo_of = [*memos, *[()] * len(cells)]
+    members = tuple(member(i, cell, memo=memo_of[i]) for i, cell in enumerate(cells))
     return Situation(cost_map, cost_map.fused_map.frontiers, members, (), (), 7)
 
 
@@ -216,7 +216,7 @@ def test_of_equal_targets_the_first_is_taken() -> None:
 
 
 @pytest.mark.parametrize("accessible", [True, False])
-def test_who_cannot_get_to_its_region_yet_chooses_first(*, accessible: bool) -> None:
+def test_a_robot_that_cannot_get_to_its_region_yet_chooses_first(*, accessible: bool) -> None:
     situation = scene("?..ab....?")
     regions = SimpleNamespace(
         owned=np.array([0, 1]),
@@ -225,7 +225,7 @@ def test_who_cannot_get_to_its_region_yet_chooses_first(*, accessible: bool) -> 
         diagonal=10.0,
     )
     travel = np.array([[2.0, 5.0], [3.0, 4.0]])
-    targets = kmeans._targets(situation, regions, travel, [0, 1])
+    targets = kmeans.choose_targets(situation, regions, travel, [0, 1])
     assert targets == ({0: 1, 1: 8} if accessible else {0: 8, 1: 1})
 
 
@@ -254,7 +254,7 @@ def test_with_fewer_cells_than_robots_some_have_no_region_but_all_a_target() -> 
     assert targets_of(situation) == [3, 3, 3]
 
 
-def test_who_has_no_region_keeps_the_centroid_that_it_had() -> None:
+def test_a_robot_without_a_region_keeps_its_centroid() -> None:
     memos = ((WARM, 0, 5), (WARM, 0, 6), (WARM, 0, 7))
     situation = scene("abc.?", memos=memos)
     lacks = regions_of(situation, 0, 1, 2).owned.tolist().index(NO_REGION)
@@ -267,11 +267,8 @@ def test_what_walls_enclose_belongs_to_no_region() -> None:
 
 
 def test_an_unknown_part_without_a_frontier_belongs_to_no_region() -> None:
-    # Somebody stood before the right one and saw nothing new.
-    situation = scene("?..a..?")
-    situation.cost_map.fused_map.void[5] = True
-    situation.cost_map.fused_map.revision += 1
-    situation = situation._replace(frontiers=situation.cost_map.fused_map.frontiers)
+    # A robot stood before the right one and saw nothing new.
+    situation = scene("?..a..?", dead=5)
     assert regions_of(situation, 6).places == [[0, PARTS // 2]]
     assert targets_of(situation) == [1]
 
@@ -285,20 +282,20 @@ def test_without_frontiers_regions_are_kept() -> None:
     assert assign(scene("a.#?", memos=((2, 3, 4),))) == [Task(NOWHERE, (2, 3, 4))]
 
 
-def test_nobody_idles_where_targets_are_fewer_than_robots() -> None:
+def test_no_robot_idles_where_targets_are_fewer_than_robots() -> None:
     assert targets_of(scene("abcd..?")) == [5, 5, 5, 5]
 
 
-def test_nobody_idles_because_its_frontiers_lie_near_cheaper_ones_of_others() -> None:
+def test_no_robot_idles_because_its_frontiers_lie_near_cheaper_ones_of_others() -> None:
     assert targets_of(scene("a.?.b")) == [1, 3]
 
 
-def test_a_robot_behind_walls_gets_no_target_and_harms_nobody() -> None:
+def test_a_robot_behind_walls_gets_no_target_and_others_theirs() -> None:
     tasks = assign(scene("a#b..??", "#######"))
     assert [task.target for task in tasks] == [NOWHERE, 4]
 
 
-def test_targets_of_those_who_keep_theirs_are_taken() -> None:
+def test_targets_of_robots_that_keep_theirs_are_taken() -> None:
     situation = scene("?..a.....?")
     assert targets_of(situation) == [1]
     keeps = (member(1, 4, target=1),)
@@ -354,13 +351,13 @@ def test_a_memo_that_lost_its_last_zeros_is_the_same() -> None:
     assert assign(whole) == assign(short)
 
 
-def test_everybody_who_knows_the_same_comes_to_the_same() -> None:
+def test_robots_that_know_the_same_come_to_the_same_assignment() -> None:
     situation = scene("??.a.b.???", "...c.d..??", "?????????.")
     assigned = [KMeans(mission(), 5, me).assign(situation) for me in (None, 0, 1, 2, 3)]
     assert all(tasks == assigned[0] for tasks in assigned)
 
 
-def test_nothing_depends_on_what_was_asked_before() -> None:
+def test_an_assignment_does_not_depend_on_earlier_ones() -> None:
     one, other = scene("??.a.b.???"), scene("ab??????")
     planner = KMeans(mission(), 5, None)
     first = planner.assign(one)
@@ -563,7 +560,7 @@ def situations(draw: st.DrawFn) -> Situation:
     n = rows * columns
     kinds = draw(st.lists(st.sampled_from(crowded), min_size=n, max_size=n))
     grid = np.array(kinds, dtype=np.uint8).reshape(rows, columns)
-    cost_map = terrain_of(grid, draw(st.sampled_from([0.5, 1.0, 2.5, 4.0])))
+    cost_map = cost_map_of(grid, draw(st.sampled_from([0.5, 1.0, 2.5, 4.0])))
     cells, targets = st.integers(0, n - 1), st.integers(NOWHERE, n - 1)
     robots = draw(st.lists(st.tuples(cells, targets, MEMOS), min_size=1, max_size=5))
     group = [member(i, cell, target, memo) for i, (cell, target, memo) in enumerate(robots)]
@@ -589,7 +586,7 @@ def test_the_kernels_do_what_the_equations_say(situation: Situation, seed: int) 
 
 @examples(100)
 @given(situations(), st.integers(0, 2**63 - 1))
-def test_nobody_who_can_reach_a_frontier_idles(situation: Situation, seed: int) -> None:
+def test_no_robot_that_can_reach_a_frontier_idles(situation: Situation, seed: int) -> None:
     tasks = KMeans(mission(), seed, None).assign(situation)
     for m, task in zip(situation.members, tasks, strict=True):
         reached = np.isfinite(situation.cost_map.travel(m.cell)[situation.frontiers])
@@ -636,7 +633,7 @@ def test_k_means_is_exact_and_leaves_no_region_empty(
     points, columns, starts = case
     centroids = np.array(starts, dtype=np.float64)
     region = np.full(12 * columns, NO_REGION)
-    kmeans._cluster(np.array(points), columns, centroids, region)
+    kmeans.divide(np.array(points), columns, centroids, region)
     regions, places = plain_cluster(points, columns, starts)
     assert {p: int(region[p]) for p in points} == regions
     assert centroids.tolist() == [list(place) for place in places]
@@ -674,7 +671,7 @@ def test_a_line_is_blocked_by_the_cells_on_it(
 
 @pytest.mark.parametrize("layout", ["blank", "unstructured", "cityblock"])
 @pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
-def test_four_robots_explore_all_there_is_to_see(layout: str, coordination: str) -> None:
+def test_four_robots_explore_all_observable_cells(layout: str, coordination: str) -> None:
     scenario = mission(
         f"map.layout={layout}",
         "map.size_m=[48.0, 48.0]",

@@ -1,4 +1,4 @@
-"""A market of goals: how goals are proposed, what they cost, who gets them, and that none is ever lost."""
+"""A market of goals: how goals are proposed, what they cost, which robot gets them, and that none is ever lost."""
 
 import itertools
 import math
@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_agent.mapping.cost_map import CostMap
-from kantor_agent.mapping.fused_map import FusedMap
 from kantor_agent.planners.map_base import Member, Situation, Task
-from kantor_agent.planners.market.costs import NOBODY, Costs, price_of, separate
+from kantor_agent.planners.market.costs import NO_ROBOT, Costs, price_of, separate
 from kantor_agent.planners.market.goals import (
     clear_disc,
     greedy_goals,
@@ -22,15 +21,16 @@ from kantor_agent.planners.market.goals import (
 from kantor_agent.planners.market.memo import Memo, packed, unpacked
 from kantor_agent.planners.market.planner import Market
 from kantor_agent.planners.market.rules import MarketRules
-from kantor_agent.planners.market.trader import _Holding
+from kantor_agent.planners.market.trader import Holding
 from kantor_fleet.execution.in_process_team import play
 from kantor_protocol.base.counter_rng import Purpose, uniform
-from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN
 from kantor_protocol.replication.registers import NUMBER_MAX
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.record.records import Batch, Record
 from kantor_worldsim.world.world import WorldSetup
+from support.floors import Floor
 from support.strategies import examples
 
 MISSION = """
@@ -50,12 +50,15 @@ def mission(*overrides: str) -> Scenario:
     return parse(MISSION, "market", overrides)
 
 
-def terrain_of(*rows: str, range_m: float = 4.0) -> CostMap:
-    """A chart as it is drawn, row 0 first: `?` unknown, `.` free, `#` wall."""
-    fused_map = FusedMap(Frame(1.0, (0.0, 0.0), len(rows), len(rows[0])), 4)
-    fused_map.cells[:] = [KINDS[kind] for row in rows for kind in row]
-    fused_map.revision = 1
-    return CostMap(mission(f"sensor.range_m={range_m}"), fused_map)
+def floor_of(*rows: str, range_m: float = 4.0) -> Floor:
+    """A map as it is drawn, row 0 first: `?` unknown, `.` free, `#` wall."""
+    kinds = np.array([[KINDS[kind] for kind in row] for row in rows], dtype=np.uint8)
+    return Floor(kinds, f"sensor.range_m={range_m}")
+
+
+def cost_map_of(*rows: str, range_m: float = 4.0) -> CostMap:
+    """The cost map of a floor."""
+    return floor_of(*rows, range_m=range_m).cost_map
 
 
 CORRIDOR = "????............????"
@@ -84,7 +87,7 @@ def situation(
 
 def test_quadtree_splits_until_leaves_are_two_ranges_long() -> None:
     """8 x 8 cells, range 1: sixteen leaves of 2 x 2, and a goal in the middle of each."""
-    cost_map = terrain_of(*["?" * 8] * 8, range_m=1.0)
+    cost_map = cost_map_of(*["?" * 8] * 8, range_m=1.0)
 
     assert quadtree_goals(cost_map) == [
         8 * row + column for row in (1, 3, 5, 7) for column in (1, 3, 5, 7)
@@ -93,28 +96,28 @@ def test_quadtree_splits_until_leaves_are_two_ranges_long() -> None:
 
 def test_quadtree_leaf_of_two_ranges_is_not_split() -> None:
     """8 x 8 cells, range 4: the whole map is one leaf."""
-    assert quadtree_goals(terrain_of(*["?" * 8] * 8)) == [8 * 4 + 4]
+    assert quadtree_goals(cost_map_of(*["?" * 8] * 8)) == [8 * 4 + 4]
 
 
 def test_quadtree_passes_over_what_is_known_to_three_quarters() -> None:
     """Range 1, leaves of 2 x 2: one of four cells is too little, and so are 4 of 16."""
-    assert quadtree_goals(terrain_of("....", ".???", "??..", "??..", range_m=1.0)) == [7, 13]
-    assert quadtree_goals(terrain_of("....", ".?.?", "?...", "?...", range_m=1.0)) == []
+    assert quadtree_goals(cost_map_of("....", ".???", "??..", "??..", range_m=1.0)) == [7, 13]
+    assert quadtree_goals(cost_map_of("....", ".?.?", "?...", "?...", range_m=1.0)) == []
 
 
 def test_quadtree_centre_that_is_known_is_no_goal() -> None:
     """A goal is given up when its cell is known, so that this one would not live."""
-    assert quadtree_goals(terrain_of("??", "?.", range_m=1.0)) == []
+    assert quadtree_goals(cost_map_of("??", "?.", range_m=1.0)) == []
 
 
 def test_quadtree_ends_when_ranges_are_tiny() -> None:
     """With a range below half a cell every unknown cell is a goal."""
-    assert quadtree_goals(terrain_of("?.?", range_m=0.01)) == [0, 2]
+    assert quadtree_goals(cost_map_of("?.?", range_m=0.01)) == [0, 2]
 
 
 def test_greedy_takes_the_cheapest_a_range_apart() -> None:
     """From cell 2, range 4: cell 3 costs 1, then 7 and 11 are the next at least 4 away."""
-    cost_map = terrain_of("...????????????")
+    cost_map = cost_map_of("...????????????")
     field = cost_map.optimistic(2)
 
     assert greedy_goals(cost_map, field, [], 5) == [3, 7, 11]
@@ -123,28 +126,28 @@ def test_greedy_takes_the_cheapest_a_range_apart() -> None:
 
 def test_greedy_leaves_out_what_is_within_half_a_range_of_a_held_goal() -> None:
     """Goal 4 is held: 3 and up to 6 are as good as taken; 7 is not."""
-    cost_map = terrain_of("...????????????")
+    cost_map = cost_map_of("...????????????")
 
     assert greedy_goals(cost_map, cost_map.optimistic(2), [4], 5) == [7, 11]
 
 
 def test_greedy_of_equals_takes_the_lowest_cell() -> None:
     """Both sides of the robot are as near."""
-    cost_map = terrain_of("??.??")
+    cost_map = cost_map_of("??.??")
 
     assert greedy_goals(cost_map, cost_map.optimistic(2), [], 1) == [1]
 
 
 def test_greedy_does_not_propose_what_walls_enclose() -> None:
     """Behind the wall everything is unknown, and stays so."""
-    cost_map = terrain_of("..#???")
+    cost_map = cost_map_of("..#???")
 
     assert greedy_goals(cost_map, cost_map.optimistic(0), [], 5) == []
 
 
 def test_random_goals_are_keyed_draws_without_known_cells() -> None:
     """Cells anywhere, by seed, robot and tick; the known and repeated ones are left out."""
-    cost_map = terrain_of("????????........")
+    cost_map = cost_map_of("????????........")
     drawn = [int(uniform(3, Purpose.MARKET, 1, 20, i) * 16) for i in range(64)]
     left = [cell for cell in dict.fromkeys(drawn) if cell < 8]
 
@@ -159,7 +162,7 @@ def test_proposed_goals_are_unknown_reachable_apart_and_not_too_many(rule: str, 
     """Every rule: at most goal_count, none within half a range of another or of a held goal."""
     rng = np.random.default_rng(seed)
     rows = ["".join(rng.choice(list("??.#"), 20)) for _ in range(20)]
-    cost_map = terrain_of(*rows)
+    cost_map = cost_map_of(*rows)
     here = int(np.flatnonzero(cost_map.fused_map.cells == FREE)[0])
     held = [int(cell) for cell in np.flatnonzero(cost_map.fused_map.cells == UNKNOWN)[::50]]
     field = cost_map.optimistic(here)
@@ -199,13 +202,13 @@ PLACES = st.lists(st.integers(0, 399), min_size=1, max_size=7, unique=True)
 def scattered_walls(seed: int) -> CostMap:
     """20 x 20 cells, a quarter of them walls, half of them unknown."""
     rng = np.random.default_rng(seed)
-    return terrain_of(*["".join(rng.choice(list("??.#"), 20)) for _ in range(20)])
+    return cost_map_of(*["".join(rng.choice(list("??.#"), 20)) for _ in range(20)])
 
 
 def length(costs: Costs, place: int, tour: Sequence[int]) -> float:
     """Of a tour."""
     before = [NOWHERE, *tour]
-    return sum(costs._leg(place, one, other) for one, other in itertools.pairwise(before))
+    return sum(costs.leg(place, one, other) for one, other in itertools.pairwise(before))
 
 
 @given(st.integers(0, 30), PLACES, st.integers(0, 399))
@@ -251,8 +254,8 @@ def test_saving_is_what_the_tour_gets_shorter(
 
 
 def test_saving_of_an_unreachable_goal_is_infinite() -> None:
-    """Whoever gets there may have it."""
-    cost_map = terrain_of("..#???..")
+    """A robot that gets there may have it."""
+    cost_map = cost_map_of("..#???..")
     costs = Costs(cost_map, [cost_map.optimistic(0)], [4, 5])
 
     assert costs.saving(0, [4, 5], 4) == math.inf
@@ -286,7 +289,7 @@ def test_distances_between_goals_are_a_metric_and_no_way_is_shorter(
 
 def test_robot_drives_to_the_frontier_on_the_way_to_its_goal() -> None:
     """The nearest frontier is at the left end, the goal at the right."""
-    cost_map = terrain_of(CORRIDOR)
+    cost_map = cost_map_of(CORRIDOR)
     rules = MarketRules(mission(), 0)
     asked = situation(cost_map, [member(0, 6)])
 
@@ -296,7 +299,7 @@ def test_robot_drives_to_the_frontier_on_the_way_to_its_goal() -> None:
 
 def test_way_to_a_goal_leads_round_what_is_known_to_be_a_wall() -> None:
     """As the crow flies the frontier at the wall is nearest to the goal, but it leads the long way."""
-    cost_map = terrain_of(
+    cost_map = cost_map_of(
         "????????",
         "########",
         "........",
@@ -313,7 +316,7 @@ def test_way_to_a_goal_leads_round_what_is_known_to_be_a_wall() -> None:
 
 def test_without_a_way_to_any_frontier_there_is_no_target() -> None:
     """A goal changes nothing about it."""
-    cost_map = terrain_of("..#...??")
+    cost_map = cost_map_of("..#...??")
     rules = MarketRules(mission(), 0)
     asked = situation(cost_map, [member(0, 0)])
 
@@ -327,17 +330,17 @@ def test_without_a_way_to_any_frontier_there_is_no_target() -> None:
 def exchange(*overrides: str, **tours: list[int]) -> Market:
     """A supervisor's market with tours, by `r0`, `r1`, …"""
     market = Market(mission(*overrides), 0, None)
-    market._form._tours = {int(name[1:]): tour for name, tour in tours.items()}
+    market.form.tours = {int(name[1:]): tour for name, tour in tours.items()}
     return market
 
 
-def test_goals_go_to_who_reaches_them_cheapest() -> None:
+def test_goals_go_to_the_robot_that_reaches_them_cheapest() -> None:
     """Robots at 5 and 14 hold the far ends. 17 costs r0 12, r1 bids 3 + 15 - 12 = 6; then 2 costs r1 15, r0 3."""
     market = exchange(r0=[17], r1=[2])
 
-    tasks = market.assign(situation(terrain_of(CORRIDOR), [member(0, 5), member(1, 14)]))
+    tasks = market.assign(situation(cost_map_of(CORRIDOR), [member(0, 5), member(1, 14)]))
 
-    assert market._form._tours == {0: [2], 1: [17]}
+    assert market.form.tours == {0: [2], 1: [17]}
     assert [task.target for task in tasks] == [4, 15]
     assert not market.negotiates
 
@@ -346,38 +349,38 @@ def test_without_a_better_bid_the_seller_keeps_its_goal() -> None:
     """An equal bid is none: from 9 and 9 both ways are as long."""
     market = exchange(r0=[17], r1=[2])
 
-    market.assign(situation(terrain_of(CORRIDOR), [member(0, 9), member(1, 9)]))
+    market.assign(situation(cost_map_of(CORRIDOR), [member(0, 9), member(1, 9)]))
 
-    assert market._form._tours == {0: [17], 1: [2]}
+    assert market.form.tours == {0: [17], 1: [2]}
 
 
 def test_of_equal_bids_the_lowest_place_wins() -> None:
     """r0 is far; r1 and r2 stand side by side."""
     market = exchange(r0=[17], r1=[2], r2=[2])
 
-    market.assign(situation(terrain_of(CORRIDOR), [member(0, 5), member(1, 14), member(2, 14)]))
+    market.assign(situation(cost_map_of(CORRIDOR), [member(0, 5), member(1, 14), member(2, 14)]))
 
-    assert 17 in market._form._tours[1]
-    assert 17 not in market._form._tours[2]
+    assert 17 in market.form.tours[1]
+    assert 17 not in market.form.tours[2]
 
 
 def test_goals_are_auctioned_again_as_positions_change() -> None:
     """The robots have changed sides; so do the goals."""
     market = exchange(r0=[2], r1=[17])
 
-    market.assign(situation(terrain_of(CORRIDOR), [member(0, 14), member(1, 5)]))
+    market.assign(situation(cost_map_of(CORRIDOR), [member(0, 14), member(1, 5)]))
 
-    assert market._form._tours == {0: [17], 1: [2]}
+    assert market.form.tours == {0: [17], 1: [2]}
 
 
 def test_robots_together_divide_what_is_unknown() -> None:
     """Nobody proposes what another holds; together they hold every leaf once."""
-    cost_map = terrain_of(*["?" * 24] * 11, "?" * 10 + "...." + "?" * 10, *["?" * 24] * 12)
+    cost_map = cost_map_of(*["?" * 24] * 11, "?" * 10 + "...." + "?" * 10, *["?" * 24] * 12)
     market = Market(mission("planner.goal_count=8"), 0, None)
 
     market.assign(situation(cost_map, [member(i, 24 * 11 + 11) for i in range(3)]))
 
-    tours = market._form._tours
+    tours = market.form.tours
     assert sorted(goal for tour in tours.values() for goal in tour) == quadtree_goals(cost_map)
     assert all(tours.values())
 
@@ -386,33 +389,33 @@ def test_goals_that_are_known_or_unreachable_are_given_up() -> None:
     """Cell 8 is known; 18 lies behind a wall."""
     market = exchange(r0=[2, 8, 18], r1=[])
 
-    market.assign(situation(terrain_of("????........#..????"), [member(0, 6), member(1, 7)]))
+    market.assign(situation(cost_map_of("????........#..????"), [member(0, 6), member(1, 7)]))
 
-    assert market._form._tours[0] == [2]
+    assert market.form.tours[0] == [2]
 
 
-def test_tour_of_a_robot_that_is_gone_is_free() -> None:
-    """Somebody who is left proposes its goals anew."""
+def test_goals_of_a_robot_out_of_contact_are_free() -> None:
+    """A robot that is left proposes its goals anew."""
     market = exchange(r0=[2], r1=[17])
 
-    market.assign(situation(terrain_of(CORRIDOR), [member(0, 5)]))
+    market.assign(situation(cost_map_of(CORRIDOR), [member(0, 5)]))
 
-    assert market._form._tours == {0: [2]}
+    assert market.form.tours == {0: [2]}
 
 
 def test_robots_that_keep_their_targets_trade_as_well() -> None:
-    """Only r0 is given a target, but the goals are everybody's."""
+    """Only r0 is given a target, but all robots trade."""
     market = exchange(r0=[17], r1=[2])
 
-    tasks = market.assign(situation(terrain_of(CORRIDOR), [member(0, 5)], [member(1, 14)]))
+    tasks = market.assign(situation(cost_map_of(CORRIDOR), [member(0, 5)], [member(1, 14)]))
 
-    assert market._form._tours == {0: [2], 1: [17]}
+    assert market.form.tours == {0: [2], 1: [17]}
     assert [task.target for task in tasks] == [4]
 
 
 def test_idle_robot_drives_to_the_nearest_frontier() -> None:
     """What is unknown is too little for a goal; without this the mission would never end."""
-    cost_map = terrain_of("..................?.")
+    cost_map = cost_map_of("..................?.")
     [task] = Market(mission(), 0, None).assign(situation(cost_map, [member(0, 3)]))
 
     assert task == Task(17)
@@ -430,16 +433,16 @@ def test_every_sale_shortens_the_tours(seed: int, tours: list[list[int]]) -> Non
     market = exchange(r0=[], r1=[], r2=[])
     for robot, tour in enumerate(tours):
         goals = [cell for cell in tour if cell in reached and cell not in taken]
-        market._form._tours[robot] = goals
+        market.form.tours[robot] = goals
         taken.update(goals)
     costs = Costs(cost_map, fields, taken)
-    before = sum(length(costs, i, tour) for i, tour in market._form._tours.items())
+    before = sum(length(costs, i, tour) for i, tour in market.form.tours.items())
 
-    market._form._sell(costs, [0, 1, 2])
+    market.form.sell(costs, [0, 1, 2])
 
-    after = sum(length(costs, i, tour) for i, tour in market._form._tours.items())
+    after = sum(length(costs, i, tour) for i, tour in market.form.tours.items())
     assert after <= before + 1e-9
-    assert sorted(g for tour in market._form._tours.values() for g in tour) == sorted(taken)
+    assert sorted(g for tour in market.form.tours.values() for g in tour) == sorted(taken)
 
 
 # Memos.
@@ -450,22 +453,22 @@ NUMBERS = st.integers(-NUMBER_MAX, NUMBER_MAX)
 @given(st.lists(NUMBERS | st.integers(-2, 30), max_size=88))
 @examples(200)
 def test_any_register_is_some_memo(numbers: list[int]) -> None:
-    """Whatever a robot says: cells are on the map, heirs in the team, and it is announced as it was."""
+    """Whatever a robot says: cells are on the map, successors in the team, and it is announced as it was."""
     memo = unpacked(numbers, 3, 20)
 
     assert memo.clock >= 0
     assert -1 <= memo.offered < 20
-    assert len(memo.seen) == len(memo.bids) == 3
-    assert all(0 <= goal < 20 and -1 <= heir < 3 for goal, heir in memo.tour)
-    told = list(packed(memo))
-    while told and told[-1] == 0:
-        told.pop()
-    assert unpacked(told, 3, 20) == memo
+    assert len(memo.acknowledged) == len(memo.bids) == 3
+    assert all(0 <= goal < 20 and -1 <= successor < 3 for goal, successor in memo.tour)
+    numbers = list(packed(memo))
+    while numbers and numbers[-1] == 0:
+        numbers.pop()
+    assert unpacked(numbers, 3, 20) == memo
 
 
 @pytest.mark.parametrize("robots", [1, 2, 8, 1000])
 def test_longest_memo_fits_into_a_register(robots: int) -> None:
-    """A full tour, everybody's offers answered, an offer of its own."""
+    """A full tour, the offers of all others answered, an offer of its own."""
     scenario = mission(f"robots.count={robots}")
     tour = tuple((cell, robots - 1) for cell in range(MarketRules(scenario, 0).capacity))
     memo = Memo(9, 7, 5, 3, (1,) * robots, (1,) * robots, tour)
@@ -482,11 +485,11 @@ def test_prices_are_bounded() -> None:
 
 @given(st.lists(st.lists(NUMBERS | st.integers(-2, 30), max_size=88), min_size=3, max_size=3))
 @examples(50)
-def test_robot_stands_whatever_others_announce(told: list[list[int]]) -> None:
+def test_robot_survives_any_announcement(announced: list[list[int]]) -> None:
     """It has a target, and its own memo fits."""
-    cost_map, scenario = terrain_of(CORRIDOR), mission()
+    cost_map, scenario = cost_map_of(CORRIDOR), mission()
     market, task = Market(scenario, 0, 1), Task()
-    for tick, memo in enumerate(told):
+    for tick, memo in enumerate(announced):
         others = [member(robot, 5, Task(4, tuple(memo))) for robot in (0, 2)]
         [task] = market.assign(situation(cost_map, [member(1, 7 + tick, task)], others, tick))
 
@@ -497,43 +500,43 @@ def test_robot_stands_whatever_others_announce(told: list[list[int]]) -> None:
 
 # Robots among themselves.
 
-Hears = Callable[[int, int, int], Sequence[int]]
-"""Speaker, listener and step to the delays, in steps, with which a word arrives; none: it is lost."""
+Radio = Callable[[int, int, int], Sequence[int]]
+"""Source, receiver and step to the delays, in steps, with which a memo arrives; none: it is lost."""
 
 
-def everybody(_speaker: int, _listener: int, _step: int) -> Sequence[int]:
+def perfect_radio(_source: int, _receiver: int, _step: int) -> Sequence[int]:
     """A radio without faults."""
     return (1,)
 
 
-def nobody(_speaker: int, _listener: int, _step: int) -> Sequence[int]:
+def no_radio(_source: int, _receiver: int, _step: int) -> Sequence[int]:
     """A radio that is off."""
     return ()
 
 
 class Net:
-    """Robots that hear of one another's registers: late, twice or not at all, the newest wins."""
+    """Robots that receive one another's registers: late, twice or not at all; the newest counts."""
 
-    def __init__(self, cost_map: CostMap, cells: Sequence[int], *overrides: str) -> None:
+    def __init__(self, floor: Floor, cells: Sequence[int], *overrides: str) -> None:
         self.robots = len(cells)
         scenario = mission(f"robots.count={self.robots}", *overrides)
-        self.terrains = [cost_map] * self.robots
+        self.floors = [floor] * self.robots
         self.markets = [Market(scenario, 0, robot) for robot in range(self.robots)]
         self.members = [member(robot, cell) for robot, cell in enumerate(cells)]
-        self.told: list[dict[int, tuple[int, int, Member]]] = [{} for _ in cells]
+        self.received: list[dict[int, tuple[int, int, Member]]] = [{} for _ in cells]
         self.under_way: list[tuple[int, int, int, Member]] = []
         self.step = 0
 
-    def play(self, steps: int, hears: Hears = everybody) -> None:
-        """Let everybody step; in between, words travel."""
+    def play(self, steps: int, radio: Radio = perfect_radio) -> None:
+        """Let every robot step; in between, memos are under way."""
         for _ in range(steps):
             self.step += 1
             self._deliver()
             self.members = [self._asked(robot) for robot in range(self.robots)]
-            for speaker, listener in itertools.permutations(range(self.robots), 2):
-                for delay in hears(speaker, listener, self.step):
+            for source, receiver in itertools.permutations(range(self.robots), 2):
+                for delay in radio(source, receiver, self.step):
                     due = self.step + delay
-                    self.under_way.append((due, listener, self.step, self.members[speaker]))
+                    self.under_way.append((due, receiver, self.step, self.members[source]))
 
     def move(self, *cells: int) -> None:
         """Put the robots somewhere else."""
@@ -542,47 +545,49 @@ class Net:
         ]
 
     def _deliver(self) -> None:
-        for due, listener, stamp, word in self.under_way:
-            told = self.told[listener]
-            if due <= self.step and stamp > told.get(word.robot, (0,))[0]:
-                told[word.robot] = (stamp, self.step, word)
-        self.under_way = [word for word in self.under_way if word[0] > self.step]
+        for due, receiver, stamp, sender in self.under_way:
+            received = self.received[receiver]
+            if due <= self.step and stamp > received.get(sender.robot, (0,))[0]:
+                received[sender.robot] = (stamp, self.step, sender)
+        self.under_way = [copy for copy in self.under_way if copy[0] > self.step]
 
     def _asked(self, robot: int) -> Member:
         me = self.members[robot]
         others = [
-            word
-            for _, (_, heard, word) in sorted(self.told[robot].items())
-            if heard + 8 >= self.step
+            sender
+            for _, (_, at, sender) in sorted(self.received[robot].items())
+            if at + 8 >= self.step
         ]
-        asked = situation(self.terrains[robot], [me], others, self.step)
+        asked = situation(self.floors[robot].cost_map, [me], others, self.step)
         [task] = self.markets[robot].assign(asked)
         return me._replace(task=task)
 
     def give(self, robot: int, *goals: int) -> None:
         """Let a robot hold goals, and no others."""
-        self.markets[robot]._form._tour = [_Holding(goal) for goal in goals]
+        self.markets[robot].form.tour = [Holding(goal) for goal in goals]
 
     def memo(self, robot: int) -> Memo:
         """What a robot announces."""
         return unpacked(
-            self.members[robot].task.memo, self.robots, self.terrains[robot].frame.cells
+            self.members[robot].task.memo, self.robots, self.floors[robot].fused_map.frame.cells
         )
 
     def tour(self, robot: int) -> list[int]:
         """The goals that a robot holds."""
-        return [goal for goal, _heir in self.memo(robot).tour]
+        return [goal for goal, _successor in self.memo(robot).tour]
 
     def holders(self, goal: int) -> list[int]:
-        """Who holds a goal."""
+        """The robots that hold a goal."""
         return [robot for robot in range(self.robots) if goal in self.tour(robot)]
 
-    def until(self, rule: Callable[[], bool], hears: Hears = everybody, steps: int = 40) -> None:
+    def until(
+        self, rule: Callable[[], bool], radio: Radio = perfect_radio, steps: int = 40
+    ) -> None:
         """Play until a rule holds."""
         for _ in range(steps):
             if rule():
                 return
-            self.play(1, hears)
+            self.play(1, radio)
         raise AssertionError("it never came to that")
 
 
@@ -597,7 +602,7 @@ W, E, N = 2, 33, 36 * 12 + 23
 
 def hall() -> Net:
     """r0 in the west holds W and E; r1 in the branch holds N, and will buy E for half its price."""
-    net = Net(terrain_of(*HALL), [5, 36 * 8 + 23])
+    net = Net(floor_of(*HALL), [5, 36 * 8 + 23])
     net.give(0, W, E)
     net.give(1, N)
     return net
@@ -608,9 +613,9 @@ def sold(net: Net) -> bool:
     return (E, 1) in net.memo(0).tour
 
 
-def only(speaker: int) -> Hears:
-    """A radio that carries the words of one robot."""
-    return lambda one, _other, _step: (1,) if one == speaker else ()
+def only(source: int) -> Radio:
+    """A radio that carries the memos of one robot."""
+    return lambda one, _other, _step: (1,) if one == source else ()
 
 
 def step_aside(net: Net) -> None:
@@ -620,7 +625,7 @@ def step_aside(net: Net) -> None:
 
 
 def test_best_bid_takes_the_goal() -> None:
-    """Offer, bid, award, confirmation: one word each."""
+    """Offer, bid, award, confirmation: one memo each."""
     net = hall()
     net.play(2)
     assert net.memo(0).offered == W
@@ -635,7 +640,7 @@ def test_best_bid_takes_the_goal() -> None:
 
 
 def test_without_a_better_bid_the_goal_stays() -> None:
-    """r0 offers W, N is offered by r1; nobody gets them cheaper."""
+    """r0 offers W, N is offered by r1; no robot gets them cheaper."""
     net = hall()
     net.play(20)
 
@@ -653,11 +658,13 @@ def test_robots_that_stand_still_stop_trading() -> None:
 
     for robot in (0, 1):
         memo = net.memo(robot)
-        assert memo._replace(clock=0, seen=()) == before[robot]._replace(clock=0, seen=())
+        assert memo._replace(clock=0, acknowledged=()) == before[robot]._replace(
+            clock=0, acknowledged=()
+        )
 
 
 def test_lost_award_leaves_the_goal_with_its_seller() -> None:
-    """r1 never hears that it has won: the lease runs out, r0 takes E back, and sells it again."""
+    """r1 never learns that it has won: the lease runs out, r0 takes E back, and sells it again."""
     net = hall()
     net.until(lambda: sold(net))
     net.under_way = []
@@ -665,20 +672,20 @@ def test_lost_award_leaves_the_goal_with_its_seller() -> None:
     net.play(4, only(1))
     assert sold(net)
     net.play(1, only(1))
-    assert (E, NOBODY) in net.memo(0).tour
+    assert (E, NO_ROBOT) in net.memo(0).tour
     assert net.holders(E) == [0]
 
     step_aside(net)
     net.until(lambda: net.holders(E) == [1])
 
 
-def test_lost_confirmation_is_settled_when_words_get_through() -> None:
+def test_lost_confirmation_is_settled_when_memos_arrive() -> None:
     """r1 holds E, r0 does not hear it and takes E back. Both hold it, then the lower place alone."""
     net = hall()
     net.until(lambda: sold(net))
     net.play(10, only(0))
     assert net.holders(E) == [0, 1]
-    assert (E, NOBODY) in net.memo(0).tour
+    assert (E, NO_ROBOT) in net.memo(0).tour
 
     net.until(lambda: net.holders(E) == [0])
     step_aside(net)
@@ -686,21 +693,21 @@ def test_lost_confirmation_is_settled_when_words_get_through() -> None:
 
 
 def test_winner_that_disappears_leaves_the_goal_with_its_seller() -> None:
-    """Nobody hears anybody after the award."""
+    """The radio is off after the award."""
     net = hall()
     net.until(lambda: sold(net))
     net.under_way = []
-    net.play(7, nobody)
+    net.play(7, no_radio)
 
-    assert (E, NOBODY) in net.memo(0).tour
+    assert (E, NO_ROBOT) in net.memo(0).tour
     assert net.holders(E) == [0]
 
 
 def test_seller_that_disappears_after_the_award_leaves_the_goal_with_the_winner() -> None:
-    """r1 hears the award and nothing more; it holds E and may offer it once r0 is out of contact."""
+    """r1 receives the award and nothing more; it holds E and may offer it once r0 is out of contact."""
     net = hall()
     net.until(lambda: sold(net))
-    net.play(12, nobody)
+    net.play(12, no_radio)
 
     assert E in net.tour(1)
     assert net.memo(1).firm == net.tour(1)
@@ -710,18 +717,18 @@ def test_seller_that_disappears_before_the_award_keeps_the_goal() -> None:
     """r1 has bid; an offer is no award."""
     net = hall()
     net.until(lambda: net.memo(0).offered == E)
-    net.play(12, nobody)
+    net.play(12, no_radio)
 
     assert net.holders(E) == [0]
     assert net.memo(0).offered == NOWHERE
 
 
 def test_award_that_comes_when_it_was_taken_back_is_settled() -> None:
-    """The award arrives 12 steps late, and no word after it for a while: both hold E, then one."""
+    """The award arrives 12 steps late, and no memo after it for a while: both hold E, then one."""
     net = hall()
     net.until(lambda: sold(net))
     net.under_way = [(due + 12, *rest) for due, *rest in net.under_way if rest[0] == 1]
-    net.play(14, nobody)
+    net.play(14, no_radio)
     assert net.holders(E) == [0, 1]
 
     net.until(lambda: len(net.holders(E)) == 1)
@@ -730,7 +737,7 @@ def test_award_that_comes_when_it_was_taken_back_is_settled() -> None:
 
 
 def test_offer_waits_for_all_in_contact_but_not_for_ever() -> None:
-    """r1 is heard and hears nothing: bidding ends with the lease, and the next goal is offered."""
+    """r1 is received and receives nothing: bidding ends with the lease, and the next goal is offered."""
     net = hall()
     net.until(lambda: net.memo(0).offered == W)
     net.under_way = []
@@ -741,9 +748,9 @@ def test_offer_waits_for_all_in_contact_but_not_for_ever() -> None:
 
 
 def test_silent_robot_out_of_contact_does_not_hold_up_an_offer() -> None:
-    """Whoever is not in contact is not waited for, and alone there is nothing to sell."""
+    """A robot out of contact is not waited for, and alone there is nothing to sell."""
     net = hall()
-    net.play(9, nobody)
+    net.play(9, no_radio)
 
     assert net.memo(0).offered == NOWHERE
     assert net.tour(0) == [W, E]
@@ -755,37 +762,37 @@ def answer(seen: int, *tour: tuple[int, int]) -> Member:
 
 
 @pytest.mark.parametrize(
-    ("what", "word", "after"),
+    ("what", "successor", "after"),
     [
-        ("confirmed", answer(60, (E, NOBODY)), []),
-        ("holds one near it", answer(60, (E - 1, NOBODY)), []),
-        ("holds one too far off", answer(60, (E - 3, NOBODY)), [NOBODY]),
-        ("confirmed an earlier award", answer(59, (E, NOBODY)), [1]),
+        ("confirmed", answer(60, (E, NO_ROBOT)), []),
+        ("holds one near it", answer(60, (E - 1, NO_ROBOT)), []),
+        ("holds one too far off", answer(60, (E - 3, NO_ROBOT)), [NO_ROBOT]),
+        ("confirmed an earlier award", answer(59, (E, NO_ROBOT)), [1]),
         ("has not answered yet", answer(59), [1]),
-        ("declined", answer(60), [NOBODY]),
-        ("has named an heir itself", answer(60, (E, 2)), [NOBODY]),
+        ("declined", answer(60), [NO_ROBOT]),
+        ("has named an successor itself", answer(60, (E, 2)), [NO_ROBOT]),
     ],
 )
-def test_seller_lets_go_only_of_what_the_heir_holds_for_good(
-    what: str, word: Member, after: list[int]
+def test_seller_releases_only_what_the_successor_holds_without_a_successor(
+    what: str, successor: Member, after: list[int]
 ) -> None:
     """r0 has named r1 in its memo 60."""
     market = Market(mission(), 0, 0)
-    market._form._tour = [_Holding(W), _Holding(E, heir=1, named=60, until=62)]
+    market.form.tour = [Holding(W), Holding(E, successor=1, named=60, until=62)]
 
-    market.assign(situation(terrain_of(*HALL), [member(0, 5)], [word], 61))
+    market.assign(situation(cost_map_of(*HALL), [member(0, 5)], [successor], 61))
 
-    assert [held.heir for held in market._form._tour if held.goal == E] == after, what
+    assert [held.successor for held in market.form.tour if held.goal == E] == after, what
 
 
-def test_two_that_name_each_other_do_not_both_let_go() -> None:
+def test_two_robots_that_name_each_other_do_not_both_release() -> None:
     """Each holds E and has named the other: neither holds it for good, so neither lets go."""
     net = hall()
     net.play(2)
     net.give(0, W)
     for robot in (0, 1):
-        holding = _Holding(E, heir=1 - robot, named=3, until=20)
-        net.markets[robot]._form._tour.append(holding)
+        holding = Holding(E, successor=1 - robot, named=3, until=20)
+        net.markets[robot].form.tour.append(holding)
     for _ in range(10):
         net.play(1)
         assert net.holders(E)
@@ -814,23 +821,21 @@ def test_goals_further_apart_are_two() -> None:
     assert sorted([*net.tour(0), *net.tour(1)]) == [W - 2, W + 1, E - 1]
 
 
-def test_winner_does_not_take_what_it_knows() -> None:
-    """r1 has seen E before it hears the award: it declines at once, and r0 keeps E till it learns."""
+def test_winner_does_not_take_a_known_goal() -> None:
+    """r1 has seen E before it receives the award: it declines at once, and r0 keeps E till it learns."""
     net = hall()
-    net.terrains[1] = terrain_of(*HALL)
+    net.floors[1] = floor_of(*HALL)
     net.until(lambda: sold(net))
-    net.terrains[1].fused_map.cells[E] = FREE
-    net.terrains[1].fused_map.revision += 1
+    net.floors[1].see([E], FREE)
     net.play(3)
 
     assert net.holders(E) == [0]
-    assert (E, NOBODY) in net.memo(0).tour
+    assert (E, NO_ROBOT) in net.memo(0).tour
 
 
 def test_robots_that_start_at_once_end_up_with_every_goal_once() -> None:
     """All propose the same before they hear of one another."""
-    cost_map = terrain_of(*["?" * 24] * 11, "." * 24, *["?" * 24] * 12)
-    net = Net(cost_map, [24 * 11 + 11] * 3)
+    net = Net(floor_of(*["?" * 24] * 11, "." * 24, *["?" * 24] * 12), [24 * 11 + 11] * 3)
     net.play(1)
     assert net.tour(0) == net.tour(1) == net.tour(2)
 
@@ -840,8 +845,8 @@ def test_robots_that_start_at_once_end_up_with_every_goal_once() -> None:
 
 
 def test_idle_robot_in_contact_drives_to_the_nearest_frontier() -> None:
-    """r0 holds all there is; nobody waits."""
-    net = Net(terrain_of(CORRIDOR), [6, 7])
+    """r0 holds all goals; no robot waits."""
+    net = Net(floor_of(CORRIDOR), [6, 7])
     net.give(0, 2, 17)
     net.play(1)
     net.give(1)
@@ -854,7 +859,7 @@ def test_idle_robot_in_contact_drives_to_the_nearest_frontier() -> None:
 
 def test_target_stays_while_it_is_a_frontier_and_the_goal_is_the_same() -> None:
     """However the robot moves."""
-    net = Net(terrain_of(CORRIDOR), [6])
+    net = Net(floor_of(CORRIDOR), [6])
     net.play(1)
     first = net.members[0].task.target
     for cell in (7, 8, 9, 10, 11, 12, 13):
@@ -865,34 +870,26 @@ def test_target_stays_while_it_is_a_frontier_and_the_goal_is_the_same() -> None:
 
 # The same under any radio.
 
-FIELD = terrain_of(*["?" * 24] * 11, *["." * 24] * 2, *["?" * 24] * 11)
+FIELD = (*["?" * 24] * 11, *["." * 24] * 2, *["?" * 24] * 11)
 
 
-def faulty(seed: int, robots: int) -> Hears:
-    """Words are lost, late, repeated and overtaken; for a while the team is cut in two."""
+def faulty(seed: int, robots: int) -> Radio:
+    """Memos are lost, late, repeated and overtaken; for a while the team is cut in two."""
     rng = np.random.default_rng(seed)
     side = rng.integers(0, 2, (8, robots))
     loss = rng.random()
 
-    def hears(speaker: int, listener: int, step: int) -> Sequence[int]:
+    def radio(source: int, receiver: int, step: int) -> Sequence[int]:
         part = side[step // 10 % 8]
         copies = [int(rng.integers(1, 12)) if rng.random() < 0.3 else 1 for _ in range(2)]
-        heard = part[speaker] == part[listener] and rng.random() > loss * 0.8
-        return copies[: 1 + (rng.random() < 0.2)] if heard else ()
+        arrives = part[source] == part[receiver] and rng.random() > loss * 0.8
+        return copies[: 1 + (rng.random() < 0.2)] if arrives else ()
 
-    return hears
-
-
-def fresh(cost_map: CostMap) -> CostMap:
-    """A chart of its own."""
-    fused_map = FusedMap(cost_map.frame, 4)
-    fused_map.cells[:] = cost_map.fused_map.cells
-    fused_map.revision = 1
-    return CostMap(mission(), fused_map)
+    return radio
 
 
-def strolling(net: Net, rng: np.random.Generator) -> None:
-    """Everybody somewhere on the known floor, not far from before."""
+def wander(net: Net, rng: np.random.Generator) -> None:
+    """Move every robot on the known floor, not far from before."""
     net.move(
         *[
             24 * int(rng.integers(11, 13))
@@ -905,20 +902,20 @@ def strolling(net: Net, rng: np.random.Generator) -> None:
 @given(seed=st.integers(0, 10**6), robots=st.integers(2, 4))
 @examples(25)
 def test_no_goal_is_ever_lost(seed: int, robots: int) -> None:
-    """Whatever the radio does, a goal that nobody knows is held by somebody, in the end by one alone."""
+    """Whatever the radio does, an unknown goal is held by a robot, in the end by one alone."""
     rng = np.random.default_rng(seed)
-    net = Net(FIELD, [24 * 11 + int(cell) for cell in rng.integers(0, 24, robots)])
+    net = Net(floor_of(*FIELD), [24 * 11 + int(cell) for cell in rng.integers(0, 24, robots)])
     radio, goals = faulty(seed, robots), set[int]()
     for step in range(180):
-        net.play(1, radio if step < 80 else everybody)
+        net.play(1, radio if step < 80 else perfect_radio)
         held = {goal for robot in range(robots) for goal in net.tour(robot)}
         goals |= held
         assert held == goals
         if step < 110:
-            strolling(net, rng)
+            wander(net, rng)
 
-    told = [goal for robot in range(robots) for goal in net.tour(robot)]
-    assert len(told) == len(goals)
+    held = [goal for robot in range(robots) for goal in net.tour(robot)]
+    assert len(held) == len(goals)
     assert all(net.memo(robot).firm == net.tour(robot) for robot in range(robots))
     assert all(net.memo(robot).offered == NOWHERE for robot in range(robots))
 
@@ -926,53 +923,55 @@ def test_no_goal_is_ever_lost(seed: int, robots: int) -> None:
 @given(seed=st.integers(0, 10**6), robots=st.integers(2, 4))
 @examples(25)
 def test_no_goal_is_lost_while_robots_explore(seed: int, robots: int) -> None:
-    """Everybody has a chart of its own and learns of cells at other times than the others."""
+    """Every robot has a map of its own and learns of cells at other times than the others."""
     rng = np.random.default_rng(seed)
-    net = Net(FIELD, [24 * 11 + int(cell) for cell in rng.integers(0, 24, robots)])
-    net.terrains = [fresh(FIELD) for _ in range(robots)]
+    net = Net(floor_of(*FIELD), [24 * 11 + int(cell) for cell in rng.integers(0, 24, robots)])
+    net.floors = [floor_of(*FIELD) for _ in range(robots)]
     radio, goals = faulty(seed, robots), set[int]()
     for _ in range(80):
         net.play(1, radio)
-        unknown_to_all = np.all([t.fused_map.cells == UNKNOWN for t in net.terrains], axis=0)
+        unknown_to_all = np.all([f.fused_map.cells == UNKNOWN for f in net.floors], axis=0)
         held = {goal for robot in range(robots) for goal in net.tour(robot)}
         goals = {goal for goal in goals | held if unknown_to_all[goal]}
         assert goals <= held
-        strolling(net, rng)
+        wander(net, rng)
         if held and rng.random() < 0.2:
             seen = sorted(held)[int(rng.integers(len(held)))]
-            for cost_map in net.terrains:
+            for floor in net.floors:
                 if rng.random() < 0.5:
-                    cost_map.fused_map.cells[seen] = FREE
-                    cost_map.fused_map.revision += 1
+                    floor.see([seen], FREE)
 
 
 @pytest.mark.parametrize("rule", ["random", "greedy"])
 @given(seed=st.integers(0, 10**6))
 @examples(15)
 def test_goals_vanish_only_for_one_that_is_as_good(rule: str, seed: int) -> None:
-    """Whoever lets go of an unknown goal has been told that its heir holds one within half a range."""
+    """A robot that releases an unknown goal has received that its successor holds one within half a range."""
     rng = np.random.default_rng(seed)
     net = Net(
-        FIELD, [24 * 11 + int(cell) for cell in rng.integers(0, 24, 3)], f"planner.goals={rule}"
+        floor_of(*FIELD),
+        [24 * 11 + int(cell) for cell in rng.integers(0, 24, 3)],
+        f"planner.goals={rule}",
     )
     radio = faulty(seed, 3)
+    cells_between = net.floors[0].cost_map.cells_between
     for _ in range(80):
         before = [net.memo(robot).tour for robot in range(3)]
         net.play(1, radio)
         for robot in range(3):
-            for goal, heir in before[robot]:
+            for goal, successor in before[robot]:
                 if goal not in net.tour(robot):
-                    told = net.told[robot][heir][2].task.memo
-                    firm = unpacked(told, 3, 576).firm
-                    assert min(FIELD.cells_between(goal, other) for other in firm) <= 2.0
-        strolling(net, rng)
+                    memo = net.received[robot][successor][2].task.memo
+                    firm = unpacked(memo, 3, 576).firm
+                    assert min(cells_between(goal, other) for other in firm) <= 2.0
+        wander(net, rng)
 
 
 @given(seed=st.integers(0, 10**6))
 @examples(10)
-def test_same_words_make_the_same_market(seed: int) -> None:
+def test_same_memos_make_the_same_market(seed: int) -> None:
     """No clock, no entropy: two teams that hear the same announce the same."""
-    nets = [Net(FIELD, [270, 275, 280], "planner.goals=random") for _ in range(2)]
+    nets = [Net(floor_of(*FIELD), [270, 275, 280], "planner.goals=random") for _ in range(2)]
     radios = [faulty(seed, 3) for _ in nets]
     for net, radio in zip(nets, radios, strict=True):
         net.play(40, radio)
@@ -1019,7 +1018,7 @@ def targets_of(scenario: Scenario, seed: int) -> tuple[str, dict[str, list[tuple
     [("coordination=centralized",), (), BAD_RADIO],
     ids=["centralized", "decentralized", "bad-radio"],
 )
-def test_mission_ends_and_nobody_dithers(rule: str, how: tuple[str, ...]) -> None:
+def test_mission_ends_and_targets_do_not_oscillate(rule: str, how: tuple[str, ...]) -> None:
     """All is explored; of a robot's targets hardly one in ten is one of the four before it."""
     scenario = mission(*FIELD_TRIP, *how, f"planner.goals={rule}")
     reason, targets = targets_of(scenario, 1)

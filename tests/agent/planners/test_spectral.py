@@ -22,7 +22,7 @@ from kantor_protocol.replication.gossip import build_replica
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import decode_gossip, encode_gossip
 from kantor_protocol.wire.weights import Units
-from support.strategies import Points, cast, examples, mission, rehearse, scattered
+from support.strategies import Points, build_team, examples, mission, scattered, step_rounds
 
 Floats = npt.NDArray[np.float64]
 
@@ -168,7 +168,7 @@ def mu_of(modes: int) -> Floats:
 def test_any_number_of_modes_explores(modes: int) -> None:
     """From the constant alone, which is level everywhere, to the most that a scenario allows."""
     scenario = mission(*WIDE, f"planner.modes={modes}")
-    told = rehearse(cast(scenario, scattered(12)), scenario, 8)
+    told = step_rounds(build_team(scenario, scattered(12)), scenario, 8)
     goals = [outputs.goal for _, outputs in told["r1"]]
 
     assert all((goal is None) == (modes == 1) for goal in goals)
@@ -182,7 +182,7 @@ def test_where_the_gradient_vanishes_a_robot_stays() -> None:
     assert choose(scenario, belief_of(scenario, scattered(12)), (50.0, 50.0)) is None
 
 
-def test_who_has_been_somewhere_goes_elsewhere() -> None:
+def test_a_visited_place_is_left_for_another() -> None:
     """The sums never forget: from the same place, by another way."""
     scenario = mission("planner=spectral")
     belief = belief_of(scenario, scattered(12))
@@ -256,7 +256,7 @@ def test_density_is_that_of_the_samples_where_there_is_no_mixture() -> None:
         cos_x, cos_y = (np.cos(np.outer(k, math.pi * c / 100.0)) for c in (x, y))
         expected = (cos_x[:, None, :] * cos_y[None, :, :]).mean(axis=2)
 
-        np.testing.assert_allclose(planner._mean, expected.ravel(), atol=1e-12)  # type: ignore[attr-defined]
+        np.testing.assert_allclose(planner.mean, expected.ravel(), atol=1e-12)  # type: ignore[attr-defined]
 
 
 def test_mixture_outside_the_domain_falls_back_on_the_samples() -> None:
@@ -296,20 +296,20 @@ def test_knowledge_of_others_changes_the_way() -> None:
     scenario = mission("planner=spectral", "energy.points=60", "vehicle.speed_m_s=50.0")
     ways = []
     for heard in (True, False):
-        machines = cast(scenario, scattered(12))
-        told = rehearse(machines, scenario, 9, lambda _speaker, _listener, heard=heard: heard)
+        machines = build_team(scenario, scattered(12))
+        told = step_rounds(machines, scenario, 9, lambda _speaker, _listener, heard=heard: heard)
         ways.append([outputs.pose for _, outputs in told["r1"]])
 
     assert ways[0][0] == ways[1][0]
     assert ways[0][-1] != ways[1][-1]
 
 
-def test_everybody_comes_to_hold_the_same_sums() -> None:
+def test_all_robots_come_to_hold_the_same_sums() -> None:
     """In the end a robot's total is the plain sum of all visits, also by way of a relay."""
     for overrides in ((), ("coordination=centralized",)):
         scenario = mission("planner=spectral", "planner.modes=5", "energy.steps=6", *overrides)
-        machines = cast(scenario, scattered(12))
-        told = rehearse(machines, scenario, 30)
+        machines = build_team(scenario, scattered(12))
+        told = step_rounds(machines, scenario, 30)
         visits = np.zeros(25, dtype=np.int64)
         for name in scenario.robot_ids:
             for inputs, outputs in told[name]:
@@ -324,8 +324,8 @@ def test_everybody_comes_to_hold_the_same_sums() -> None:
 def test_hostile_registers_change_nothing() -> None:
     """Sums beyond the visits: the message is refused whole, and counted."""
     scenario = mission("planner=spectral", "planner.modes=2")
-    machines = cast(scenario, scattered(12))
-    said = rehearse(machines, scenario, 2)["r2"][-1][1].outbox[0]
+    machines = build_team(scenario, scattered(12))
+    said = step_rounds(machines, scenario, 2)["r2"][-1][1].outbox[0]
     news, boast = decode_gossip(said.body), bytes([0, 9, 0, 1, 9, 2, 9, 9, 9])
     lie = encode_gossip(msgspec.structs.replace(news, registers=boast))
     machine, look = machines["r1"], Observation(2, Pose(10.0, 10.0))

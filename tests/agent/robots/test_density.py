@@ -33,12 +33,12 @@ from kantor_protocol.wire.weights import Units, WeightsSubscriber
 from support.strategies import (
     MINIMUM,
     Transcript,
-    cast,
+    build_team,
     examples,
     in_a_row,
     mission,
-    rehearse,
     scattered,
+    step_rounds,
 )
 
 N = 12
@@ -67,7 +67,7 @@ def robot(scenario: Scenario, name: str = "r1") -> DensityRobot:
 def transcripts(name: str, rounds: int = 40) -> dict[str, Transcript]:
     """What the robots of a mission took in and put out; the supervisor is left out."""
     scenario = MISSIONS[name]
-    played = rehearse(cast(scenario, SAMPLES_M), scenario, rounds)
+    played = step_rounds(build_team(scenario, SAMPLES_M), scenario, rounds)
     return {robot_id: played[robot_id] for robot_id in scenario.robot_ids}
 
 
@@ -123,7 +123,7 @@ def test_energy_budget_is_never_exceeded(name: str) -> None:
 
 
 @EVERY_MISSION
-def test_robot_that_is_done_stands_and_ships_nothing(name: str) -> None:
+def test_resting_robot_stays_and_ships_nothing(name: str) -> None:
     """FINISHED or EXHAUSTED is final: same pose, no goal, no spending; it still speaks (Alg. 3)."""
     for transcript in transcripts(name).values():
         put_out = [outputs for _, outputs in transcript]
@@ -137,7 +137,7 @@ def test_robot_that_is_done_stands_and_ships_nothing(name: str) -> None:
 
 
 @EVERY_MISSION
-def test_state_says_why_a_robot_is_done(name: str) -> None:
+def test_final_state_is_the_reason_for_rest(name: str) -> None:
     """FINISHED: no weight left in its view. EXHAUSTED: its energy is spent and weight is left."""
     for transcript in transcripts(name).values():
         left = [UNITS.sample] * N
@@ -169,7 +169,7 @@ def test_published_weights_are_the_robot_s_own(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["ledger", "centralized", "walking", "spare-energy"])
-def test_everybody_comes_to_the_sum_of_all_spending(name: str) -> None:
+def test_all_robots_come_to_the_sum_of_all_spending(name: str) -> None:
     """ledger: weights = first weight - everybody's spending, once all news is in (design, 4)."""
     left = [UNITS.sample] * N
     vectors = []
@@ -202,7 +202,7 @@ def test_step_is_numbered_and_sound(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "target"), [("ledger", EVERYBODY), ("min", EVERYBODY), ("centralized", SUPERVISOR)]
 )
-def test_robots_address_the_supervisor_only_or_everybody(name: str, target: str) -> None:
+def test_robots_address_the_supervisor_only_or_all_in_range(name: str, target: str) -> None:
     """centralized: robots talk to the supervisor only; decentralized: to whoever is in range."""
     targets = {
         envelope.target
@@ -311,7 +311,7 @@ def test_malformed_envelopes_are_counted_and_change_nothing(name: str) -> None:
         max_size=6,
     )
 )
-def test_any_bodies_are_survived(bodies: list[bytes]) -> None:
+def test_any_bodies_give_sound_outputs(bodies: list[bytes]) -> None:
     """Whatever reaches the radio: outputs that are sound, and no more energy than there is."""
     noise = tuple(Envelope("r2", i, "", body) for i, body in enumerate(bodies))
     for outputs in alone(mission(), 12, lambda _, inputs: noisy(inputs, noise, 0)):
@@ -322,12 +322,12 @@ def test_any_bodies_are_survived(bodies: list[bytes]) -> None:
 
 
 @pytest.mark.parametrize("overrides", [(), MINIMUM], ids=["ledger", "min"])
-def test_robot_that_is_done_keeps_relaying(overrides: tuple[str, ...]) -> None:
+def test_resting_robot_keeps_relaying(overrides: tuple[str, ...]) -> None:
     """r2 is exhausted after its first step and stands between r1 and r3: news still gets across."""
     scenario = mission(*overrides)
-    machines = cast(scenario, SAMPLES_M)
+    machines = build_team(scenario, SAMPLES_M)
     machines["r2"] = robot(mission("energy.steps=1", *overrides), "r2")
-    played = rehearse(machines, scenario, 40, in_a_row)
+    played = step_rounds(machines, scenario, 40, in_a_row)
     vectors = []
     for robot_id in ("r1", "r3"):
         vector = dict.fromkeys(range(N), UNITS.sample)
@@ -347,7 +347,7 @@ def test_concurrent_robots_do_not_stay_together() -> None:
     apart = {}
     for claims in (True, False):
         scenario = mission(starts, f"claims={str(claims).lower()}")
-        played = rehearse(cast(scenario, SAMPLES_M), scenario, 8)
+        played = step_rounds(build_team(scenario, SAMPLES_M), scenario, 8)
         places = [transcript[-1][1].pose for transcript in played.values()]
         apart[claims] = len({(pose.x_m, pose.y_m) for pose in places})
 

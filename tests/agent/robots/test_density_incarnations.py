@@ -35,7 +35,18 @@ from kantor_supervisor.density import DensitySupervisor
 from kantor_worldsim.record.records import Batch, Ending, Record
 from kantor_worldsim.world.world import WorldSetup
 from support.missions import on_map, site_of
-from support.strategies import MINIMUM, cast, examples, mission, scattered, starts
+from support.strategies import (
+    MINIMUM,
+    VALIDATED_ROUNDS,
+    InRange,
+    all_in_range,
+    build_team,
+    examples,
+    mission,
+    scattered,
+    start_poses,
+    validate_all,
+)
 
 N = 12
 SAMPLES_M = scattered(N)
@@ -52,7 +63,6 @@ MISSIONS = {
     "walking": ("samples.diffusion_m=4.0",),
 }
 EVERY_MISSION = pytest.mark.parametrize("name", list(MISSIONS))
-Hears = Callable[[ParticipantId, ParticipantId], bool]
 
 
 class Rehearsal:
@@ -60,8 +70,8 @@ class Rehearsal:
 
     def __init__(self, scenario: Scenario, seed: int = 1) -> None:
         self.scenario, self._seed = scenario, seed
-        self.machines: dict[ParticipantId, StateMachine] = cast(scenario, SAMPLES_M, seed)
-        self.bodies = {name: Body(pose) for name, pose in starts(scenario).items()}
+        self.machines: dict[ParticipantId, StateMachine] = build_team(scenario, SAMPLES_M, seed)
+        self.bodies = {name: Body(pose) for name, pose in start_poses(scenario).items()}
         self.told: dict[ParticipantId, list[Outputs]] = {name: [] for name in self.machines}
         """Of all incarnations, one after the other."""
         self.births: dict[ParticipantId, list[int]] = {name: [0] for name in self.machines}
@@ -82,7 +92,7 @@ class Rehearsal:
 
     def round(
         self,
-        hears: Hears = lambda _speaker, _listener: True,
+        in_range: InRange = all_in_range,
         *,
         absent: Iterable[ParticipantId] = (),
         skew_ns: int = 0,
@@ -107,8 +117,10 @@ class Rehearsal:
         for envelope in sent:
             for name in self.machines:
                 wanted = envelope.target in (EVERYBODY, name) and envelope.source != name
-                if wanted and name not in absent and hears(envelope.source, name):
+                if wanted and name not in absent and in_range(envelope.source, name):
                     self._inboxes[name].append(envelope)
+        if self.rounds % VALIDATED_ROUNDS == 0:
+            validate_all(self.machines.values())
 
     def replica(self, name: ParticipantId) -> Replica:
         """What a participant holds."""
@@ -139,7 +151,7 @@ def pairs(packed: bytes) -> list[tuple[int, int]]:
     deaths=st.sets(st.tuples(st.integers(1, 14), st.integers(0, 3)), max_size=8),
     lost=st.sets(st.integers(0, 200), max_size=80),
 )
-def test_whoever_is_born_again_in_the_end_all_know_the_same(
+def test_all_know_the_same_in_the_end_whatever_incarnations_begin(
     *, name: str, deaths: set[tuple[int, int]], lost: set[int]
 ) -> None:
     """Robots and the supervisor forget all at any moment, messages are lost; then the radio is good."""
@@ -190,7 +202,7 @@ def check_life(played: Rehearsal, name: ParticipantId) -> None:
         assert died == born or subscriber.weights is not None
 
 
-def test_sums_over_visits_count_those_of_the_dead() -> None:
+def test_sums_over_visits_count_those_of_earlier_incarnations() -> None:
     """Spectral: what an incarnation has told of its visits stays in everybody's sums, once."""
     played = Rehearsal(mission(*MISSIONS["spectral"], "energy.points=60"))
     for moment in range(30):
@@ -210,7 +222,7 @@ def test_sums_over_visits_count_those_of_the_dead() -> None:
         assert played.replica(name).registers.total.tolist() == visits.tolist()
 
 
-def test_who_takes_over_a_body_holds_for_a_step() -> None:
+def test_an_incarnation_that_takes_over_a_body_holds_for_a_step() -> None:
     """It cannot know when the body moved last; a full step could break the speed limit."""
     played = Rehearsal(mission(*MISSIONS["spectral"], "energy.points=300"))
     for _ in range(5):
@@ -254,7 +266,7 @@ def test_robots_go_on_without_a_supervisor_and_come_back(merge: str, disk: str) 
         assert weights[0] == [max(0, whole - consumed[sample]) for sample in range(N)]
 
 
-def test_robot_out_of_the_supervisors_reach_is_alone_by_itself() -> None:
+def test_only_the_robot_out_of_the_supervisors_range_fails_over() -> None:
     """Failover is each robot's own: the others go on with the supervisor."""
     played = Rehearsal(mission("coordination=centralized", "energy.points=300"))
     for _ in range(30):
@@ -264,7 +276,7 @@ def test_robot_out_of_the_supervisors_reach_is_alone_by_itself() -> None:
     assert targets == {"r1": EVERYBODY, "r2": SUPERVISOR, "r3": SUPERVISOR}
 
 
-def test_boast_about_its_own_log_moves_nobody() -> None:
+def test_a_version_vector_beyond_the_log_is_accepted_and_changes_nothing() -> None:
     """Whoever claims to hold more of a robot's log than it has written is heard, and no more."""
     played = Rehearsal(mission())
     for _ in range(4):
@@ -309,13 +321,13 @@ def test_samples_walk_a_bounded_way_at_once_and_never_back() -> None:
     walked = []
     for step, now_s in enumerate((0.1, 3600.0, 0.3, 0.4, 30.0, 30.1, 30.2, 30.3, 30.4, 30.5, 30.6)):
         robot.step(Inputs(round(now_s * 1e9), Observation(step, Pose(10.0, 10.0))))
-        walked.append(robot._belief.walked)
+        walked.append(robot._belief.random_walk_steps)
 
     assert walked == [1, 33, 33, 33, 65, 97, 129, 161, 193, 225, 257]
     late = DensityRobot("r1", scenario, 1, Body(Pose(10.0, 10.0)), SAMPLES_M)
     for step in range(12):
         late.step(Inputs(30_000_000_000 + step, Observation(step, Pose(10.0, 10.0))))
-    assert late._belief.walked == 300
+    assert late._belief.random_walk_steps == 300
 
 
 # On maps, in the real world-sim.
@@ -380,7 +392,7 @@ def explore(scenario: Scenario, troubled: dict[ParticipantId, Troubled]) -> list
 
 @pytest.mark.parametrize("planner", MAP_PLANNERS)
 @pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
-def test_map_is_explored_whoever_is_born_again(planner: str, coordination: str) -> None:
+def test_map_is_explored_whatever_incarnations_begin(planner: str, coordination: str) -> None:
     """Layers of the dead count on; whoever comes back gets targets and rests at last."""
     scenario = on_map(f"planner.name={planner}", f"coordination={coordination}", "limit_s=300")
     site = site_of(scenario)

@@ -120,7 +120,7 @@ class Played:
 
 @pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
 @pytest.mark.parametrize("planner", sorted(MAP_PLANNERS))
-def test_every_planner_explores_it_all_and_rests(planner: str, coordination: str) -> None:
+def test_every_planner_explores_the_whole_map_and_rests(planner: str, coordination: str) -> None:
     """Each robot by itself, when no frontier can be reached any more."""
     played = Played(mission(f"planner={planner}", f"coordination={coordination}"))
 
@@ -133,7 +133,9 @@ def test_every_planner_explores_it_all_and_rests(planner: str, coordination: str
     )
 
 
-def test_who_knows_the_same_comes_to_the_same_assignment(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_robots_that_know_the_same_come_to_the_same_assignment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """In contact with everybody and without loss, all robots decide the same at the same time."""
     decided: dict[int, list[dict[int, Task]]] = {}
     decide = assignment.Assignment.decide
@@ -155,7 +157,7 @@ def test_who_knows_the_same_comes_to_the_same_assignment(monkeypatch: pytest.Mon
         assert all(tasks[0] == tasks[1] == tasks[2] for tasks in full.values())
 
 
-def test_a_robot_that_hears_nobody_explores_alone() -> None:
+def test_a_robot_out_of_contact_explores_alone() -> None:
     """Range 0: everybody does everything, and none rests before."""
     alone = Played(mission("radio.range_m=0"))
     together = Played(mission())
@@ -173,14 +175,14 @@ def test_loss_delay_and_repetition_cost_time_alone(coordination: str) -> None:
     Played(mission(f"coordination={coordination}", *overrides)).assert_explored()
 
 
-def test_without_their_supervisor_robots_go_on_by_themselves() -> None:
+def test_robots_out_of_range_of_their_supervisor_assign_targets_themselves() -> None:
     """One that is out of range of everybody gives no orders."""
     out_of_range = ("supervisor.range_m=0", "supervisor.pose_m=[500.0, 500.0]")
 
     Played(mission("coordination=centralized", *out_of_range)).assert_explored()
 
 
-def test_a_supervisor_that_falls_silent_is_done_without() -> None:
+def test_robots_go_on_without_a_supervisor_that_falls_silent() -> None:
     """Its last orders hold until they are out of date."""
 
     class Falling:
@@ -277,7 +279,7 @@ def test_rest_is_final() -> None:
                 assert len(step_record.outputs.outbox) == 1
 
 
-def test_a_late_word_moves_nobody() -> None:
+def test_a_late_observation_changes_nothing() -> None:
     """An observation of an older step is no news, neither of the place nor of the walls."""
     scenario = mission("robots.count=1")
     robot = MappingRobot("r1", scenario, 0, Body(Pose(2.5, 2.5)), ROOMS.frame)
@@ -291,7 +293,7 @@ def test_a_late_word_moves_nobody() -> None:
     assert robot._replica.store.length[0] == held
 
 
-def test_a_supervisor_is_light_on_what_it_does_not_know() -> None:
+def test_a_supervisor_that_knows_no_robot_assigns_no_target() -> None:
     """Before anybody has spoken it has nobody to send anywhere."""
     scenario = mission("coordination=centralized")
     supervisor = MappingSupervisor(SUPERVISOR, scenario, 0, Body(Pose(0.0, 0.0)), ROOMS.frame)

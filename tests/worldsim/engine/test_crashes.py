@@ -18,7 +18,7 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import decode_gossip
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import ForeignRecordError, Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.radio.channel import DROPPED
 from kantor_worldsim.record.records import (
     Batch,
@@ -139,11 +139,11 @@ def test_restart_with_the_snapshot_is_as_if_nothing_had_been(
     overrides = (*LOSSY, *PACES[pace])
     kills = [kill(who, at_s, at_s + 1e-9) for at_s in sorted(moments_s)]
     records = run(*kills, overrides=overrides)
-    starts = [incident for incident in incidents(records) if incident.what == "start"]
+    starts = [incident for incident in incidents(records) if incident.kind == "start"]
 
     assert batches(records) == batches(undisturbed(overrides))
     assert all(incident.incarnation == 0 for incident in starts)
-    assert [(incident.who, incident.what) for incident in incidents(records)] == [
+    assert [(incident.who, incident.kind) for incident in incidents(records)] == [
         (who, what) for _ in starts for what in ("kill", "start")
     ]
 
@@ -182,7 +182,7 @@ def test_step_between_its_note_and_its_answer_is_neither_lost_nor_made_twice(
     """It spends once: on record before anybody hears of it, told when the robot is back."""
     overrides = (*LOSSY, *PACES[pace])
     records = run(kill("r2", 1.22, until_s, "mid_step = true"), overrides=overrides)
-    start = next(incident for incident in incidents(records) if incident.what == "start")
+    start = next(incident for incident in incidents(records) if incident.kind == "start")
     plain = step_records(undisturbed(overrides), "r2")
     silent = [batch for batch in batches(records) if batch.absent]
     answer = next(
@@ -215,7 +215,7 @@ def test_who_forgot_comes_back_as_another(pace: str, disk: str, mid_step: bool) 
     more = (f'disk = "{disk}"', *(("mid_step = true",) if mid_step else ()))
     kills = [kill("r1", 1.02, 1.42, *more), kill("r1", 2.02, 2.42, *more)]
     records = run(*kills, overrides=(*LOSSY, *PACES[pace]))
-    starts = [incident for incident in incidents(records) if incident.what == "start"]
+    starts = [incident for incident in incidents(records) if incident.kind == "start"]
     told = step_records(records, "r1")
     incarnations = {
         outputs(step_record).step: decode_gossip(envelope.body).incarnation
@@ -239,7 +239,7 @@ def test_who_never_acted_is_nobody_else(disk: str) -> None:
         kill("r1", 0.01, 0.52, f'disk = "{disk}"', "mid_step = true"),
         kill("r2", 0.01, 0.52, f'disk = "{disk}"'),
     )
-    starts = {i.who: (i.incarnation, i.step) for i in incidents(records) if i.what == "start"}
+    starts = {i.who: (i.incarnation, i.step) for i in incidents(records) if i.kind == "start"}
 
     assert starts == {"r1": (0, int(disk == "kept")), "r2": (0, 0)}
     assert is_sound(records)
@@ -286,7 +286,7 @@ def test_what_is_sent_to_an_idle_robot_waits(fault: str, told: tuple[str, str]) 
         if decision.target == "r2" and 900 * MS <= batch.now_ns < 1500 * MS
     )
 
-    assert tuple(incident.what for incident in incidents(records)) == told
+    assert tuple(incident.kind for incident in incidents(records)) == told
     assert [step_record.now_ns // MS for step_record in r2][8:11] == [900, 1500, 1600]
     assert back.heard == tuple((source, sequence) for _, source, sequence in waiting)
     assert not any(batch.absent for batch in batches(records))
@@ -299,7 +299,7 @@ def test_slow_robot_gets_to_some_of_its_steps() -> None:
     times_ms = [step_record.now_ns // MS for step_record in step_records(records, "r2")]
 
     assert times_ms[8:15] == [900, 1200, 1600, 2000, 2400, 2500, 2600]
-    assert [incident.what for incident in incidents(records)] == ["slow", "quicken"]
+    assert [incident.kind for incident in incidents(records)] == ["slow", "quicken"]
     assert is_sound(records)
 
 
@@ -319,7 +319,7 @@ def test_wrong_clock_is_on_record_and_breaks_no_rule(pace: str, offset_s: float)
     )
     mailbag = EnvelopeIndex()
     for batch in batches(records):
-        mailbag.post(batch)
+        mailbag.add(batch)
 
     assert wrong
     assert all(
@@ -364,7 +364,7 @@ def test_limit_holds_for_deeds_too() -> None:
     """What would be done after the limit is not done."""
     records = run(kill("r2", 0.52, 2.5), overrides=("limit_s=2.0",))
 
-    assert [incident.what for incident in incidents(records)] == ["kill"]
+    assert [incident.kind for incident in incidents(records)] == ["kill"]
     assert records[-1] == Ending(2000 * MS, "limit")
 
 
@@ -413,7 +413,7 @@ def test_world_sim_goes_on_from_its_record(
         b for b in paused if not isinstance(b, ProcessEvent)
     ][1:]
     assert not any(batch.now_ns in during for batch in batches(killed))
-    told = [(i.now_ns, i.what) for i in incidents(killed) if i.who == WORLD_SIM]
+    told = [(i.now_ns, i.kind) for i in incidents(killed) if i.who == WORLD_SIM]
     assert told == [(during.start, "kill"), (during.stop, "start")][: len(told)]
 
 
@@ -473,16 +473,16 @@ def test_mission_goes_on_from_any_record(pace: str) -> None:
     whole: list[Record] = []
     play(scenario, 1, site, [whole.append])
     for asks in range(1, 60, 2):
-        crew = in_process(everybody_mortal(scenario, site))
+        exchange = InProcessExchange(everybody_mortal(scenario, site))
         left = iter(range(asks))
         records: list[Record] = []
         simulation = Simulation(scenario, 1, site, [records.append])
-        simulate(simulation, crew, 1, lambda left=left: next(left, None) is None)  # type: ignore[misc]
+        simulate(simulation, exchange, 1, lambda left=left: next(left, None) is None, exchange)  # type: ignore[misc]
         if records[-1] == whole[-1]:
             break
         records.pop()
         again = Simulation.resumed(scenario, 1, site, tuple(records), [records.append])
-        simulate(again, crew, 1, lambda: False)
+        simulate(again, exchange, 1, lambda: False, exchange)
 
         assert records == whole
 

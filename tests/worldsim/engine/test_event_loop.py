@@ -16,7 +16,7 @@ from kantor_protocol.scenario.clocks import StepClock, step_clocks
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.engine.event_loop import Agenda, simulate
 from kantor_worldsim.engine.simulation import Simulation, Step
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.radio.channel import DROPPED
 from kantor_worldsim.record.journal import Journal
@@ -65,7 +65,7 @@ def run(
     records: list[Record] = []
     simulation = Simulation(scenario, 1, site, [records.append])
     prepare(simulation)
-    simulate(simulation, exchange(in_process(team(scenario, 1, site))), 1, stopped)
+    simulate(simulation, exchange(InProcessExchange(team(scenario, 1, site))), 1, stopped)
     return records
 
 
@@ -89,7 +89,7 @@ import sys
 from kantor_fleet.execution.in_process_team import play, team
 from kantor_protocol.scenario.load import parse
 from kantor_worldsim.engine.event_loop import simulate
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.world.world import WorldSetup
@@ -260,7 +260,7 @@ def test_messages_pass_the_codec() -> None:
     inputs = Inputs(
         5, Simulation(mission(), 1, WorldSetup.of(mission(), 1), []).inputs("r1", 5).observation
     )
-    outputs = in_process({"r1": Echo()})({"r1": inputs})["r1"]
+    outputs = InProcessExchange({"r1": Echo()})({"r1": inputs})["r1"]
 
     assert given == [inputs]
     assert given[0] is not inputs
@@ -315,7 +315,7 @@ def test_robot_that_has_left_is_not_waited_for() -> None:
     """When whoever runs the robots knows that one is gone, the mission ends with the others."""
 
     def leave(simulation: Simulation) -> None:
-        simulation.gone = {"r2"}
+        simulation._gone = {"r2"}
 
     records = run(mission("energy.steps=60"), exchange=without("r2", 0), prepare=leave)
 

@@ -52,7 +52,7 @@ def test_world_sim_comes_first_and_goes_last() -> None:
     pause = 'kind = "pause"; who = ["r3"]; from_s = 1.0; until_s = 2.0'
     deeds = schedule_of(troubled(outage, pause))
 
-    assert [(deed.who, deed.what) for deed in deeds] == [
+    assert [(deed.who, deed.kind) for deed in deeds] == [
         ("r3", "pause"),
         ("worldsim", "kill"),
         ("worldsim", "start"),

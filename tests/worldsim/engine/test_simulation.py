@@ -121,7 +121,7 @@ def test_act_is_recorded_with_what_led_to_it() -> None:
     second = theatre.play(r2=outputs(1, (20.0, 0.0), source="r2"))
     step_record = act_of(second, "r2")
     mailbag = EnvelopeIndex()
-    mailbag.post(first)
+    mailbag.add(first)
 
     assert step_record.heard == (("r1", 10),)
     assert (step_record.now_ns, step_record.observation.pose) == (2 * PERIOD_NS, Pose(24.0, 0.0))
@@ -182,11 +182,11 @@ def test_turn_is_asked_again_until_it_is_answered() -> None:
     """The same inputs, whatever came since; the inbox is on record with the answer."""
     theatre = Theatre()
     theatre.play(r2=outputs(1, (20.0, 0.0), "r1", source="r2"))
-    turn = theatre.simulation.turn("r1", 2 * PERIOD_NS, skew_ns=7)
+    turn = theatre.simulation.request("r1", 2 * PERIOD_NS, skew_ns=7)
     theatre.simulation.settle(2 * PERIOD_NS, [turn])
     silent = theatre.records[-1]
     theatre.play(r2=outputs(2, (20.0, 0.0), "r1", source="r2"))
-    again = theatre.simulation.turn("r1", 4 * PERIOD_NS)
+    again = theatre.simulation.request("r1", 4 * PERIOD_NS)
     theatre.simulation.settle(4 * PERIOD_NS, [again.answered(outputs(1, (1.0, 0.0)))])
     answered = theatre.records[-1]
     assert isinstance(silent, Batch)
@@ -239,7 +239,7 @@ def test_those_who_left_are_not_waited_for(
     }
     if step_records:
         theatre.play(**step_records)
-    theatre.simulation.gone = set(gone)
+    theatre.simulation._gone = set(gone)
 
     assert theatre.simulation.over == over
 

@@ -1,4 +1,4 @@
-"""Who is let in, with a bus of the test's own."""
+"""Admission of processes, with a bus that the test plays."""
 
 from typing import cast
 
@@ -9,8 +9,9 @@ from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.wire.messages import Mission, decode_to_participant
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.config import MissionConfig
-from kantor_worldsim.exchange.lobby import AGAIN_S, Lobby
-from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.exchange.lobby import RETRY_S, Lobby
+from kantor_worldsim.observers.metrics.density import DensityMetrics
+from kantor_worldsim.observers.progress import ProgressReporter
 from kantor_worldsim.world.world import WorldSetup
 from support.strategies import mission
 
@@ -41,24 +42,23 @@ class Bus:
 
 
 def test_who_is_there_and_silent_is_told_its_mission_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Behind a site's router a process may be seen before it can be reached: it is told once in AGAIN_S."""
+    """Behind a site's router a process may be seen before it can be reached: it is told once in RETRY_S."""
     bus, scenario = Bus(), mission()
     monkeypatch.setattr("kantor_worldsim.exchange.lobby.time", bus)
-    site = WorldSetup.of(scenario, 0)
-    plan = MissionConfig(scenario, 0, site, "wall")
+    setup = WorldSetup.of(scenario, 0)
+    simulation = Simulation(scenario, 0, setup, [])
     lobby = Lobby(
         cast("HubRouter", bus),
-        plan,
-        Recording(scenario, 0, "wall"),
+        MissionConfig(scenario, 0, setup, "wall"),
+        "run",
+        simulation,
+        ProgressReporter(DensityMetrics(), scenario, lambda _progress: None),
         lambda: False,
-        lambda _progress: None,
-        None,
         lambda _line: None,
     )
-    lobby.simulation = Simulation(scenario, 0, site, [])
     bus.events.append(Joined("r1", "nonce"))
-    while bus.now_s < 3.5 * AGAIN_S:
-        lobby.next(0.1 * AGAIN_S)
+    while bus.now_s < 3.5 * RETRY_S:
+        lobby.next(0.1 * RETRY_S)
 
     told = [decode_to_participant(payload) for _, payload in bus.sent]
     assert {name for name, _ in bus.sent} == {"r1"}

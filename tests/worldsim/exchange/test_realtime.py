@@ -1,4 +1,4 @@
-"""What the wall's relay keeps for a participant, and what it believes of what that has heard."""
+"""The realtime exchange: the outbox of a participant, and which reported inboxes are possible."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,7 +9,7 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.engine.process_faults import schedule_of
 from kantor_worldsim.exchange.config import needs_process_control
 from kantor_worldsim.exchange.fault_injector import world_starts_ns
-from kantor_worldsim.exchange.realtime import Mail
+from kantor_worldsim.exchange.realtime import Outbox
 from support.strategies import examples, mission
 
 
@@ -26,42 +26,42 @@ def test_whatever_part_of_what_was_handed_out_arrived_is_believed(
     handed: list[int], kept: list[bool]
 ) -> None:
     """A full queue drops some; the rest is in order. Numbers come twice, as duplicates do."""
-    mail = Mail()
-    mail.waiting += [envelope(number) for number in handed]
-    assert [e.sequence for e in mail.hand()] == handed
+    outbox = Outbox()
+    outbox.waiting += [envelope(number) for number in handed]
+    assert [e.sequence for e in outbox.hand()] == handed
     arrived = [number for number, stays in zip(handed, kept, strict=False) if stays]
-    heard = mail.heard(tuple(("r1", number) for number in arrived))
+    heard = outbox.received(tuple(("r1", number) for number in arrived))
 
     assert heard is not None
     assert [e.sequence for e in heard] == arrived
-    assert len(mail.handed) <= len(handed) - len(arrived)
+    assert len(outbox.handed) <= len(handed) - len(arrived)
 
 
 @given(handed=NUMBERS, told=NUMBERS)
 @examples(300)
 def test_nothing_else_is_believed(handed: list[int], told: list[int]) -> None:
     """Against the rule in words: an inbox is a subsequence of what was handed out."""
-    mail = Mail()
-    mail.waiting += [envelope(number) for number in handed]
-    mail.hand()
+    outbox = Outbox()
+    outbox.waiting += [envelope(number) for number in handed]
+    outbox.hand()
     rest = iter(handed)
     possible = all(number in rest for number in told)
 
-    assert (mail.heard(tuple(("r1", number) for number in told)) is not None) == possible
+    assert (outbox.received(tuple(("r1", number) for number in told)) is not None) == possible
     if not possible:
-        assert [e.sequence for e in mail.handed] == handed
+        assert [e.sequence for e in outbox.handed] == handed
 
 
 def test_what_waits_for_who_does_not_listen_is_bounded() -> None:
-    mail = Mail()
-    mail.waiting += [envelope(i) for i in range(3 * INBOX_MAX)]
-    first = mail.hand()
-    mail.waiting += [envelope(i) for i in range(3 * INBOX_MAX, 5 * INBOX_MAX)]
-    assert mail.hand() == ()
-    assert len(first) == len(mail.waiting) == INBOX_MAX
-    mail.heard(tuple((e.source, e.sequence) for e in first))
-    assert [e.sequence for e in mail.hand()] == list(range(4 * INBOX_MAX, 5 * INBOX_MAX))
-    assert len(mail.waiting) == 0
+    outbox = Outbox()
+    outbox.waiting += [envelope(i) for i in range(3 * INBOX_MAX)]
+    first = outbox.hand()
+    outbox.waiting += [envelope(i) for i in range(3 * INBOX_MAX, 5 * INBOX_MAX)]
+    assert outbox.hand() == ()
+    assert len(first) == len(outbox.waiting) == INBOX_MAX
+    outbox.received(tuple((e.source, e.sequence) for e in first))
+    assert [e.sequence for e in outbox.hand()] == list(range(4 * INBOX_MAX, 5 * INBOX_MAX))
+    assert len(outbox.waiting) == 0
 
 
 def beset(*faults: str) -> Scenario:
@@ -83,14 +83,14 @@ def test_faults_of_real_processes_need_hands() -> None:
 
 
 def test_a_killed_world_sim_knows_when_it_was_to_come_back() -> None:
-    """Other deeds may be due before."""
-    deeds = schedule_of(
+    """Other schedule may be due before."""
+    schedule = schedule_of(
         beset(
             '{kind="kill", who=["worldsim"], from_s=3, until_s=5}',
             '{kind="pause", who=["r2"], from_s=2, until_s=4}',
         )
     )
-    starts = [world_starts_ns(deeds, done) for done in range(len(deeds) + 1)]
+    starts = [world_starts_ns(schedule, done) for done in range(len(schedule) + 1)]
 
-    assert [deed.what for deed in deeds] == ["pause", "kill", "resume", "start"]
+    assert [scheduled.kind for scheduled in schedule] == ["pause", "kill", "resume", "start"]
     assert starts == [None, None, 5 * 10**9, 5 * 10**9, None]

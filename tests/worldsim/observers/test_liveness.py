@@ -9,12 +9,12 @@ import pytest
 from kantor_fleet.execution.in_process_team import team
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR
 from kantor_protocol.base.varint import put_uint
-from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import decode_gossip, encode_gossip
+from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.liveness import LivenessChecker, settling_ns
 from kantor_worldsim.record.records import Batch, Ending, Record, StepRecord
 from kantor_worldsim.world.world import WorldSetup
@@ -47,7 +47,7 @@ def rested(*overrides: str, seed: int = 1) -> list[Record]:
     site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
     simulation = _Patient(scenario, seed, site, [records.append])
-    simulate(simulation, in_process(team(scenario, seed, site)), seed, lambda: False)
+    simulate(simulation, InProcessExchange(team(scenario, seed, site)), seed, lambda: False)
     return records
 
 

@@ -18,14 +18,15 @@ from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN
 from kantor_protocol.base.machine import Inputs, Outputs
 from kantor_protocol.node.recovery import KillableNode
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
-from kantor_protocol.replication.replica import Replica, read_version_vector
+from kantor_protocol.replication.replica import Replica
 from kantor_protocol.wire.messages import decode_gossip
+from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
-from kantor_worldsim.observers.metrics.map_tracker_kernels import KIND, TOLD
+from kantor_worldsim.observers.metrics.map_tracker_kernels import AS_SENT, KIND
 from kantor_worldsim.record.columnar import ColumnarDecoder
 from kantor_worldsim.record.records import Batch, Opening, Record, StepRecord
 from kantor_worldsim.world.maps import Ground, parts
@@ -139,10 +140,10 @@ def test_robots_know_what_their_own_charts_show() -> None:
     replica = Replica(1, 2, entries(frame), None, ledger=True, claims=False)
     chart = FusedMap(frame, 2)
     for place in (0, 1):
-        count = map_tracker.state.written.item(place, TOLD)
+        count = map_tracker.state.written.item(place, AS_SENT)
         replica.store.length[place] = 0
         replica.reserve(count)
-        replica.store.logs[place, :count, 0] = map_tracker.state.told[place, :count]
+        replica.store.logs[place, :count, 0] = map_tracker.state.as_sent[place, :count]
         replica.store.length[place] = count
     chart.fold(replica)
 
@@ -242,7 +243,7 @@ def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
     records: list[Record] = []
     simulation = Simulation(scenario, 1, site, [records.append])
     build = functools.partial(participant, "r1", scenario, 1, site)
-    play_all = in_process(
+    play_all = InProcessExchange(
         team(scenario, 1, site) | {"r1": KillableNode(build, simulation.body("r1"))}
     )
     rounds = iter(range(10_000))

@@ -13,7 +13,6 @@ from kantor_protocol.base.grid import FREE, OCCUPIED
 from kantor_protocol.base.machine import Envelope, Pose, State
 from kantor_protocol.base.varint import put_int, put_uint
 from kantor_protocol.replication.occupancy_log import dead_frontier
-from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.wire.messages import (
     Array,
     GossipMessage,
@@ -21,6 +20,7 @@ from kantor_protocol.wire.messages import (
     decode_gossip,
     encode_gossip,
 )
+from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_worldsim.observers.checkers.checker import Checker, check
 from kantor_worldsim.observers.checkers.mapping import MapChecker
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
@@ -373,7 +373,7 @@ def test_frontier_may_be_called_none_from_beside_it() -> None:
     assert rules(_calls_near_frontier_none(explored(*ALONE))) == set()
 
 
-def test_frontier_may_be_called_none_after_heading_for_it_in_vain() -> None:
+def test_frontier_may_be_declared_dead_after_heading_for_it_in_vain() -> None:
     """A robot that has had the same goal for `planner.patience` steps may give it up from afar."""
     slow = (*ALONE, "vehicle.speed_m_s=4")
     records = explored(*slow)
@@ -392,7 +392,7 @@ def test_frontier_may_be_called_none_after_heading_for_it_in_vain() -> None:
     given_up = put(records, step_record, says(lambda news: having(tells(news), r1=1)))
 
     def accused(records: Records) -> bool:
-        return any("calls a frontier none" in line for line in check(records).complaints)
+        return any("declares a frontier dead" in line for line in check(records).complaints)
 
     assert accused(given_up)
     assert not accused(opened(given_up, scenario=on_map(*slow, "planner.patience=1")))
@@ -498,7 +498,7 @@ def test_robot_that_goes_on_with_its_old_log_is_named() -> None:
     """Two incarnations never share a log."""
     fault = "{kind='kill', who=['r2'], from_s=0.75, until_s=1.5}"
     records = explored(f"faults=[{fault}]")
-    start = next(r for r in records if isinstance(r, ProcessEvent) and r.what == "start")
+    start = next(r for r in records if isinstance(r, ProcessEvent) and r.kind == "start")
     reborn = msgspec.structs.replace(start, incarnation=1)
     told = [reborn if record is start else record for record in records]
 

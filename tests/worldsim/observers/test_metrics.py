@@ -27,7 +27,7 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.weights import WeightsSubscriber
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
-from kantor_worldsim.exchange.in_process import in_process
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.state import FORGED_FIRST
 from kantor_worldsim.observers.metrics.density import DensityMetrics, DensityRow
 from kantor_worldsim.observers.metrics.result import Rejoining, Result
@@ -296,7 +296,7 @@ def test_views_follow_the_robots(coordination: str, merge: tuple[str, ...]) -> N
             compared += 1
 
     simulation = Simulation(scenario, 1, site, [compare])
-    simulate(simulation, in_process(machines), 1, lambda: False)
+    simulate(simulation, InProcessExchange(machines), 1, lambda: False)
 
     assert compared > 80
 

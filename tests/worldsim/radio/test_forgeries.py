@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 
 from kantor_fleet.execution.in_process_team import play
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, Pose
-from kantor_protocol.scenario.faults.links import Delay, Drop, Hostile, Partition
+from kantor_protocol.scenario.faults.links import (
+    FORGED_SEQUENCE_MIN,
+    Delay,
+    Drop,
+    Hostile,
+    Partition,
+)
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import (
     BODY_BYTES_MAX,
@@ -23,7 +29,6 @@ from kantor_protocol.wire.messages import (
 from kantor_worldsim.radio import link_faults as injection
 from kantor_worldsim.radio.channel import DROPPED, Channel, DeliveryDecision, Sent
 from kantor_worldsim.radio.forgeries import (
-    FIRST_SEQUENCE,
     FORGERS,
     OVERSIZED_SHARE,
     ForgeryDraws,
@@ -62,8 +67,8 @@ class Air:
     def say(self, *sent: Sent) -> tuple[list[DeliveryDecision], list[DeliveryDecision]]:
         """What becomes of envelopes, and of what comes beside them."""
         decisions = self.channel.transmit(sent)[0]
-        beside = [v for v in decisions if v.sequence >= FIRST_SEQUENCE]
-        return [v for v in decisions if v.sequence < FIRST_SEQUENCE], beside
+        beside = [v for v in decisions if v.sequence >= FORGED_SEQUENCE_MIN]
+        return [v for v in decisions if v.sequence < FORGED_SEQUENCE_MIN], beside
 
 
 def chatter(count: int) -> list[Sent]:
@@ -100,7 +105,9 @@ def test_a_forgery_arrives_with_what_it_comes_beside_and_has_a_number_of_its_own
     decisions, beside = air.say(*chatter(100))
     forgeries = air.faults.pop_forged()
 
-    assert [v.sequence for v in beside] == list(range(FIRST_SEQUENCE, FIRST_SEQUENCE + 600))
+    assert [v.sequence for v in beside] == list(
+        range(FORGED_SEQUENCE_MIN, FORGED_SEQUENCE_MIN + 600)
+    )
     assert [(v.source, v.sequence, v.target) for v in beside] == [
         (e.source, e.sequence, e.target) for e in forgeries
     ]
@@ -108,7 +115,7 @@ def test_a_forgery_arrives_with_what_it_comes_beside_and_has_a_number_of_its_own
         assert (own.target, own.due_ns) == (other.target, other.due_ns)
         assert other.source == own.source or other.source in strangers(NAMES)
     assert air.faults.pop_forged() == ()
-    assert air.say(*chatter(1))[1][0].sequence == FIRST_SEQUENCE + 600
+    assert air.say(*chatter(1))[1][0].sequence == FORGED_SEQUENCE_MIN + 600
 
 
 def test_forgeries_share_the_fate_of_links() -> None:
@@ -237,12 +244,12 @@ def _clean(record: Record) -> Record:
     step_records = [
         replace(
             step_record,
-            heard=tuple(each for each in step_record.heard if each[1] < FIRST_SEQUENCE),
+            heard=tuple(each for each in step_record.heard if each[1] < FORGED_SEQUENCE_MIN),
             outputs=step_record.outputs and replace(step_record.outputs, refused=0),
         )
         for step_record in record.step_records
     ]
-    decisions = [v for v in record.decisions if v.sequence < FIRST_SEQUENCE]
+    decisions = [v for v in record.decisions if v.sequence < FORGED_SEQUENCE_MIN]
     return replace(
         record,
         step_records=tuple(step_records),
@@ -279,7 +286,7 @@ def test_nobody_takes_in_anything_of_the_catalogue(
     for record in records:
         for step_record in record.step_records if isinstance(record, Batch) else ():
             refused[step_record.name] += sum(
-                sequence >= FIRST_SEQUENCE for _, sequence in step_record.heard
+                sequence >= FORGED_SEQUENCE_MIN for _, sequence in step_record.heard
             )
             assert step_record.outputs is not None
             assert step_record.outputs.refused == refused[step_record.name]
@@ -300,7 +307,7 @@ def test_inboxes_with_forgeries_can_be_opened_again() -> None:
         if isinstance(again, Batch):
             for step_record in again.step_records:
                 inputs = mailbag.inputs(step_record)
-                heard += sum(envelope.sequence >= FIRST_SEQUENCE for envelope in inputs.inbox)
-            mailbag.post(again)
+                heard += sum(envelope.sequence >= FORGED_SEQUENCE_MIN for envelope in inputs.inbox)
+            mailbag.add(again)
 
     assert heard > 50

@@ -15,6 +15,7 @@ from kantor_protocol.base.counter_rng import Purpose, uniform
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.scenario.dump import to_tree
 from kantor_protocol.scenario.faults.links import (
+    FORGED_SEQUENCE_MIN,
     Bandwidth,
     Burst,
     Clog,
@@ -36,7 +37,6 @@ from kantor_worldsim.observers.metrics.result import FaultCounts, Result
 from kantor_worldsim.observers.recording import metrics_of
 from kantor_worldsim.radio.channel import DROPPED, Channel, DeliveryDecision, Sent
 from kantor_worldsim.radio.fault_kernels import in_burst
-from kantor_worldsim.radio.forgeries import FIRST_SEQUENCE
 from kantor_worldsim.radio.link_faults import LinkFaults
 from kantor_worldsim.record.journal import Journal
 from kantor_worldsim.record.records import Batch, Ending, Opening, Record
@@ -605,7 +605,7 @@ def _arrivals(decisions: Sequence[DeliveryDecision]) -> dict[tuple[str, int, str
     """When the first copy of each message that was sent arrives at each receiver."""
     arrivals: dict[tuple[str, int, str], int] = {}
     for source, sequence, target, due_ns in map(msgspec.structs.astuple, decisions):
-        if due_ns != DROPPED and sequence < FIRST_SEQUENCE:
+        if due_ns != DROPPED and sequence < FORGED_SEQUENCE_MIN:
             key = source, sequence, target
             arrivals[key] = min(due_ns, arrivals.get(key, due_ns))
     return arrivals

@@ -1,9 +1,10 @@
-"""Truth, radio and record together: what each participant is given, and what follows from its act.
+"""The simulation: truth, radio and record together; what each participant is given, and what follows from its step.
 
-Both the virtual loop and the wall relay stand on this; they differ only in who waits for whom.
+The event loop of virtual time and the realtime exchange both drive it; they differ only in which of them waits
+for participants.
 
-A stage is a function of the records that it has told: whoever has them has the stage (`Stage.resumed`).
-So world-sim needs no snapshot beside its journal.
+A simulation is a function of the records that it has emitted: it can be rebuilt from them (`Simulation.resumed`),
+so world-sim needs no snapshot beside its journal.
 """
 
 from collections.abc import Callable, Iterable
@@ -20,13 +21,17 @@ from kantor_protocol.base.machine import (
     State,
 )
 from kantor_protocol.scenario.faults.processes import Kill, OnProcesses
+from kantor_protocol.scenario.faults.schedule import AnyFault
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError, check_outputs
-from kantor_worldsim.radio.channel import Channel, DeliveryDecision, Sent
+from kantor_worldsim.engine.process_faults import schedule_of
+from kantor_worldsim.radio.channel import Channel, Sent
 from kantor_worldsim.radio.link_faults import LinkFaults
+from kantor_worldsim.record.process_events import TAKE_OVER, ProcessEventKind
 from kantor_worldsim.record.records import (
     Batch,
     Ending,
+    Opening,
     ProcessEvent,
     Record,
     StepRecord,
@@ -35,29 +40,29 @@ from kantor_worldsim.record.records import (
 from kantor_worldsim.world.world import World, WorldSetup
 
 Observer = Callable[[Record], None]
-"""Takes each record as it comes into being: journal, metrics, checker, progress."""
+"""Receives each record as it is emitted."""
 
 
 class Step(msgspec.Struct, frozen=True, gc=False):
-    """What a participant was given and what it returned; None if it returned nothing."""
+    """Inputs of a participant's step, and its outputs; None if it returned none."""
 
     name: ParticipantId
     inputs: Inputs
     outputs: Outputs | None
     skew_ns: int = 0
-    """How far the clock in the inputs is ahead."""
+    """Skew of the clock that the inputs show, positive if it is ahead."""
 
     def answered(self, outputs: Outputs | None) -> "Step":
-        """The same step with what was returned."""
+        """The same step with its outputs."""
         return Step(self.name, self.inputs, outputs, self.skew_ns)
 
 
 class ForeignRecordError(ValueError):
-    """Records that this version does not make of what participants did; the text says which."""
+    """Records that this version does not emit for the same steps; the text names the first."""
 
 
 class Simulation:
-    """A mission under way."""
+    """A mission in progress. Steps and process events go in, records come out."""
 
     def __init__(
         self, scenario: Scenario, seed: int, site: WorldSetup, observers: Iterable[Observer]
@@ -65,14 +70,15 @@ class Simulation:
         self.scenario = scenario
         self.seed = seed
         self.now_ns = 0
+        """Time of the last record, or later; it never falls."""
         self.done_ns = 0
-        """Turn by turn: every step that was due before is done."""
-        self.deeds = 0
-        """So many of the scenario's deeds (see `outages`) are done."""
+        """Virtual time: every step that was due before is done. At most now_ns + 1."""
+        self.faults_done = 0
+        """Number of scheduled process faults that are done (see `process_faults.py`)."""
         self.limit_ns = scenario.limit_ns
         self._linger_ns = round(scenario.linger_s * 1e9)
         self._restless_ns = max((fault.until_ns or 0 for fault in scenario.faults), default=0)
-        """Up to then somebody explored, or something could go wrong."""
+        """The last time at which a robot explored, or a fault was to end."""
         self._faults = LinkFaults.of(scenario, seed)
         self.channel = Channel(
             scenario, seed, site.ground, self._faults.rule if self._faults else None
@@ -82,16 +88,21 @@ class Simulation:
         self._world = World(scenario, seed, site)
         self._observers = tuple(observers)
         self._resting: set[ParticipantId] = set()
+        """Robots that have come to rest; each of them has stepped."""
         self._acted: set[ParticipantId] = set()
+        """Participants that have stepped."""
         self._unanswered: dict[ParticipantId, Step] = {}
+        """Requests without outputs so far, none of them with outputs; their participants are asked again."""
         self._died_ns: dict[ParticipantId, int] = {}
+        """Time of each process's last kill, not after now_ns."""
         self._kept: list[Record] | None = [] if _may_be_killed(scenario) else None
-        self.gone: set[ParticipantId] = set()
-        """Participants that have left and will not come back. Who is killed for good is among them;
-        whoever runs the others keeps this up to date."""
+        """All records so far, the opening first, where the scenario kills world-sim."""
+        self._gone: frozenset[ParticipantId] = frozenset()
+        """Participants that are not on the bus and that the mission does not wait for: killed for good, or
+        reported by the exchange (`leave`, `come_back`). All in the roster."""
         for name in scenario.roster:
             self.channel.place(name, self._world.pose(name))
-        self._tell(opening_of(scenario, seed, site, self._world.first_look()))
+        self._emit(opening_of(scenario, seed, site, self._world.first_look()))
 
     @classmethod
     def resumed(
@@ -102,90 +113,90 @@ class Simulation:
         records: Iterable[Record],
         observers: Iterable[Observer],
     ) -> "Simulation":
-        """A stage as it was when it had told these records, all without an ending.
+        """A simulation as it was when it had emitted these records, all without an ending.
 
-        What participants did happens once more, and no listener is told. Raises ForeignRecordError.
+        Their steps are settled once more, and no observer is called. Raises ForeignRecordError.
         """
-        told: list[Record] = []
-        simulation = cls(scenario, seed, site, [told.append])
+        emitted: list[Record] = []
+        simulation = cls(scenario, seed, site, [emitted.append])
         for number, record in enumerate(records):
             try:
                 simulation._repeat(record)
             except KeyError as error:
-                raise ForeignRecordError(f"record {number}: {error} is not under way") from None
+                raise ForeignRecordError(f"record {number}: {error} is not in flight") from None
             except IndexError:
                 raise ForeignRecordError(f"record {number}: no such fault") from None
-            if told != [record]:
+            if emitted != [record]:
                 raise ForeignRecordError(f"record {number}: does not follow from those before it")
-            told.clear()
+            emitted.clear()
         simulation._observers = tuple(observers)
         return simulation
 
     def rebuilt(self) -> "Simulation":
-        """The same stage from its records; only where the scenario has world-sim killed."""
+        """The same simulation from its records; only where the scenario kills world-sim."""
         assert self._kept is not None
         return Simulation.resumed(self.scenario, self.seed, self._site, self._kept, self._observers)
 
     def forget(self) -> None:
-        """Keep no records: a process that is killed is not rebuilt in memory."""
+        """Keep no records in memory: a process of its own is rebuilt from its journal."""
         self._kept = None
 
     def _repeat(self, record: Record) -> None:
         if isinstance(record, Batch):
-            self.settle(
-                record.now_ns, [self._recalled(step_record) for step_record in record.step_records]
-            )
+            self.settle(record.now_ns, [self._step_of(made) for made in record.step_records])
         elif isinstance(record, ProcessEvent):
             self.note(record)
 
-    def _recalled(self, step_record: StepRecord) -> Step:
-        """The step that an act is the record of."""
-        if step_record.outputs is None or step_record.name in self._unanswered:
-            return self.turn(step_record.name, step_record.now_ns, step_record.skew_ns).answered(
-                step_record.outputs
-            )
-        inbox = self.channel.collect_heard(step_record.name, step_record.heard)
-        inputs = Inputs(
-            step_record.now_ns + step_record.skew_ns, self._world.observe(step_record.name), inbox
-        )
-        return Step(step_record.name, inputs, step_record.outputs, step_record.skew_ns)
+    def _step_of(self, made: StepRecord) -> Step:
+        """The step that a record is of."""
+        if made.outputs is None or made.name in self._unanswered:
+            return self.request(made.name, made.now_ns, made.skew_ns).answered(made.outputs)
+        inbox = self.channel.collect_heard(made.name, made.heard)
+        inputs = Inputs(made.now_ns + made.skew_ns, self._world.observe(made.name), inbox)
+        return Step(made.name, inputs, made.outputs, made.skew_ns)
 
     def inputs(self, name: ParticipantId, now_ns: int) -> Inputs:
-        """What has reached a participant by now. Its inbox is handed out once."""
+        """Observation of a participant and the messages that have arrived by now, each handed out once."""
         return Inputs(now_ns, self._world.observe(name), self.channel.collect(name, now_ns))
 
-    def turn(self, name: ParticipantId, now_ns: int, skew_ns: int = 0) -> Step:
-        """What to ask a participant now: the last turn again if it has not answered that."""
-        asked = self._unanswered.get(name)
-        if asked is not None:
-            return asked
-        inputs = Inputs(
-            now_ns + skew_ns, self._world.observe(name), self.channel.collect(name, now_ns)
-        )
+    def request(self, name: ParticipantId, now_ns: int, skew_ns: int = 0) -> Step:
+        """The step to ask a participant for now: the last one again if that is unanswered."""
+        if (unanswered := self._unanswered.get(name)) is not None:
+            return unanswered
+        inbox = self.channel.collect(name, now_ns)
+        inputs = Inputs(now_ns + skew_ns, self._world.observe(name), inbox)
         return Step(name, inputs, None, skew_ns)
 
     def unanswered(self, name: ParticipantId) -> Step | None:
-        """The turn that a participant was given and has not answered."""
+        """The request that a participant has not answered."""
         return self._unanswered.get(name)
 
     def body(self, name: ParticipantId) -> Body:
-        """What whoever takes a participant over has to know."""
+        """State of a participant as a process that takes it over must know it."""
         return self._world.body(name)
 
     def look(self, name: ParticipantId) -> Observation:
-        """What the world tells a participant of itself."""
+        """Observation of a participant by itself."""
         return self._world.observe(name)
 
     def acted(self, name: ParticipantId) -> bool:
         """Whether a participant has ever stepped in this mission."""
         return name in self._acted
 
+    def leave(self, names: Iterable[ParticipantId]) -> None:
+        """Do not wait for these participants; they are not on the bus."""
+        self._gone |= frozenset(names)
+
+    def come_back(self, name: ParticipantId) -> None:
+        """Wait for a participant again; it is back on the bus."""
+        self._gone -= {name}
+
     @property
     def over(self) -> str | None:
-        """Why there is nothing more to do, or None.
+        """Reason to end the mission, or None.
 
-        `done`: every robot rests, or has left while others rest, for as long as the scenario has them
-        linger. `deserted`: nobody is left.
+        `done`: every robot rests, or has left while others rest, for as long as the scenario lets it
+        linger. `deserted`: no robot is left.
         """
         reason = self._at_rest
         lingers = self.now_ns < self._restless_ns + self._linger_ns if self._linger_ns else False
@@ -193,17 +204,15 @@ class Simulation:
 
     @property
     def _at_rest(self) -> str | None:
-        robots = self._robots
-        if len(self._resting) + len(self.gone) < len(robots) or not robots <= (
-            self._resting | self.gone
-        ):
+        robots, resting, gone = self._robots, self._resting, self._gone
+        if len(resting) + len(gone) < len(robots) or not robots <= resting | gone:
             return None
-        return "done" if robots - self.gone or robots <= self._resting else "deserted"
+        return "done" if robots - gone or robots <= resting else "deserted"
 
-    def settle(self, now_ns: int, steps: Iterable[Step]) -> tuple[DeliveryDecision, ...]:
-        """Let steps made at one moment happen: everybody is heard from where its step began, then moves.
+    def settle(self, now_ns: int, steps: Iterable[Step]) -> None:
+        """Settle steps made at one moment: messages are delivered from where steps began, then robots move.
 
-        A robot answers from where it heard, before what it heard makes it turn away (Algorithm 3).
+        A robot answers from where it received, before what it received makes it turn away (Algorithm 3).
         """
         self.now_ns = max(self.now_ns, now_ns)
         self.done_ns = now_ns + 1
@@ -211,43 +220,59 @@ class Simulation:
             self._restless_ns = max(self._restless_ns, now_ns)
         sound = [step if _is_sound(step) else step.answered(None) for step in steps]
         sent = [Sent(now_ns, e) for step in sound if step.outputs for e in step.outputs.outbox]
-        ruled, out_of_range = self.channel.transmit(sent)
-        decisions = tuple(ruled)
-        step_records = tuple([self._act(step) for step in sound])
-        absent = (
-            [step_record.name for step_record in step_records if step_record.outputs is None]
-            if self._unanswered
-            else ()
-        )
-        fault_stats = self._faults.pop_stats() if self._faults else ()
+        decisions, out_of_range = self.channel.transmit(sent)
+        made = tuple([self._accept(step) for step in sound])
+        absent = [step.name for step in made if step.outputs is None] if self._unanswered else ()
+        stats = self._faults.pop_stats() if self._faults else ()
         forged = self._faults.pop_forged() if self._faults else ()
-        self._tell(
-            Batch(now_ns, step_records, decisions, out_of_range, tuple(absent), fault_stats, forged)
+        self._emit(
+            Batch(now_ns, made, tuple(decisions), out_of_range, tuple(absent), stats, forged)
         )
-        return decisions
 
-    def note(self, incident: ProcessEvent) -> None:
-        """Put on record what befell a process, and let it have its effect on who is left, and where."""
-        now_ns, who, what, index, _, incarnation = msgspec.structs.astuple(incident)
-        self.now_ns, self.done_ns = max(self.now_ns, now_ns), now_ns
-        if what == "kill":
-            self._died_ns[who] = now_ns
-        fault = self.scenario.faults[index] if index >= 0 else None
-        self.deeds += fault is not None
+    def note(self, event: ProcessEvent) -> None:
+        """Record a process event, and apply what follows for positions, messages and who is waited for."""
+        self.now_ns, self.done_ns = max(self.now_ns, event.now_ns), event.now_ns
+        if event.kind == ProcessEventKind.KILL:
+            self._died_ns[event.who] = event.now_ns
+        fault = self.scenario.faults[event.fault] if event.fault >= 0 else None
+        self.faults_done += fault is not None
         if isinstance(fault, Kill) and fault.until_ns is None:
-            self.gone = self.gone | {who}
-        if what in {"start", "join"} and who != WORLD_SIM:
-            if isinstance(fault, OnProcesses):  # what reached nobody
-                self.channel.lose(who, self._died_ns.get(who, fault.from_ns), now_ns)
-            if self._world.begin(who, incarnation):
-                self._resting.discard(who)
-        self._tell(incident)
+            self.leave((event.who,))
+        if event.kind in TAKE_OVER and event.who != WORLD_SIM:
+            self._take_over(event, fault)
+        self._emit(event)
+
+    def _take_over(self, event: ProcessEvent, fault: AnyFault | None) -> None:
+        """A process takes over a body; messages that arrived while there was none are lost."""
+        if isinstance(fault, OnProcesses):
+            since_ns = self._died_ns.get(event.who, fault.from_ns)
+            self.channel.lose(event.who, since_ns, event.now_ns)
+        if self._world.begin(event.who, event.incarnation):
+            self._resting.discard(event.who)
 
     def end(self, reason: str) -> None:
-        """Close the record."""
-        self._tell(Ending(self.now_ns, reason))
+        """Record the end of the mission."""
+        self._emit(Ending(self.now_ns, reason))
 
-    def _act(self, step: Step) -> StepRecord:
+    def validate(self) -> None:
+        """Assert the invariants that are stated at the attributes."""
+        roster = frozenset(self.scenario.roster)
+        processes = roster | {WORLD_SIM}
+        assert 0 <= self.done_ns <= self.now_ns + 1
+        assert 0 <= self.faults_done <= len(schedule_of(self.scenario))
+        assert self._resting <= self._acted & self._robots
+        assert self._acted <= roster
+        assert self._gone <= processes
+        assert set(self._unanswered) <= roster
+        assert all(step.outputs is None for step in self._unanswered.values())
+        assert all(0 <= died_ns <= self.now_ns for died_ns in self._died_ns.values())
+        assert set(self._died_ns) <= processes
+        assert self._kept is None or isinstance(self._kept[0], Opening)
+        self.channel.validate()
+        self._world.validate()
+
+    def _accept(self, step: Step) -> StepRecord:
+        """The record of a step, with the world's verdict on it."""
         name, inputs, outputs, skew_ns = step.name, step.inputs, step.outputs, step.skew_ns
         now_ns = inputs.now_ns - skew_ns
         if outputs is None:
@@ -263,15 +288,15 @@ class Simulation:
             self._resting.add(name)
         return StepRecord(name, now_ns, inputs.observation, heard, outputs, verdict, skew_ns)
 
-    def _tell(self, record: Record) -> None:
+    def _emit(self, record: Record) -> None:
         if self._kept is not None:
             self._kept.append(record)
-        for listener in self._observers:
-            listener(record)
+        for observer in self._observers:
+            observer(record)
 
 
 def _is_sound(step: Step) -> bool:
-    """Whether its outputs, if any, have a place on the stage: no bad numbers, no false sender."""
+    """Whether the outputs of a step, if any, can be settled: finite numbers, and no false sender."""
     outputs = step.outputs
     if outputs is None:
         return True
@@ -286,5 +311,5 @@ def _is_sound(step: Step) -> bool:
 
 
 def _may_be_killed(scenario: Scenario) -> bool:
-    """Whether world-sim is killed in a scenario, and has to go on from what it has told."""
+    """Whether a scenario kills world-sim, which is then rebuilt from its records."""
     return any(isinstance(fault, Kill) and WORLD_SIM in fault.who for fault in scenario.faults)

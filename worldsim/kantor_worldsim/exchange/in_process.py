@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+import msgspec
+
 from kantor_protocol.base.machine import (
     WORLD_SIM,
     Body,
@@ -13,70 +15,77 @@ from kantor_protocol.base.machine import (
 from kantor_protocol.node.recovery import KillableNode
 from kantor_protocol.scenario.faults.processes import Disk
 from kantor_protocol.wire.messages import decode_inputs, encode
-from kantor_worldsim.engine.event_loop import Crew, decode_outputs
 from kantor_worldsim.exchange.membership import JoinDecision, Membership
 
+_decode_outputs = msgspec.msgpack.Decoder(Outputs).decode
+"""Their numbers are checked by the simulation."""
 
-def in_process(machines: Mapping[ParticipantId, StateMachine]) -> Crew:
-    """The crew without processes. Whom the scenario has killed must be a `Mortal`."""
-    return InProcessExchange(machines)
+
+class _PermanentNode:
+    """A participant that no fault of the scenario kills: its state machine, with encoded inputs."""
+
+    def __init__(self, machine: StateMachine) -> None:
+        self._machine = machine
+
+    def step_encoded(self, entry: bytes, /) -> Outputs:
+        return self._machine.step(decode_inputs(entry))
+
+    def start(self, body: Body, _disk: Disk) -> tuple[int, int]:
+        """A late joiner has existed since the start, and was not asked until now."""
+        return body.incarnation, body.step
 
 
 class InProcessExchange:
-    """The crew without processes. Everything passes the codec, so nothing is shared."""
+    """Exchange and process control for participants in this process.
+
+    Inputs and outputs pass through the codec, so that participants share no objects.
+    """
 
     def __init__(self, machines: Mapping[ParticipantId, StateMachine]) -> None:
-        self._machines = machines
-        self._lives = dict.fromkeys(machines, 0)
-        """How often each participant was started anew."""
-        self._admission = Membership(machines)
+        """machines: a `KillableNode` for each participant that the scenario kills."""
+        self._nodes = {
+            name: machine if isinstance(machine, KillableNode) else _PermanentNode(machine)
+            for name, machine in machines.items()
+        }
+        self._starts = dict.fromkeys(machines, 0)
+        """Number of restarts of each participant."""
+        self._membership = Membership(machines)
         for name in machines:
-            self._admission.join(name, self._nonce(name))
+            self._membership.join(name, self._nonce(name))
 
     def __call__(
         self, inputs: Mapping[ParticipantId, Inputs], /
     ) -> Mapping[ParticipantId, Outputs]:
-        """Step all of a batch."""
-        machines = self._machines
-        made = {}
-        for name, given in inputs.items():
-            machine, entry = machines[name], encode(given)
-            outputs = (
-                machine.step_encoded(entry)
-                if type(machine) is KillableNode
-                else machine.step(decode_inputs(entry))
-            )
-            made[name] = decode_outputs(encode(outputs))
-        return made
+        """Step all participants of a batch."""
+        nodes = self._nodes
+        return {
+            name: _decode_outputs(encode(nodes[name].step_encoded(encode(given))))
+            for name, given in inputs.items()
+        }
 
     def kill(self, name: ParticipantId) -> None:
-        """End a participant; nothing has to be done to world-sim, which is rebuilt."""
-        if name != WORLD_SIM:
-            self._mortal(name).kill()
-            self._admission.leave(name, self._nonce(name))
+        """Kill a participant. World-sim itself is rebuilt from its records by the event loop."""
+        if name == WORLD_SIM:
+            return
+        node = self._nodes[name]
+        if not isinstance(node, KillableNode):
+            raise TypeError(f"{name} is killed in this scenario; pass a KillableNode")
+        node.kill()
+        self._membership.leave(name, self._nonce(name))
 
     def start(self, name: ParticipantId, body: Body, disk: Disk) -> tuple[int, int]:
-        """Start one that was killed, or is late."""
-        machine = self._machines[name]
-        if not isinstance(
-            machine, KillableNode
-        ):  # it has been there all the time, and was not asked
-            return body.incarnation, body.step
-        self._lives[name] += 1
-        self._admission.join(name, self._nonce(name))
-        return machine.start(body, disk)
+        """Start a participant that was killed, or is late; its (incarnation, last step)."""
+        node = self._nodes[name]
+        if isinstance(node, KillableNode):
+            self._starts[name] += 1
+            self._membership.join(name, self._nonce(name))
+        return node.start(body, disk)
 
-    def pretend(self, name: ParticipantId) -> bool:
-        """Have the register decide on somebody else; whoever gets in leaves again at once."""
-        let_in = self._admission.join(name, "impostor") in {JoinDecision.NEW, JoinDecision.BACK}
-        self._admission.leave(name, "impostor")
-        return let_in
+    def admits_impostor(self, name: ParticipantId) -> bool:
+        """Whether a second process under this id would be admitted; it leaves again at once."""
+        decision = self._membership.join(name, "impostor")
+        self._membership.leave(name, "impostor")
+        return decision in {JoinDecision.NEW, JoinDecision.BACK}
 
     def _nonce(self, name: ParticipantId) -> str:
-        return f"{name}, life {self._lives[name]}"
-
-    def _mortal(self, name: ParticipantId) -> KillableNode:
-        machine = self._machines[name]
-        if not isinstance(machine, KillableNode):
-            raise TypeError(f"{name} is killed in this scenario; hand over a life.Mortal")
-        return machine
+        return f"{name}, start {self._starts[name]}"

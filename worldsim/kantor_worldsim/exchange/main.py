@@ -1,8 +1,8 @@
-"""World-sim as a process: it hosts the bus, gathers the roster, and runs the mission over it.
+"""The world-sim process: it hosts the bus, gathers the roster, and runs the mission.
 
-It can be killed at any time and go on from its journal. What a participant did counts once it is on
-record, and only then is the participant told, so whoever comes back agrees with the record: a step that is not in
-it is said again, and one that is in it is not done twice.
+It can be killed at any time and resume from its journal. A step counts once it is on record, and only then is
+its participant sent an acknowledgement, so that a participant that connects again agrees with the record: a step
+that is not in it is reported again, and one that is in it is not made twice.
 """
 
 from collections.abc import Callable
@@ -10,64 +10,65 @@ from collections.abc import Callable
 from kantor_protocol.scenario.clocks import step_clocks
 from kantor_protocol.transport.rate_limit import rate_limits
 from kantor_protocol.transport.router import HubRouter
-from kantor_protocol.wire.messages import Progress
+from kantor_protocol.wire.messages import Progress, encode
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.config import MissionConfig
 from kantor_worldsim.exchange.lobby import COME_BACK_S, RETURN_S, Lobby
 from kantor_worldsim.exchange.lockstep import LockstepExchange
-from kantor_worldsim.exchange.process_control import ProcessController
+from kantor_worldsim.exchange.process_control import ProcessController, no_controller
 from kantor_worldsim.exchange.realtime import RealtimeExchange
 from kantor_worldsim.observers.metrics.result import Result
+from kantor_worldsim.observers.progress import ProgressReporter
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.record.run_folder import Past
 
 
-def _unseen(_progress: Progress) -> None:
-    """Progress that nobody here looks at."""
-
-
-def _unsaid(_line: str) -> None:
-    """News that nobody here reads."""
-
-
 def run(
     host: HubRouter,
-    plan: MissionConfig,
+    config: MissionConfig,
     recording: Recording,
     stopped: Callable[[], bool],
-    show: Callable[[Progress], None] = _unseen,
+    show: Callable[[Progress], None] = lambda _progress: None,
     past: Past | None = None,
-    hands: ProcessController | None = None,
-    say: Callable[[str], None] = _unsaid,
+    controller: ProcessController = no_controller,
+    say: Callable[[str], None] = lambda _line: None,
 ) -> Result:
     """Run a mission to its end, or until `stopped()`. The record is closed in every case.
 
-    show: takes what observers on the bus are told as well. past: what recording has taken already; the
-    mission goes on from there. hands: who carries out the scenario's faults of processes.
-    say: takes one line of news for a person.
+    show: receives the same progress as observers on the bus. past: records that recording has observed already; the
+    mission resumes from there. controller: carries out the scenario's faults of processes.
+    say: receives one line of news for a person.
     """
-    host.limit(rate_limits(step_clocks(plan.scenario, plan.seed), plan.exchange, plan.speed))
-    lobby = Lobby(host, plan, recording, stopped, show, hands, say)
-    observers = [recording.observe, lobby.tell]
+    scenario, seed = config.scenario, config.seed
+    host.limit(rate_limits(step_clocks(scenario, seed), config.exchange, config.speed))
+
+    def publish(progress: Progress) -> None:
+        host.publish_progress(encode(progress))
+        show(progress)
+
+    reporter = ProgressReporter(recording.metrics, scenario, publish)
+    observers = (recording.observe, reporter.observe)
     if past is None:
-        simulation = Simulation(plan.scenario, plan.seed, plan.site, observers)
+        simulation = Simulation(scenario, seed, config.setup, observers)
     else:
-        simulation = Simulation.resumed(
-            plan.scenario, plan.seed, plan.site, past.records, observers
-        )
-        lobby.recall(past.records)
-    lobby.simulation = simulation
+        simulation = Simulation.resumed(scenario, seed, config.setup, past.records, observers)
     simulation.forget()
-    lobby.gather(plan.patience_s if past is None else RETURN_S)
-    if plan.exchange == "wall":
-        reason = RealtimeExchange(lobby, simulation, plan, resumed=past is not None).run()
+    lobby = Lobby(host, config, recording.run, simulation, reporter, stopped, say)
+    if past is not None:
+        lobby.recall(past.records)
+    lobby.gather(config.start_after_s if past is None else RETURN_S)
+    if config.exchange == "wall":
+        resumed = past is not None
+        relay = RealtimeExchange(lobby, simulation, config, controller, stopped, resumed=resumed)
+        reason = relay.run()
     else:
         lobby.open(lambda: simulation.done_ns)
-        reason = simulate(simulation, LockstepExchange(lobby), plan.seed, stopped)
+        lockstep = LockstepExchange(lobby, controller)
+        reason = simulate(simulation, lockstep, seed, stopped, lockstep)
     lobby.dismiss(reason, 0.0 if past is None else COME_BACK_S)
     recording.refused_at_door = lobby.refused
     recording.excess = host.excess
     result = recording.finish()
-    lobby.tell_progress("over", reason)
+    reporter.report("over", reason, at_once=True)
     return result

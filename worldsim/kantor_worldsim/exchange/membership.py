@@ -1,9 +1,9 @@
-"""Who plays whom: a pure register of processes, by the nonce that each of them has for itself.
+"""Membership: which process plays which participant, by the nonce that each process has drawn for itself. Pure.
 
-1. One process at a time plays a participant. While it is on the bus, no other gets in under its id.
-2. When it has left, the next that comes takes its place, and the one before is *fenced*: should it have been
-   frozen only, and wake up later, it is refused, for two writers must never share a log.
-3. A process that left and comes back with nobody in between goes on.
+1. One process at a time plays a participant. While it is on the bus, no other process is admitted under its id.
+2. When it has left, the next process that joins takes its place, and the earlier one is *fenced*: if it was only
+   frozen and wakes up later, it is refused, because two writers must never share a log.
+3. A process that left and joins again with no other in between goes on.
 """
 
 from collections.abc import Iterable
@@ -13,16 +13,16 @@ from kantor_protocol.base.machine import ParticipantId
 
 
 class JoinDecision(Enum):
-    """What becomes of a process that asks to join."""
+    """Decision on a process that asks to join."""
 
     NEW = auto()
     """It plays the participant from now on, and needs its mission."""
     BACK = auto()
-    """It played it before, and goes on."""
+    """It played the participant before, and goes on."""
     UNKNOWN = auto()
-    """Nobody of that name is in the team."""
+    """The id is not in the roster."""
     TAKEN = auto()
-    """Another process plays it and is on the bus."""
+    """Another process plays the participant and is on the bus."""
     FENCED = auto()
     """Another process has taken its place."""
 
@@ -32,47 +32,49 @@ REFUSALS = {
     JoinDecision.TAKEN: "is on the bus already; stop the other process or choose another id",
     JoinDecision.FENCED: "was gone, and another process has taken its place; start it again to take turns",
 }
-"""Why a process is not let in."""
+"""The reason that a refused process is given."""
 
 
 class Membership:
-    """The register."""
+    """The processes that play the participants of a roster."""
 
     def __init__(self, roster: Iterable[ParticipantId]) -> None:
         self._last: dict[ParticipantId, str] = dict.fromkeys(roster, "")
-        """Nonce of the process that played each participant last, or plays it; empty: nobody has."""
-        self._here: set[ParticipantId] = set()
+        """Nonce of the process that plays each participant or played it last; empty: none has."""
+        self._present: set[ParticipantId] = set()
+        """Participants whose process is on the bus; each has a nonce."""
         self._fenced: set[str] = set()
+        """Nonces of replaced processes; none of them plays a participant."""
 
     def join(self, name: ParticipantId, nonce: str) -> JoinDecision:
-        """A process has come."""
+        """Decide on a process that asks to join."""
         if name not in self._last:
             return JoinDecision.UNKNOWN
         if nonce in self._fenced:
             return JoinDecision.FENCED
         last = self._last[name]
         if nonce == last:
-            self._here.add(name)
+            self._present.add(name)
             return JoinDecision.BACK
-        if name in self._here:
+        if name in self._present:
             return JoinDecision.TAKEN
         if last:
             self._fenced.add(last)
         self._last[name] = nonce
-        self._here.add(name)
+        self._present.add(name)
         return JoinDecision.NEW
 
     def leave(self, name: ParticipantId, nonce: str) -> bool:
-        """A process has gone; whether it was the one that plays."""
+        """Note that a process has left; whether it was the one that plays the participant."""
         if not self.plays(name, nonce):
             return False
-        self._here.discard(name)
+        self._present.discard(name)
         return True
 
     def plays(self, name: ParticipantId, nonce: str) -> bool:
-        """Whether this process plays that participant, and is on the bus."""
-        return name in self._here and self._last[name] == nonce
+        """Whether this process plays the participant and is on the bus."""
+        return name in self._present and self._last[name] == nonce
 
     def player(self, name: ParticipantId) -> str | None:
-        """The nonce of the process on the bus that plays a participant."""
-        return self._last[name] if name in self._here else None
+        """Nonce of the process on the bus that plays a participant."""
+        return self._last[name] if name in self._present else None

@@ -1,34 +1,54 @@
-"""What a world-sim process asks of whoever has started the processes of a fleet."""
+"""Commands to real processes: what world-sim asks of the process that started the fleet."""
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from enum import Enum, auto
+from typing import NamedTuple
 
 from kantor_protocol.base.machine import ParticipantId
 from kantor_protocol.scenario.faults.processes import Disk
 
 
-class ProcessCommand(NamedTuple):
-    """One thing to be done to one process. The order is carried out when the answer comes."""
+class CommandKind(Enum):
+    """Kinds of commands."""
 
-    what: Literal[
-        "kill",  # SIGKILL; it is gone
-        "start",  # kill it if it is there, see to its disk, and start it
-        "freeze",  # SIGSTOP
-        "thaw",  # SIGCONT
-        "fill",  # it can write no more
-        "free",  # it can write again
-        "pretend",  # start a second process under this id
-        "refused",  # what became of that; None: it is there still
-        "restart",  # world-sim itself: SIGKILL, and after a while start it to resume; there is no answer
-        "rest",  # world-sim itself: SIGSTOP, and after a while SIGCONT
-    ]
+    KILL = auto()
+    """SIGKILL."""
+    START = auto()
+    """Kill the process if it runs, damage its write-ahead log as `disk` says, and start it."""
+    FREEZE = auto()
+    """SIGSTOP."""
+    THAW = auto()
+    """SIGCONT."""
+    FILL_DISK = auto()
+    """Let no write succeed."""
+    FREE_DISK = auto()
+    """Let writes succeed again."""
+    START_IMPOSTOR = auto()
+    """Start a second process under the same id."""
+    IS_IMPOSTOR_REFUSED = auto()
+    """Answers whether the second process was refused; None: it still runs."""
+    RESTART_WORLD_SIM = auto()
+    """SIGKILL to world-sim, and after a while start it to resume; there is no answer."""
+    REST_WORLD_SIM = auto()
+    """SIGSTOP to world-sim, and after a while SIGCONT."""
+
+
+class ProcessCommand(NamedTuple):
+    """A command to one process. It is carried out when the answer arrives."""
+
+    kind: CommandKind
     who: ParticipantId
     disk: Disk = "kept"
     step: int = 0
-    """start: the last step that the world knows of."""
+    """START: the last step that is on record."""
     after_s: float = 0.0
-    """Real seconds."""
+    """World-sim: real seconds until it goes on."""
 
 
 ProcessController = Callable[[ProcessCommand], bool | None]
-"""Whoever carries out orders."""
+"""Carries out commands."""
+
+
+def no_controller(command: ProcessCommand) -> bool | None:
+    """The controller of processes that were started one by one, which refuses every command."""
+    raise TypeError(f"{command.who}: faults of processes need the process that started the fleet")

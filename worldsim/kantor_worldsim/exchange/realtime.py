@@ -1,141 +1,151 @@
-"""The relay of the wall exchange: who steps when is up to the participants."""
+"""The realtime exchange: every participant steps by its own clock, and world-sim relays on arrival."""
 
 import time
 from collections import deque
+from collections.abc import Callable
 from itertools import islice
 
 import msgspec
 
 from kantor_protocol.base.machine import WORLD_SIM, Envelope, Inputs, ParticipantId
 from kantor_protocol.node.wall_clock import INBOX_MAX
-from kantor_protocol.wire.messages import VERSION, Report, StepRequest, encode
+from kantor_protocol.wire.messages import VERSION, Report, StepRequest
 from kantor_worldsim.engine.simulation import Simulation, Step
 from kantor_worldsim.exchange.config import MissionConfig
 from kantor_worldsim.exchange.fault_injector import FaultInjector
-from kantor_worldsim.exchange.lobby import POLL_S, PROGRESS_S, Lobby
+from kantor_worldsim.exchange.lobby import POLL_S, Lobby
+from kantor_worldsim.exchange.process_control import ProcessController
+from kantor_worldsim.observers.progress import PROGRESS_S
+from kantor_worldsim.radio.fault_kernels import DUE_MAX_NS
+from kantor_worldsim.record.process_events import ProcessEventKind
 from kantor_worldsim.record.records import ProcessEvent
 
 _CLOCK_TOLERANCE_NS = 500_000_000
-"""Wall, in real time: how far ahead of world-sim's clock a robot's may be."""
+"""In real time: how far a robot's clock may be ahead of world-sim's."""
 _SKEW_MAX_NS = 2**52
-_NEVER_NS = 2**62
 
 
 class RealtimeExchange:
-    """The wall exchange: every participant steps by its own clock.
+    """Relays between participants that step by their own clocks.
 
-    What it sends is ruled on and passed on when it arrives. Every inbox is recorded as the
-    participant reports it. A step is accepted once, and the next only after it: until a participant has been
-    told, it holds, and says its report again.
+    Messages are decided on and relayed when they arrive. Inboxes are recorded as participants report them. A step
+    is accepted once, and the next only after it: a participant takes no step before its last one is
+    acknowledged, and repeats its report until then.
     """
 
     def __init__(
-        self, lobby: Lobby, simulation: Simulation, plan: MissionConfig, *, resumed: bool
+        self,
+        lobby: Lobby,
+        simulation: Simulation,
+        config: MissionConfig,
+        controller: ProcessController,
+        stopped: Callable[[], bool],
+        *,
+        resumed: bool,
     ) -> None:
         self._lobby = lobby
         self._simulation = simulation
-        self._speed = plan.speed
-        self._period_ns = plan.scenario.period_ns
-        self._limit_ns = plan.scenario.limit_ns
-        self._mail = {name: Mail() for name in plan.scenario.roster}
-        self._skews = dict.fromkeys(plan.scenario.roster, 0)
-        """How far ahead each clock was told to be."""
-        self._deeds = FaultInjector(lobby, simulation, plan)
+        self._stopped = stopped
+        self._speed = config.speed
+        self._period_ns = config.scenario.period_ns
+        self._limit_ns = config.scenario.limit_ns
+        self._outboxes = {name: Outbox() for name in config.scenario.roster}
+        self._skews_ns = dict.fromkeys(config.scenario.roster, 0)
+        """Skew that each participant's clock was set to."""
+        self._injector = FaultInjector(lobby, simulation, config, controller)
         start_ns = self._resumed_ns() if resumed else 0
         self._origin_ns = time.monotonic_ns() - round(start_ns / self._speed)
 
     def _resumed_ns(self) -> int:
-        """Have what was handed out before as it may be heard of yet; and the time to go on from."""
-        simulation, lobby = self._simulation, self._lobby
-        for name, mail in self._mail.items():
-            mail.handed += simulation.inputs(name, _NEVER_NS).inbox
-        before_ns = simulation.now_ns
-        told_ns = max((told.now_ns for told in lobby.told.values()), default=0)
-        start_ns = max(before_ns, told_ns, self._deeds.world_starts_ns or 0)
-        if self._deeds.world_starts_ns is None:
-            simulation.note(ProcessEvent(before_ns, WORLD_SIM, "leave"))
-            simulation.note(ProcessEvent(start_ns, WORLD_SIM, "join"))
+        """Restore what had been handed out, as participants may still report it; the time to go on from."""
+        simulation = self._simulation
+        for name, outbox in self._outboxes.items():
+            outbox.handed += simulation.inputs(name, DUE_MAX_NS).inbox
+        stopped_ns, restart_ns = simulation.now_ns, self._injector.world_starts_ns
+        start_ns = max(stopped_ns, self._lobby.latest_ready_ns, restart_ns or 0)
+        if restart_ns is None:
+            simulation.note(ProcessEvent(stopped_ns, WORLD_SIM, ProcessEventKind.LEAVE))
+            simulation.note(ProcessEvent(start_ns, WORLD_SIM, ProcessEventKind.JOIN))
         return start_ns
 
     def run(self) -> str:
-        """Relay until the mission is over; why it is."""
-        lobby, deeds = self._lobby, self._deeds
+        """Relay until the mission is over; the reason."""
+        lobby, injector = self._lobby, self._injector
         lobby.open(lambda: self._now_ns)
-        deeds.do(self._now_ns)
-        lobby.newcomers = deque(lobby.ready)
+        injector.advance(self._now_ns)
+        lobby.announce_all()
         while True:
             reason = self._reason()
             if reason is not None:
                 self._simulation.end(reason)
                 return reason
-            while lobby.newcomers:
-                self._welcome(lobby.newcomers.popleft())
-            report = lobby.next(self._patience_s())
-            deeds.do(self._now_ns)
-            if not deeds.world_is_down:  # what is said now is said again
+            while (newcomer := lobby.pop_newcomer()) is not None:
+                self._welcome(newcomer)
+            report = lobby.next(self._timeout_s())
+            injector.advance(self._now_ns)
+            if not injector.world_is_down:  # a report that is lost now is repeated
                 if report is not None:
                     self._settle(*report)
                 self._deliver()
 
     @property
     def _now_ns(self) -> int:
-        """Simulated time; it does not run back, whatever the clocks are."""
+        """Simulated time; it never falls, whatever the clocks do."""
         by_clock_ns = round((time.monotonic_ns() - self._origin_ns) * self._speed)
         return max(by_clock_ns, self._simulation.now_ns)
 
     def _reason(self) -> str | None:
         if self._simulation.over:
             return self._simulation.over
-        if self._lobby.stopped():
+        if self._stopped():
             return "interrupted"
         return "limit" if self._now_ns > self._limit_ns else None
 
-    def _patience_s(self) -> float:
+    def _timeout_s(self) -> float:
         """Real seconds until there is something to do."""
         now_ns = self._now_ns
-        due_ns = (self._simulation.channel.next_due_ns(), self._deeds.next_ns(now_ns))
+        due_ns = (self._simulation.channel.next_due_ns(), self._injector.next_ns(now_ns))
         waits_s = [(due - now_ns) * 1e-9 / self._speed for due in due_ns if due is not None]
-        longest_s = POLL_S if self._deeds.busy else PROGRESS_S
+        longest_s = POLL_S if self._injector.busy else PROGRESS_S
         return min(longest_s, max(0.0, min(waits_s, default=longest_s)))
 
     def _welcome(self, name: ParticipantId) -> None:
-        """Start the clock of whoever has got ready."""
-        if name in self._lobby.ready:
-            self._deeds.welcome(name)
+        """Start the clock of a participant that became ready."""
+        if self._lobby.is_ready(name):
+            self._injector.welcome(name)
             self._set_clock(name, self._now_ns)
 
     def _set_clock(self, name: ParticipantId, now_ns: int) -> None:
-        self._skews[name] = self._deeds.skew_ns(name, now_ns)
-        self._lobby.go(name, now_ns, self._speed, self._skews[name])
+        self._skews_ns[name] = self._injector.skew_ns(name, now_ns)
+        self._lobby.start_clock(name, now_ns, self._speed, self._skews_ns[name])
 
     def _settle(self, name: ParticipantId, report: Report) -> None:
-        known = self._simulation.body(name).step
-        if report.outputs.step <= known:  # it has not heard yet that this was accepted
+        done = self._simulation.body(name).step
+        if report.outputs.step <= done:  # the acknowledgement has not arrived yet
             self._hand(name)
-        elif not self._deeds.dies(name):
-            inputs = self._inputs(name, known, report)
+        elif not self._injector.kills_in_step(name):
+            inputs = self._inputs(name, done, report)
             if inputs is None:
                 self._lobby.refused += 1
                 return
-            self._simulation.settle(
-                self._now_ns, [Step(name, inputs, report.outputs, report.skew_ns)]
-            )
+            step = Step(name, inputs, report.outputs, report.skew_ns)
+            self._simulation.settle(self._now_ns, [step])
             self._hand(name)
 
-    def _inputs(self, name: ParticipantId, known: int, report: Report) -> Inputs | None:
-        """The inputs that the participant says it had, if it can have had them."""
+    def _inputs(self, name: ParticipantId, done: int, report: Report) -> Inputs | None:
+        """The inputs that a participant reports, if they are possible. done: its last step on record."""
         ahead_ns = report.now_ns - self._now_ns
-        if report.observed != known or report.outputs.step != known + 1:
+        if report.observed != done or report.outputs.step != done + 1:
             return None
         if ahead_ns > _CLOCK_TOLERANCE_NS * self._speed or abs(report.skew_ns) > _SKEW_MAX_NS:
             return None
-        inbox = self._mail[name].heard(report.heard)
+        inbox = self._outboxes[name].received(report.heard)
         if inbox is None:
             return None
         return Inputs(report.now_ns + report.skew_ns, self._simulation.look(name), inbox)
 
     def _deliver(self) -> None:
-        """Hand on what is due at anybody."""
+        """Hand out the envelopes that are due at any participant."""
         due_ns, now_ns = self._simulation.channel.next_due_ns(), self._now_ns
         if due_ns is None or due_ns > now_ns:
             return
@@ -144,41 +154,41 @@ class RealtimeExchange:
                 self._hand(name)
 
     def _hand(self, name: ParticipantId) -> None:
-        """Tell a participant where it is, and hand it what has arrived."""
-        now_ns, mail = self._now_ns, self._mail[name]
+        """Send a participant its observation, which acknowledges its step, and the envelopes that have arrived."""
+        now_ns, outbox = self._now_ns, self._outboxes[name]
         given = self._simulation.inputs(name, now_ns)
-        mail.waiting += given.inbox
-        if self._deeds.is_frozen(name):
-            return  # it waits
-        if name not in self._lobby.ready:
-            mail.waiting.clear()  # what reaches nobody is lost
+        outbox.waiting += given.inbox
+        if self._injector.is_frozen(name):
+            return  # the envelopes wait
+        if not self._lobby.is_ready(name):
+            outbox.waiting.clear()  # envelopes for an absent participant are lost
             return
-        if self._deeds.skew_ns(name, now_ns) != self._skews[name]:
+        if self._injector.skew_ns(name, now_ns) != self._skews_ns[name]:
             self._set_clock(name, now_ns)
-        turn = StepRequest(VERSION, msgspec.structs.replace(given, inbox=mail.hand()))
-        self._lobby.host.send(name, encode(turn), patiently=False)
+        request = StepRequest(VERSION, msgspec.structs.replace(given, inbox=outbox.hand()))
+        self._lobby.request(name, request, patiently=False)
 
 
-class Mail:
-    """What has arrived for a participant. Neither queue is longer than an inbox may be."""
+class Outbox:
+    """Envelopes for a participant. Neither queue is longer than an inbox may be."""
 
     def __init__(self) -> None:
         self.waiting: deque[Envelope] = deque(maxlen=INBOX_MAX)
-        """Not handed to it yet."""
+        """Arrived, and not handed out yet."""
         self.handed: deque[Envelope] = deque()
-        """Handed to it, and not heard as far as is known, in order."""
+        """Handed out, and not reported as received so far, in order."""
 
     def hand(self) -> tuple[Envelope, ...]:
-        """What is to be handed out now."""
+        """The envelopes to hand out now."""
         room = max(0, INBOX_MAX - len(self.handed))
         inbox = tuple([self.waiting.popleft() for _ in range(min(room, len(self.waiting)))])
         self.handed += inbox
         return inbox
 
-    def heard(
+    def received(
         self, references: tuple[tuple[ParticipantId, int], ...]
     ) -> tuple[Envelope, ...] | None:
-        """The inbox of these envelopes, if they were handed out in this order; what was skipped is lost."""
+        """The inbox that a participant reports, if it was handed out in this order; skipped envelopes are lost."""
         inbox: list[Envelope] = []
         skipped = 0
         for envelope in self.handed:

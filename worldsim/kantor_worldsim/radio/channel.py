@@ -1,8 +1,9 @@
-"""The radio: who hears an envelope, when, and what gets lost. The only place that knows range.
+"""The radio channel: which receivers an envelope reaches, when, and which copies are lost.
 
-Range is between true poses at the time of sending, which is when a step begins: after the inbox was
-taken in, before the move. On a map walls between two poses may shorten it or end it. Every draw is keyed by (seed, purpose, link, sequence, copy): it depends on
-nothing that happened before, so one more message or one more robot changes no other draw.
+Range is measured between true poses at the time of sending, which is the beginning of a step: after the inbox was
+processed, before the move. On a map, walls between two poses may shorten the range or block the link. Every draw is
+keyed by (seed, purpose, link, sequence, copy): it depends on nothing that happened before, so one more message or one
+more robot changes no other draw.
 """
 
 import struct
@@ -21,23 +22,24 @@ from kantor_worldsim.world.maps import Ground
 from kantor_worldsim.world.sensors import walls_between
 
 LINK_WIDTH = 4096
-"""Links are numbered source * width + target; the roster is smaller, the supervisor comes last."""
+"""Links are numbered source * LINK_WIDTH + target; rosters are smaller, and the supervisor has the last number."""
 DROPPED = -1
+"""The due time of a copy that is lost."""
 
 _SENT = struct.Struct("=qqqq")
-"""A row of what the kernel reads; to write it so costs a fifth of making an array."""
-_RULED = struct.Struct("=qqq")
-"""A row of what it writes."""
+"""A row of the kernel's input; packing it costs a fifth of building an array."""
+_DECIDED = struct.Struct("=qqq")
+"""A row of the kernel's output."""
 
 
 class DeliveryDecision(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """What the channel decided on one copy of an envelope for one receiver within range."""
+    """The channel's decision on one copy of an envelope, for one receiver within range."""
 
     source: ParticipantId
     sequence: int
     target: ParticipantId
     due_ns: int
-    """When it arrives, or DROPPED."""
+    """Time of arrival, or DROPPED."""
 
 
 class Sent(NamedTuple):
@@ -47,8 +49,8 @@ class Sent(NamedTuple):
     envelope: Envelope
 
 
-class Field(NamedTuple):
-    """What decides who can hear whom, for kernels; see `hears`."""
+class LinkGeometry(NamedTuple):
+    """Poses and walls, from which kernels decide which links stand; see `hears`."""
 
     left_m: float
     bottom_m: float
@@ -57,36 +59,36 @@ class Field(NamedTuple):
     loss_m: float
     cells: np.ndarray
     xy_m: np.ndarray
-    """(n, 2) where everybody truly is, the unplaced at infinity."""
+    """(n, 2) true positions in the world frame; infinity for participants without one."""
     supervisor: int
-    """Its place in the roster, or -1."""
-    supervisor_stands: bool
-    """It has a place on the map, so that walls may stand before it."""
+    """The supervisor's index in the roster, or -1."""
+    supervisor_placed: bool
+    """Whether the supervisor has a pose on the map, so that walls may block its links."""
 
 
-class Ruled(NamedTuple):
-    """Verdicts as numbers."""
+class Decisions(NamedTuple):
+    """Delivery decisions as numbers."""
 
     rows: np.ndarray
-    """(rows, 3): receiver (place in the roster), row of what is on the air, due_ns or DROPPED."""
+    """(rows, 3): receiver (index in the roster), row of the envelope on the air, due_ns or DROPPED."""
     size: int
-    """How many rows count."""
+    """Number of valid rows."""
 
 
 Interference = Callable[
-    [Sequence[Sent], np.ndarray, Ruled, Field], tuple[Sequence[Sent], Ruled, int]
+    [Sequence[Sent], np.ndarray, Decisions, LinkGeometry], tuple[Sequence[Sent], Decisions, int]
 ]
-"""Rules on what the radio has ruled, given what was sent, also as numbers (rows, 4): now_ns, source,
-sequence, target; and where everybody is. It returns what is on the air then, which is what was sent and
-perhaps more; the verdicts on that; and how many receivers are no longer in range."""
+"""Changes the channel's decisions. Arguments: the envelopes sent, the same as numbers (rows, 4): now_ns, source,
+sequence, target; the decisions; the geometry. Returns the envelopes on the air, which are those sent and perhaps
+more; the decisions on them; and the number of receivers that are out of range now."""
 
 
 _Flight = tuple[int, int, int, int, Envelope]
-"""Of an envelope under way: due_ns, place of its source, sequence, number of the flight."""
+"""An envelope in flight: due_ns, index of its source, sequence, number of the flight, envelope."""
 
 
 class _ChannelConfig(NamedTuple):
-    """The radio's parameters, for the kernel."""
+    """Parameters of the radio, for the kernel."""
 
     seed: int
     range_m: float
@@ -100,20 +102,20 @@ class _ChannelConfig(NamedTuple):
 
 
 class Walls(NamedTuple):
-    """What the radio minds of a map."""
+    """Walls of a map, as far as they matter to the radio."""
 
     left_m: float
     bottom_m: float
     resolution_m: float
     line_of_sight: bool
     loss_m: float
-    """Of range, for each wall."""
+    """Loss of range for each wall between."""
     cells: np.ndarray
-    """(rows, columns), or nothing where walls do not matter."""
+    """(rows, columns); empty where walls do not matter."""
 
     @classmethod
     def of(cls, radio: RadioOptions, ground: Ground | None) -> "Walls":
-        """Of a scenario's radio on a map, if there is one."""
+        """Walls for a scenario's radio, on a map if there is one."""
         if ground is None or not (radio.line_of_sight or radio.wall_loss_m > 0.0):
             return OPEN
         frame, cells = ground
@@ -140,10 +142,10 @@ def _in_range(
     range_m: float,
     through: bool,
 ) -> bool:
-    """Whether two participants hear each other. xy_m: (n, 2); through: whatever stands between."""
+    """Whether a link stands. xy_m: (n, 2); through: walls do not matter."""
     dx = xy_m[other, 0] - xy_m[one, 0]
     dy = xy_m[other, 1] - xy_m[one, 1]
-    if not dx * dx + dy * dy <= range_m * range_m:  # nor when a place is unknown
+    if not dx * dx + dy * dy <= range_m * range_m:  # also false for a participant without a pose
         return False
     if through or cells.shape[0] == 0:
         return True
@@ -161,28 +163,28 @@ def _in_range(
 
 
 @kernel
-def hears(field: Field, one: int, other: int, range_m: float) -> bool:
-    """Whether two participants (places in the roster) hear each other if their range is so many metres."""
-    through = field.supervisor in (one, other) and not field.supervisor_stands
-    heard: bool = _in_range(
-        field.left_m,
-        field.bottom_m,
-        field.resolution_m,
-        field.line_of_sight,
-        field.loss_m,
-        field.cells,
-        field.xy_m,
+def hears(geometry: LinkGeometry, one: int, other: int, range_m: float) -> bool:
+    """Whether the link between two participants (indices in the roster) stands at a range of range_m."""
+    through = geometry.supervisor in (one, other) and not geometry.supervisor_placed
+    stands: bool = _in_range(
+        geometry.left_m,
+        geometry.bottom_m,
+        geometry.resolution_m,
+        geometry.line_of_sight,
+        geometry.loss_m,
+        geometry.cells,
+        geometry.xy_m,
         one,
         other,
         range_m,
         through,
     )
-    return heard
+    return stands
 
 
 @kernel
 def link_of(source: int, target: int, supervisor: int) -> int:
-    """The number of the link between two places in the roster."""
+    """Number of the link between two indices in the roster."""
     here = LINK_WIDTH - 1 if source == supervisor else source
     there = LINK_WIDTH - 1 if target == supervisor else target
     return here * LINK_WIDTH + there
@@ -220,15 +222,15 @@ def _transmit(
     cells: np.ndarray,
     xy_m: np.ndarray,
     supervisor: int,
-    supervisor_stands: bool,
+    supervisor_placed: bool,
     sent: np.ndarray,
     envelopes: int,
-    ruled: np.ndarray,
+    decided: np.ndarray,
 ) -> tuple[int, int]:
-    """Rule on every envelope for every possible receiver.
+    """Decide on every envelope for every possible receiver.
 
-    sent: (m, 4) now_ns, source, sequence, target or -1. Returns how many verdicts there are, in the
-    rows of ruled (rows, 3): receiver, which (row of sent) and due_ns; and how many receivers were out of range.
+    sent: (m, 4) now_ns, source, sequence, target or -1. Writes rows of decided (rows, 3): receiver, row of sent,
+    due_ns. Returns the number of decisions and the number of receivers out of range.
     """
     config = _ChannelConfig(
         seed,
@@ -241,7 +243,7 @@ def _transmit(
         reorder,
         reorder_ns,
     )
-    field = Field(
+    geometry = LinkGeometry(
         left_m,
         bottom_m,
         resolution_m,
@@ -250,9 +252,9 @@ def _transmit(
         cells,
         xy_m,
         supervisor,
-        supervisor_stands,
+        supervisor_placed,
     )
-    receiver, which, due_ns = ruled[:, 0], ruled[:, 1], ruled[:, 2]
+    receiver, which, due_ns = decided[:, 0], decided[:, 1], decided[:, 2]
     count = 0
     out_of_range = 0
     for i in range(envelopes):
@@ -262,7 +264,7 @@ def _transmit(
                 continue
             by_supervisor = supervisor in (other, source)
             range_m = config.supervisor_range_m if by_supervisor else config.range_m
-            if not hears(field, source, other, range_m):
+            if not hears(geometry, source, other, range_m):
                 out_of_range += 1
                 continue
             link = link_of(source, other, supervisor)
@@ -285,7 +287,7 @@ def _transmit(
 
 
 class Channel:
-    """Rules on transmissions and holds what is under way."""
+    """Decides on transmissions, and holds the envelopes in flight."""
 
     def __init__(
         self,
@@ -311,34 +313,36 @@ class Channel:
             round(radio.reorder_s * 1e9),
         )
         self._xy_m = np.full((len(scenario.roster), 2), np.inf)
-        self._field = Field(
+        self._geometry = LinkGeometry(
             *Walls.of(radio, ground),
             self._xy_m,
             self._places.get(SUPERVISOR, -1),
             scenario.supervisor.pose_m is not None,
         )
-        self._arguments: tuple[Any, ...] = (*self._config, *self._field)
-        self._under_way: dict[ParticipantId, list[_Flight]] = {name: [] for name in scenario.roster}
-        self._boxes = list(self._under_way.items())
+        self._arguments: tuple[Any, ...] = (*self._config, *self._geometry)
+        self._in_flight: dict[ParticipantId, list[_Flight]] = {name: [] for name in scenario.roster}
+        """A heap of envelopes for each receiver, the next arrival first; no copy that is lost."""
+        self._boxes = list(self._in_flight.items())
         self._flights = 0
+        """Number of copies put in flight so far; each has a number of its own, up to this one."""
         self._sent = np.zeros((0, 4), dtype=np.int64)
         self._make_room(1)
 
     @property
     def lookahead_ns(self) -> int:
-        """Nothing sent arrives sooner."""
+        """Least time from sending to arrival."""
         return self._config.delay_ns
 
     def place(self, name: ParticipantId, pose: Pose) -> None:
-        """Note where a participant truly is."""
+        """Set the true pose of a participant."""
         row = self._places[name]
         self._xy_m[row, 0] = pose.x_m
         self._xy_m[row, 1] = pose.y_m
 
     def transmit(self, sent: Sequence[Sent]) -> tuple[list[DeliveryDecision], int]:
-        """Rule on envelopes by the poses as they are now; also how many receivers were too far.
+        """Decisions on envelopes by the present poses, and the number of receivers out of range.
 
-        Deliveries wait in the channel until `take`.
+        Copies stay in flight until they are collected.
         """
         if not sent:
             return [], 0
@@ -348,15 +352,15 @@ class Channel:
             source, sequence = places[envelope.source], envelope.sequence
             target = targets.get(envelope.target, nowhere)
             _SENT.pack_into(self._sent_bytes, _SENT.size * i, now_ns, source, sequence, target)
-        count, out_of_range = _transmit(*self._arguments, self._sent, len(sent), self._ruled)
-        ruled = Ruled(self._ruled, count)
+        count, out_of_range = _transmit(*self._arguments, self._sent, len(sent), self._decided)
+        decided = Decisions(self._decided, count)
         if self._interference is not None:
-            sent, ruled, lost = self._interference(sent, self._sent, ruled, self._field)
+            sent, decided, lost = self._interference(sent, self._sent, decided, self._geometry)
             out_of_range += lost
-        return self._send(sent, ruled), out_of_range
+        return self._send(sent, decided), out_of_range
 
-    def _send(self, on_air: Sequence[Sent], ruled: Ruled) -> list[DeliveryDecision]:
-        """Let what arrives be under way; the verdicts."""
+    def _send(self, on_air: Sequence[Sent], decided: Decisions) -> list[DeliveryDecision]:
+        """Put copies that are not lost in flight; all decisions."""
         places, boxes, flights, nowhere = (
             self._places,
             self._boxes,
@@ -364,22 +368,22 @@ class Channel:
             len(self._roster),
         )
         decisions = []
-        told = ruled.rows.data.cast("B")[: _RULED.size * ruled.size]
-        for to, row, due_ns in _RULED.iter_unpack(told):
+        rows = decided.rows.data.cast("B")[: _DECIDED.size * decided.size]
+        for to, row, due_ns in _DECIDED.iter_unpack(rows):
             envelope = on_air[row][1]
-            speaker, sequence = envelope.source, envelope.sequence
+            source, sequence = envelope.source, envelope.sequence
             receiver, box = boxes[to]
-            decisions.append(DeliveryDecision(speaker, sequence, receiver, due_ns))
+            decisions.append(DeliveryDecision(source, sequence, receiver, due_ns))
             if due_ns != DROPPED:
                 flights += 1
-                place = places.get(speaker, nowhere)
+                place = places.get(source, nowhere)
                 heappush(box, (due_ns, place, sequence, flights, envelope))
         self._flights = flights
         return decisions
 
     def collect(self, name: ParticipantId, now_ns: int) -> tuple[Envelope, ...]:
-        """What has arrived at a participant by now, in order of (arrival, source, sequence)."""
-        waiting = self._under_way[name]
+        """Remove and return the envelopes that have arrived by now, ordered by (arrival, source, sequence)."""
+        waiting = self._in_flight[name]
         if not waiting or waiting[0][0] > now_ns:
             return ()
         arrived = []
@@ -390,49 +394,58 @@ class Channel:
     def collect_heard(
         self, name: ParticipantId, heard: Iterable[tuple[ParticipantId, int]]
     ) -> tuple[Envelope, ...]:
-        """What a participant is known to have taken, by source and sequence, of several copies the first.
+        """Remove and return the envelopes that a participant reported, by source and sequence; the first of several copies.
 
-        Raises KeyError for what is not under way.
+        Raises KeyError for an envelope that is not in flight.
         """
-        waiting = sorted(self._under_way[name])
-        taken = []
+        waiting = sorted(self._in_flight[name])
+        collected = []
         for reference in heard:
             places = (i for i, item in enumerate(waiting) if (item[4].source, item[2]) == reference)
             place = next(places, None)
             if place is None:
                 raise KeyError(reference)
-            taken.append(waiting.pop(place)[4])
-        self._under_way[name][:] = waiting  # in order, it is a heap
-        return tuple(taken)
+            collected.append(waiting.pop(place)[4])
+        self._in_flight[name][:] = waiting  # in order, it is a heap
+        return tuple(collected)
 
     def lose(self, name: ParticipantId, from_ns: int, until_ns: int) -> None:
-        """Throw away what arrives at a participant within a window, its end excluded."""
-        box = self._under_way[name]
+        """Drop the envelopes that arrive at a participant within a window, its end excluded."""
+        box = self._in_flight[name]
         box[:] = sorted(item for item in box if not from_ns <= item[0] < until_ns)
 
     def clear(self) -> None:
-        """Throw away all that is under way."""
-        for box in self._under_way.values():
+        """Drop all envelopes in flight."""
+        for box in self._in_flight.values():
             box.clear()
 
     def waits(self, name: ParticipantId, now_ns: int) -> bool:
-        """Whether something has arrived at a participant that was not taken."""
-        waiting = self._under_way[name]
+        """Whether an envelope has arrived at a participant and was not collected."""
+        waiting = self._in_flight[name]
         return bool(waiting) and waiting[0][0] <= now_ns
 
     def next_due_ns(self) -> int | None:
-        """When the next delivery is due at anybody."""
-        return min((box[0][0] for box in self._under_way.values() if box), default=None)
+        """Time of the next arrival at any participant; None if nothing is in flight."""
+        return min((box[0][0] for box in self._in_flight.values() if box), default=None)
+
+    def validate(self) -> None:
+        """Assert the invariants that are stated at the attributes."""
+        assert set(self._in_flight) == set(self._roster)
+        for box in self._in_flight.values():
+            assert all(box[(i - 1) // 2] <= box[i] for i in range(1, len(box)))
+            assert all(item[0] != DROPPED and item[3] <= self._flights for item in box)
+        flights = [item[3] for box in self._in_flight.values() for item in box]
+        assert len(flights) == len(set(flights))
 
     def _make_room(self, envelopes: int) -> None:
         if self._sent.shape[0] < envelopes:
             self._sent = np.zeros((2 * envelopes, 4), dtype=np.int64)
             self._sent_bytes = self._sent.data
-            self._ruled = np.zeros((4 * envelopes * len(self._roster), 3), dtype=np.int64)
+            self._decided = np.zeros((4 * envelopes * len(self._roster), 3), dtype=np.int64)
 
 
 def links(xy_m: np.ndarray, range_m: float, walls: Walls = OPEN) -> int:
-    """Pairs of robots that hear each other. xy_m: (n, 2)."""
+    """Number of pairs of robots whose link stands. xy_m: (n, 2)."""
     return int(_links(*walls, xy_m, range_m))
 
 

@@ -1,8 +1,8 @@
-"""The link faults of a scenario as a table, and the kernels that rule by it.
+"""The link faults of a scenario as a table, and the kernels that apply it.
 
-Every fault is a rule. Of a copy of an envelope, on a link, at the time of sending, it says pass, deliver
-later, or drop; some also send more copies, or shorten the range. What several rules say is joined: a drop
-wins, delays add up, and of several that hold a copy the longest counts. So their order does not matter.
+Every fault is a rule. For a copy of an envelope, on a link, at the time of sending, its verdict is: pass, deliver
+later, or drop; some rules also send more copies, or shorten the range. Verdicts of several rules are combined: a
+drop wins, delays add up, and of several holds the longest counts. So their order does not matter.
 
 Every draw is keyed by (seed, purpose, link, sequence, fault and copy), or by a slot of time, and not by
 what happened before: one more message changes no other draw, and faults that are appended to a list
@@ -35,12 +35,12 @@ from kantor_protocol.scenario.faults.links import (
     Replay,
 )
 from kantor_protocol.scenario.schema import Scenario
-from kantor_worldsim.radio.channel import DROPPED, Field, hears, link_of
+from kantor_worldsim.radio.channel import DROPPED, LinkGeometry, hears, link_of
 
-NEVER_NS = 2**62
-"""Later than any mission; whatever is due then does not arrive."""
+DUE_MAX_NS = 2**62
+"""The latest due time of a copy, after every mission: such a copy does not arrive. Sums of two stay within 64 bits."""
 _SLOTS_IN_A_STATE = 10
-"""Of a burst: slots in the shorter of its mean times."""
+"""Slots in the shorter mean time of a burst."""
 _FLAP_SHARE = 0.5
 
 # The last word of a draw's counter: which fault, and which of the copies that it may meet.
@@ -53,13 +53,13 @@ _REPLAYED = 1 << 15
 _DROP, _BURST, _ONE_WAY, _PARTITION, _DELAY, _REORDER = 0, 1, 2, 3, 4, 5
 _CLOG, _BANDWIDTH, _RANGE, _DUPLICATE, _REPLAY, _HOSTILE = 6, 7, 8, 9, 10, 11
 
-# Columns of Table.rules.
+# Columns of FaultTable.rules.
 _KIND, FAULT, _FROM_NS, _UNTIL_NS, _AT, _SPAN_NS, _COPIES = 0, 1, 2, 3, 4, 5, 6
 _RULE_COLUMNS = 7
-"""AT: of a cut its row in severed, of a queue its column in what is said of envelopes. SPAN_NS: slots of
-a burst or of a cut that flaps, age of what is replayed."""
+"""AT: row of a cut in `severed`, column of a queue in `queued`. SPAN_NS: slot of a burst or of a cut that flaps,
+greatest age of a replayed message."""
 
-# Columns of Table.numbers, by kind.
+# Columns of FaultTable.numbers, by kind.
 _PROBABILITY = 0  # drop, duplicate, reorder, replay, hostile
 _DROP_GOOD, _DROP_BAD, _TO_BAD, _TO_GOOD = 0, 1, 2, 3  # burst
 _DELAY_S, _JITTER_S = 0, 1  # delay
@@ -68,7 +68,7 @@ _SHARE = 0  # partition
 _RANGE_M, _FACTOR = 0, 1  # range; a negative range_m is none
 _NUMBER_COLUMNS = 4
 
-# Columns of what is counted, in the order of `Toll`.
+# Columns of the counters, in the order of `FaultStats`.
 _DROPPED, _DELAYED, _DOUBLED, _REPLAYS, _FORGERIES = 0, 1, 2, 3, 4
 
 # Columns of what comes beside a message.
@@ -80,17 +80,17 @@ class FaultTable(NamedTuple):
 
     seed: int
     rules: npt.NDArray[np.int64]
-    """(n, 7): kind, place in the scenario's list, window, span, place of what it has elsewhere, copies."""
+    """(n, 7): kind, index in the scenario's list, window, AT, SPAN_NS, copies."""
     numbers: npt.NDArray[np.float64]
     """(n, 4), by kind."""
     named: npt.NDArray[np.uint8]
-    """(n, p): whether a fault is about the links of a participant."""
+    """(n, p): whether a fault applies to the links of a participant."""
     severed: npt.NDArray[np.uint8]
-    """(cuts, p, p): whether a cut, while it is there, severs the link from one to another."""
+    """(cuts, p, p): whether a cut, while it holds, severs the link from source to target."""
 
 
 class _Hop(NamedTuple):
-    """A copy of an envelope on its way over a link."""
+    """A copy of an envelope on a link."""
 
     now_ns: int
     source: int
@@ -104,8 +104,8 @@ class _Hop(NamedTuple):
 def in_burst(seed: int, link: int, index: int, slot: int, to_bad: float, to_good: float) -> bool:
     """Whether a link is bad in a slot, which it is not in slot 0. to_bad + to_good is at most 1.
 
-    A draw below to_bad makes a link bad in whatever state it was, one from 1 - to_good on makes it good,
-    and any other leaves it. So the last draw that decides is all that needs to be looked for.
+    A draw below to_bad makes a link bad in every state, one from 1 - to_good on makes it good, and any other
+    leaves it as it is. So the last draw that decides is found by going back slot by slot.
     """
     while slot > 0:
         draw = uniform(seed, Purpose.FAULT_BURST.value, link, slot, index)
@@ -119,7 +119,7 @@ def in_burst(seed: int, link: int, index: int, slot: int, to_bad: float, to_good
 
 @kernel
 def _about(table: FaultTable, rule: int, now_ns: int, source: int, target: int) -> bool:
-    """Whether a fault's window is open and the link is one of its own."""
+    """Whether a fault's window holds and the fault applies to the link."""
     row = table.rules[rule]
     if not row[_FROM_NS] <= now_ns < row[_UNTIL_NS]:
         return False
@@ -187,23 +187,23 @@ def reach_m(table: FaultTable, now_ns: int, source: int, target: int, whole_m: f
 @kernel
 def _is_lost(
     table: FaultTable,
-    field: Field,
+    geometry: LinkGeometry,
     hop: _Hop,
     robots_m: float,
     supervisors_m: float,
-    struck: np.ndarray,
+    effects: np.ndarray,
 ) -> bool:
     """Whether a receiver is beyond what faults leave of the range; each that does so is counted."""
     lost = False
-    by_supervisor = field.supervisor in (hop.source, hop.target)
+    by_supervisor = geometry.supervisor in (hop.source, hop.target)
     whole_m = supervisors_m if by_supervisor else robots_m
     for rule in range(table.rules.shape[0]):
         if table.rules[rule, _KIND] != _RANGE:
             continue
         if not _about(table, rule, hop.now_ns, hop.source, hop.target):
             continue
-        if not hears(field, hop.source, hop.target, _reach_m(table, rule, whole_m)):
-            struck[rule, _DROPPED] += 1
+        if not hears(geometry, hop.source, hop.target, _reach_m(table, rule, whole_m)):
+            effects[rule, _DROPPED] += 1
             lost = True
     return lost
 
@@ -251,7 +251,7 @@ def _delays(table: FaultTable, rule: int, hop: _Hop, queued: np.ndarray) -> tupl
 
 @kernel
 def _judge(
-    table: FaultTable, hop: _Hop, due_ns: int, queued: np.ndarray, struck: np.ndarray
+    table: FaultTable, hop: _Hop, due_ns: int, queued: np.ndarray, effects: np.ndarray
 ) -> int:
     """When a copy arrives that the radio has due then, or DROPPED."""
     if due_ns == DROPPED:
@@ -259,7 +259,7 @@ def _judge(
     dropped = False
     for rule in range(table.rules.shape[0]):
         if _drops(table, rule, hop, queued):
-            struck[rule, _DROPPED] += 1
+            effects[rule, _DROPPED] += 1
             dropped = True
     if dropped:
         return DROPPED
@@ -267,15 +267,15 @@ def _judge(
     for rule in range(table.rules.shape[0]):
         delay_ns, held_ns = _delays(table, rule, hop, queued)
         if delay_ns > 0 or held_ns > due_ns:
-            struck[rule, _DELAYED] += 1
-        later_ns += min(delay_ns, NEVER_NS - later_ns)
+            effects[rule, _DELAYED] += 1
+        later_ns += min(delay_ns, DUE_MAX_NS - later_ns)
         not_before_ns = max(not_before_ns, held_ns)
-    return max(due_ns + min(later_ns, NEVER_NS - due_ns), not_before_ns)
+    return max(due_ns + min(later_ns, DUE_MAX_NS - due_ns), not_before_ns)
 
 
 @kernel
-def _hop_of(sent: np.ndarray, ruled: np.ndarray, first: int, supervisor: int) -> _Hop:
-    target, row = ruled[first, 0], ruled[first, 1]
+def _hop_of(sent: np.ndarray, decided: np.ndarray, first: int, supervisor: int) -> _Hop:
+    target, row = decided[first, 0], decided[first, 1]
     source = sent[row, 1]
     return _Hop(sent[row, 0], source, target, link_of(source, target, supervisor), sent[row, 2], 0)
 
@@ -286,20 +286,24 @@ def _with(hop: _Hop, copy: int) -> _Hop:
 
 
 @kernel
-def _end_of(ruled: np.ndarray, count: int, first: int) -> int:
+def _end_of(decided: np.ndarray, count: int, first: int) -> int:
     """The row behind the radio's verdicts on one envelope for one receiver."""
     end = first + 1
-    while end < count and ruled[end, 0] == ruled[first, 0] and ruled[end, 1] == ruled[first, 1]:
+    while (
+        end < count
+        and decided[end, 0] == decided[first, 0]
+        and decided[end, 1] == decided[first, 1]
+    ):
         end += 1
     return end
 
 
 @kernel
-def _arrival(ruled: np.ndarray, first: int, end: int) -> int:
+def _arrival(decided: np.ndarray, first: int, end: int) -> int:
     """When the first copy arrives that the radio itself does not drop; DROPPED if there is none."""
     for row in range(first, end):
-        if ruled[row, 2] != DROPPED:
-            return ruled[row, 2]
+        if decided[row, 2] != DROPPED:
+            return decided[row, 2]
     return DROPPED
 
 
@@ -317,7 +321,7 @@ def _double(
     row: int,
     arrival_ns: int,
     queued: np.ndarray,
-    struck: np.ndarray,
+    effects: np.ndarray,
     made: int,
     out: np.ndarray,
 ) -> int:
@@ -332,17 +336,17 @@ def _double(
             continue
         copy = _FIRST_EXTRA + COPIES_MAX * table.rules[rule, FAULT]
         for _ in range(table.rules[rule, _COPIES]):
-            struck[rule, _DOUBLED] += 1
+            effects[rule, _DOUBLED] += 1
             share = _draw(table, rule, Purpose.FAULT_DELAY.value, hop, copy)
             due_ns = arrival_ns + round(share * table.numbers[rule, _LATER_S] * 1e9)
-            due_ns = _judge(table, _with(hop, copy), due_ns, queued, struck)
+            due_ns = _judge(table, _with(hop, copy), due_ns, queued, effects)
             made = _put(out, made, hop.target, row, due_ns)
             copy += 1
     return made
 
 
 @kernel
-def find_beside(
+def find_extra(
     seed: int,
     rules: np.ndarray,
     numbers: np.ndarray,
@@ -356,22 +360,22 @@ def find_beside(
     cells: np.ndarray,
     xy_m: np.ndarray,
     supervisor: int,
-    supervisor_stands: bool,
+    supervisor_placed: bool,
     robots_m: float,
     supervisors_m: float,
     sent: np.ndarray,
-    ruled: np.ndarray,
+    decided: np.ndarray,
     count: int,
-    struck: np.ndarray,
-    beside: np.ndarray,
+    effects: np.ndarray,
+    extra: np.ndarray,
 ) -> int:
     """What else comes beside what the radio delivers: an older message, or a forgery. How many there are.
 
-    beside (rows, 4): first verdict on what it comes beside, rule, and how old an older message must be at
-    least, as the time by which it was sent. What finds no room is only counted. struck: room, see `rule_on`.
+    extra (rows, 4): first verdict on what it comes extra, rule, and how old an older message must be at
+    least, as the time by which it was sent. What finds no room is only counted. effects: room, see `rule_on`.
     """
     table = FaultTable(seed, rules, numbers, named, severed)
-    field = Field(
+    geometry = LinkGeometry(
         left_m,
         bottom_m,
         resolution_m,
@@ -380,17 +384,17 @@ def find_beside(
         cells,
         xy_m,
         supervisor,
-        supervisor_stands,
+        supervisor_placed,
     )
     found = 0
     end = 0
     while end < count:
         first = end
-        end = _end_of(ruled, count, first)
-        hop = _hop_of(sent, ruled, first, supervisor)
-        if _arrival(ruled, first, end) == DROPPED:
+        end = _end_of(decided, count, first)
+        hop = _hop_of(sent, decided, first, supervisor)
+        if _arrival(decided, first, end) == DROPPED:
             continue
-        if _is_lost(table, field, hop, robots_m, supervisors_m, struck):
+        if _is_lost(table, geometry, hop, robots_m, supervisors_m, effects):
             continue
         for rule in range(rules.shape[0]):
             kind = rules[rule, _KIND]
@@ -404,8 +408,8 @@ def find_beside(
             if replays:
                 share = 1.0 - _draw(table, rule, Purpose.FAULT_DELAY.value, hop, 0)
                 latest_ns -= max(1, round(share * rules[rule, _SPAN_NS]))
-            if found < beside.shape[0]:
-                row = beside[found]
+            if found < extra.shape[0]:
+                row = extra[found]
                 row[_FIRST], row[_RULE], row[_LATEST_NS] = first, rule, latest_ns
             found += 1
     return found
@@ -426,28 +430,28 @@ def rule_on(
     cells: np.ndarray,
     xy_m: np.ndarray,
     supervisor: int,
-    supervisor_stands: bool,
+    supervisor_placed: bool,
     robots_m: float,
     supervisors_m: float,
     sent: np.ndarray,
-    ruled: np.ndarray,
+    decided: np.ndarray,
     count: int,
     queued: np.ndarray,
-    beside: np.ndarray,
-    besides: int,
-    struck: np.ndarray,
+    extra: np.ndarray,
+    extras: int,
+    effects: np.ndarray,
     fault_stats: np.ndarray,
     out: np.ndarray,
 ) -> tuple[int, int]:
-    """Rule on what the radio has ruled. How many verdicts there are, and how many receivers are lost.
+    """Rule on what the radio has decided. How many verdicts there are, and how many receivers are lost.
 
-    sent, ruled, count: see `Interference`. queued (envelopes, queues): how long each waits in ns, or
-    DROPPED. beside (besides of its rows count): see `find_beside`; with the row on the air of each, or
-    less than 0 where there is none. struck (n, 5): room. tolls (n, 5): what each fault did is added.
+    sent, decided, count: see `Interference`. queued (envelopes, queues): how long each waits in ns, or
+    DROPPED. extra (extras of its rows count): see `find_extra`; with the row on the air of each, or
+    less than 0 where there is none. effects (n, 5): room. tolls (n, 5): what each fault did is added.
     out: the verdicts; if they do not fit, nothing else has changed.
     """
     table = FaultTable(seed, rules, numbers, named, severed)
-    field = Field(
+    geometry = LinkGeometry(
         left_m,
         bottom_m,
         resolution_m,
@@ -456,47 +460,47 @@ def rule_on(
         cells,
         xy_m,
         supervisor,
-        supervisor_stands,
+        supervisor_placed,
     )
-    struck[:] = 0
+    effects[:] = 0
     made = 0
     lost = 0
     passed = 0
     end = 0
     while end < count:
         first = end
-        end = _end_of(ruled, count, first)
-        hop = _hop_of(sent, ruled, first, supervisor)
-        to, row = ruled[first, 0], ruled[first, 1]
-        if _is_lost(table, field, hop, robots_m, supervisors_m, struck):
+        end = _end_of(decided, count, first)
+        hop = _hop_of(sent, decided, first, supervisor)
+        to, row = decided[first, 0], decided[first, 1]
+        if _is_lost(table, geometry, hop, robots_m, supervisors_m, effects):
             lost += 1
             continue
         for i in range(first, end):
-            due_ns = _judge(table, _with(hop, i - first), ruled[i, 2], queued[row], struck)
+            due_ns = _judge(table, _with(hop, i - first), decided[i, 2], queued[row], effects)
             made = _put(out, made, to, row, due_ns)
-        arrival_ns = _arrival(ruled, first, end)
+        arrival_ns = _arrival(decided, first, end)
         if arrival_ns == DROPPED:
             continue
-        made = _double(table, hop, row, arrival_ns, queued[row], struck, made, out)
-        while passed < besides and beside[passed, _FIRST] == first:
-            rule, on_air = beside[passed, _RULE], beside[passed, ON_AIR]
+        made = _double(table, hop, row, arrival_ns, queued[row], effects, made, out)
+        while passed < extras and extra[passed, _FIRST] == first:
+            rule, on_air = extra[passed, _RULE], extra[passed, ON_AIR]
             passed += 1
             if on_air >= 0:
                 replays = rules[rule, _KIND] == _REPLAY
-                struck[rule, _REPLAYS if replays else _FORGERIES] += 1
+                effects[rule, _REPLAYS if replays else _FORGERIES] += 1
                 copy = (_REPLAYED if replays else _FORGED) + rules[rule, FAULT]
-                due_ns = _judge(table, _with(hop, copy), arrival_ns, queued[row], struck)
+                due_ns = _judge(table, _with(hop, copy), arrival_ns, queued[row], effects)
                 made = _put(out, made, to, on_air, due_ns)
     if made <= out.shape[0]:
         for rule in range(rules.shape[0]):
-            for deed in range(struck.shape[1]):
-                fault_stats[rule, deed] += struck[rule, deed]
+            for deed in range(effects.shape[1]):
+                fault_stats[rule, deed] += effects[rule, deed]
     return made, lost
 
 
 def until_ns(fault: Fault) -> int:
     """When it is over, or later than anything happens."""
-    return NEVER_NS if fault.until_ns is None else fault.until_ns
+    return DUE_MAX_NS if fault.until_ns is None else fault.until_ns
 
 
 class _Row(NamedTuple):

@@ -2,7 +2,7 @@
 
 A catalogue of what a broken or hostile peer could send. Every participant of every mission refuses each of
 them, whatever it merges and whatever its planner shares: a forgery is counted and changes nothing. What is
-forged rests on keyed draws, and on the message that it comes beside.
+forged rests on keyed draws, and on the message that it comes extra.
 """
 
 import math
@@ -23,11 +23,8 @@ from kantor_protocol.wire.messages import (
     encode_gossip,
 )
 
-FIRST_SEQUENCE = 2**62
-"""Forgeries are numbered from here on; no participant sends so much."""
-
 OVERSIZED_SHARE = 1 / 256
-"""Of forgeries. Every one stays in the record with all its bytes."""
+"""Share of forgeries that are too large. Each stays in the record with all its bytes, so there are few."""
 
 _NO_NEWS = GossipMessage(VERSION, 0, 0.0, 0.0, b"", b"", b"")
 _STRANGERS = ("r0", "mallory", WORLD_SIM, SUPERVISOR, "r1 ", "R1", "r999999", "r\u0661", "r1" * 64)
@@ -49,7 +46,7 @@ class ForgeryDraws:
     """Keyed draws for one forgery."""
 
     def __init__(self, seed: int, link: int, sequence: int, index: int) -> None:
-        """link, sequence: of what it comes beside. index: of which the lower 16 bits count the draws."""
+        """link, sequence: of what it comes extra. index: of which the lower 16 bits count the draws."""
         self._key = seed, Purpose.FORGERY.value, link, sequence
         self._index = index
 

@@ -1,6 +1,6 @@
 """What the link faults of a scenario do to the radio's verdicts; the rules themselves are in `rules.py`.
 
-A mission has more verdicts than steps, so they are ruled by kernels. What needs the envelopes themselves
+A mission has more verdicts than steps, so they are decided by kernels. What needs the envelopes themselves
 stays here, and takes its time only where a fault asks for it: only a queue (bandwidth), what is replayed
 and the numbers of forgeries depend on what was sent before.
 """
@@ -13,42 +13,47 @@ import msgspec
 import numpy as np
 
 from kantor_protocol.base.machine import SUPERVISOR, Envelope, ParticipantId
-from kantor_protocol.scenario.faults.links import Bandwidth, Hostile, Replay
+from kantor_protocol.scenario.faults.links import (
+    FORGED_SEQUENCE_MIN,
+    Bandwidth,
+    Hostile,
+    Replay,
+)
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.radio import fault_kernels as of
-from kantor_worldsim.radio.channel import DROPPED, Field, Ruled, Sent, link_of
+from kantor_worldsim.radio.channel import DROPPED, Decisions, LinkGeometry, Sent, link_of
 from kantor_worldsim.radio.fault_kernels import (
+    DUE_MAX_NS,
     KINDS,
-    NEVER_NS,
-    find_beside,
+    find_extra,
     reach_m,
     rule_on,
     severs,
     table_of,
     until_ns,
 )
-from kantor_worldsim.radio.forgeries import FIRST_SEQUENCE, ForgeryDraws, forge, strangers
+from kantor_worldsim.radio.forgeries import ForgeryDraws, forge, strangers
 
 
 class FaultStats(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """What one fault did to copies of messages for receivers within the radio's range."""
+    """Effects of one fault on copies of messages for receivers within the radio's range."""
 
     fault: int
-    """Its place in the scenario's list."""
+    """Its index in the scenario's list."""
     dropped: int = 0
     """A copy that several faults drop counts for each."""
     delayed: int = 0
-    """Of those that arrive."""
+    """Copies that arrive later."""
     doubled: int = 0
     replayed: int = 0
     forged: int = 0
 
 
-_DEEDS = len(FaultStats.__struct_fields__) - 1
+_COUNTERS = len(FaultStats.__struct_fields__) - 1
 
 
 class _History:
-    """What was sent lately, for a fault that sends it again."""
+    """Recent messages, for a fault that replays them."""
 
     def __init__(self, fault: Replay) -> None:
         self._age_ns = round(fault.age_s * 1e9)
@@ -56,7 +61,7 @@ class _History:
         self._sent: dict[tuple[ParticipantId, ParticipantId], deque[Sent]] = {}
 
     def remember(self, sent: Sent) -> None:
-        """Note what is sent, and forget what is too old to be drawn."""
+        """Add a message, and drop those that are too old to be drawn."""
         if sent.now_ns >= self._until_ns:
             return
         past = self._sent.setdefault((sent.envelope.source, sent.envelope.target), deque())
@@ -65,13 +70,13 @@ class _History:
             past.popleft()
 
     def older(self, envelope: Envelope, latest_ns: int) -> Envelope | None:
-        """The newest message of the same sender to the same receivers that was sent by then."""
+        """The newest message of the same sender to the same receivers that was sent by latest_ns."""
         past = self._sent.get((envelope.source, envelope.target), ())
         return next((sent.envelope for sent in reversed(past) if sent.now_ns <= latest_ns), None)
 
 
 class _Queue:
-    """What waits until its sender has air for it."""
+    """Messages that wait for their sender's bandwidth."""
 
     def __init__(self, fault: Bandwidth) -> None:
         self._fault = fault
@@ -80,7 +85,7 @@ class _Queue:
         self._free_ns: dict[ParticipantId, int] = {}
 
     def send(self, now_ns: int, envelope: Envelope) -> int:
-        """How long an envelope waits, or DROPPED."""
+        """Waiting time of an envelope in nanoseconds, or DROPPED."""
         if not self._fault.from_ns <= now_ns < self._until_ns:
             return 0
         if self._names and envelope.source not in self._names:
@@ -92,47 +97,47 @@ class _Queue:
             return DROPPED
         free_ns += round(len(envelope.body) * per_byte_ns)
         self._free_ns[envelope.source] = free_ns
-        return min(free_ns - now_ns, NEVER_NS)
+        return min(free_ns - now_ns, DUE_MAX_NS)
 
 
 class LinkFaults:
-    """All link faults of a scenario, as the radio's interference (see `Channel`) and for referees."""
+    """All link faults of a scenario, as the interference of a `Channel`."""
 
     def __init__(self, scenario: Scenario, seed: int) -> None:
-        """Use `of`, which takes no trouble where there are none."""
+        """Use `of`, which is None for a scenario without link faults."""
         self.table = table_of(scenario, seed)
-        """For kernels; without faults it has no rows."""
+        """The rules, for kernels."""
         self._order: list[int] = self.table.rules[:, of.FAULT].tolist()
         faults = {fault: scenario.faults[fault] for fault in self._order}
         self._histories = {i: _History(f) for i, f in faults.items() if isinstance(f, Replay)}
         self._queues = [_Queue(fault) for fault in faults.values() if isinstance(fault, Bandwidth)]
         self._over_ns = max(map(until_ns, faults.values()), default=0)
-        """Nothing that is sent from then on is touched."""
-        self._has_beside = any(isinstance(f, Replay | Hostile) for f in faults.values())
+        """Messages that are sent from then on are not affected."""
+        self._has_extra = any(isinstance(f, Replay | Hostile) for f in faults.values())
         self._roster = scenario.roster
         self._strangers = strangers(scenario.roster)
         self._places = {name: i for i, name in enumerate(scenario.roster)}
         self._ranges_m = scenario.radio.range_m, scenario.supervisor.range_m
         self._seed = seed
         self._forged: list[Envelope] = []
-        self._next_forged = FIRST_SEQUENCE
-        self._struck = np.zeros((len(faults), _DEEDS), dtype=np.int64)
-        self._tolls = np.zeros((len(faults), _DEEDS), dtype=np.int64)
+        self._next_forged = FORGED_SEQUENCE_MIN
+        self._effects = np.zeros((len(faults), _COUNTERS), dtype=np.int64)
+        self._totals = np.zeros((len(faults), _COUNTERS), dtype=np.int64)
         self._queued = np.zeros((1, len(self._queues)), dtype=np.int64)
-        self._beside = np.zeros((1, 4), dtype=np.int64)
+        self._extra = np.zeros((1, 4), dtype=np.int64)
         self._out = np.zeros((1, 3), dtype=np.int64)
-        self._field: Field | None = None
-        self._standing: tuple[Any, ...] = ()
+        self._geometry: LinkGeometry | None = None
+        self._constant: tuple[Any, ...] = ()
         """Arguments of the kernels that stay the same from call to call."""
 
     @classmethod
     def of(cls, scenario: Scenario, seed: int) -> "LinkFaults | None":
-        """Those of a scenario, or None if it has none."""
+        """Link faults of a scenario, or None if it has none."""
         faulty = any(type(fault) in KINDS for fault in scenario.faults)
         return cls(scenario, seed) if faulty else None
 
     def cuts(self, now_ns: int, source: ParticipantId, target: ParticipantId) -> bool:
-        """Whether nothing that is sent now gets from one to the other, however near they are."""
+        """Whether a cut severs the link from source to target now."""
         return bool(severs(self.table, now_ns, self._place(source), self._place(target)))
 
     def reach_m(self, now_ns: int, source: ParticipantId, target: ParticipantId) -> float:
@@ -144,51 +149,47 @@ class LinkFaults:
         return left_m
 
     def rule(
-        self, sent: Sequence[Sent], rows: np.ndarray, ruled: Ruled, field: Field
-    ) -> tuple[Sequence[Sent], Ruled, int]:
-        """Rule on what the radio has ruled; see `Interference`."""
+        self, sent: Sequence[Sent], rows: np.ndarray, decided: Decisions, geometry: LinkGeometry
+    ) -> tuple[Sequence[Sent], Decisions, int]:
+        """Apply the faults to the channel's decisions; see `Interference`."""
         if sent[0].now_ns >= self._over_ns:
-            return sent, ruled, 0
+            return sent, decided, 0
         self._enqueue(sent)
-        if field is not self._field:
-            self._field, self._standing = field, (*self.table, *field, *self._ranges_m)
-        law = (*self._standing, rows, *ruled)
-        on_air, besides = self._bring(sent, law) if self._has_beside else (sent, 0)
-        made, lost = self._judge(law, besides)
+        if geometry is not self._geometry:
+            self._geometry, self._constant = geometry, (*self.table, *geometry, *self._ranges_m)
+        arguments = (*self._constant, rows, *decided)
+        on_air, extras = self._bring(sent, arguments) if self._has_extra else (sent, 0)
+        made, lost = self._judge(arguments, extras)
         if made > self._out.shape[0]:
             self._out = np.zeros((2 * made, 3), dtype=np.int64)
-            made, lost = self._judge(law, besides)
-        return on_air, Ruled(self._out, made), lost
+            made, lost = self._judge(arguments, extras)
+        return on_air, Decisions(self._out, made), lost
 
     def pop_stats(self) -> tuple[FaultStats, ...]:
-        """What each fault has done since the last call; those that did nothing are left out."""
-        told = self._tolls.tobytes()
-        if told.count(0) == len(told):
+        """Effects of each fault since the last call; faults without any are left out."""
+        if not self._totals.any():
             return ()
-        fault_stats = [
-            FaultStats(fault, *deeds)
-            for fault, deeds in zip(self._order, self._tolls.tolist(), strict=True)
-            if any(deeds)
-        ]
-        self._tolls[:] = 0
-        return tuple(fault_stats)
+        counted = zip(self._order, self._totals.tolist(), strict=True)
+        stats = tuple([FaultStats(fault, *counts) for fault, counts in counted if any(counts)])
+        self._totals[:] = 0
+        return stats
 
     def pop_forged(self) -> tuple[Envelope, ...]:
-        """What was forged since the last call."""
+        """Envelopes that were forged since the last call."""
         forged, self._forged = self._forged, []
         return tuple(forged)
 
     def _place(self, name: ParticipantId) -> int:
         return self._places.get(name, -1)
 
-    def _judge(self, law: tuple[Any, ...], besides: int) -> tuple[int, int]:
+    def _judge(self, arguments: tuple[Any, ...], extras: int) -> tuple[int, int]:
         made, lost = rule_on(
-            *law, self._queued, self._beside, besides, self._struck, self._tolls, self._out
+            *arguments, self._queued, self._extra, extras, self._effects, self._totals, self._out
         )
         return made, lost
 
     def _enqueue(self, sent: Sequence[Sent]) -> None:
-        """Note what is said of envelopes whoever hears them."""
+        """Apply the rules that do not depend on the receiver: queues and histories."""
         if self._queued.shape[0] < len(sent):
             self._queued = np.zeros((2 * len(sent), len(self._queues)), dtype=np.int64)
         if self._queues:
@@ -197,22 +198,22 @@ class LinkFaults:
             for each in sent:
                 history.remember(each)
 
-    def _bring(self, sent: Sequence[Sent], law: tuple[Any, ...]) -> tuple[list[Sent], int]:
+    def _bring(self, sent: Sequence[Sent], arguments: tuple[Any, ...]) -> tuple[list[Sent], int]:
         """Put on the air what comes beside messages: all that is there, and how many rows tell of it."""
-        found = find_beside(*law, self._struck, self._beside)
-        if found > self._beside.shape[0]:
-            self._beside = np.zeros((2 * found, 4), dtype=np.int64)
-            find_beside(*law, self._struck, self._beside)
-        on_air, ruled = list(sent), law[-2]
-        for row, (first, rule, latest_ns, _) in enumerate(self._beside[:found].tolist()):
-            to, which, _ = ruled[first].tolist()
-            more = self._more(on_air[which], to, rule, latest_ns)
-            self._beside[row, of.ON_AIR] = -1 if more is None else len(on_air)
+        found = find_extra(*arguments, self._effects, self._extra)
+        if found > self._extra.shape[0]:
+            self._extra = np.zeros((2 * found, 4), dtype=np.int64)
+            find_extra(*arguments, self._effects, self._extra)
+        on_air, decided = list(sent), arguments[-2]
+        for row, (first, rule, latest_ns, _) in enumerate(self._extra[:found].tolist()):
+            to, which, _ = decided[first].tolist()
+            more = self._extra_envelope(on_air[which], to, rule, latest_ns)
+            self._extra[row, of.ON_AIR] = -1 if more is None else len(on_air)
             if more is not None:
                 on_air.append(Sent(sent[which].now_ns, more))
         return on_air, found
 
-    def _more(self, sent: Sent, to: int, rule: int, latest_ns: int) -> Envelope | None:
+    def _extra_envelope(self, sent: Sent, to: int, rule: int, latest_ns: int) -> Envelope | None:
         """What comes beside an envelope, if anything."""
         fault = self._order[rule]
         if fault in self._histories:
@@ -221,8 +222,8 @@ class LinkFaults:
 
     def _forge(self, envelope: Envelope, to: int, fault: int) -> Envelope:
         link = link_of(self._places[envelope.source], to, self._places.get(SUPERVISOR, -1))
-        dice = ForgeryDraws(self._seed, link, envelope.sequence, fault << of.FAULT_SHIFT)
-        source, body = forge(dice, envelope, self._strangers)
+        draws = ForgeryDraws(self._seed, link, envelope.sequence, fault << of.FAULT_SHIFT)
+        source, body = forge(draws, envelope, self._strangers)
         forged = Envelope(source, self._next_forged, self._roster[to], body)
         self._next_forged += 1
         self._forged.append(forged)

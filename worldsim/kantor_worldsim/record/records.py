@@ -1,8 +1,8 @@
-"""The record of a run: one opening, a batch for each moment at which somebody acted, one ending.
+"""The record of a run: one opening, a batch for each moment at which participants stepped, process events, one ending.
 
 Everything that judges or measures a run (checkers, metrics, reports, replay) reads these records and
-nothing else. They hold no trace of the exchange that ran the robots, so that the same scenario and
-seed give the same bytes in process and over the bus.
+nothing else. They hold no trace of the exchange, so that the same scenario and seed give the same bytes in process
+and over the bus. Tags and the order of fields are a contract.
 """
 
 import msgspec
@@ -14,6 +14,7 @@ from kantor_protocol.wire.messages import Array, RefusedError
 from kantor_protocol.wire.weights import Units
 from kantor_worldsim.radio.channel import DeliveryDecision
 from kantor_worldsim.radio.link_faults import FaultStats
+from kantor_worldsim.record.process_events import ProcessEventKind
 from kantor_worldsim.world.maps import Ground
 from kantor_worldsim.world.world import Found, StepVerdict, WorldSetup, units_of
 
@@ -21,7 +22,7 @@ VERSION = 1
 
 
 class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
-    """What the run starts from."""
+    """Initial state of a run."""
 
     version: int
     scenario: Scenario
@@ -30,11 +31,11 @@ class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
     targets_m: Array
     starts_m: Array
     first_look: dict[ParticipantId, tuple[Found, ...]]
-    """Targets seen at time 0."""
+    """Targets that each robot detects at time 0."""
     ground: Array | None = None
     """(rows, columns) uint8: the true map, if the robots explore one; see `grid.py`."""
     frame: Frame | None = None
-    """How its cells lie."""
+    """Where the cells of the map lie in the world."""
 
     @property
     def site(self) -> WorldSetup:
@@ -57,12 +58,12 @@ class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
 
     @property
     def units(self) -> Units:
-        """The mass of the run."""
+        """Units of mass of the run."""
         return units_of(self.scenario, self.samples_m.shape[0])
 
 
 class StepRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """One participant's step: what it was given, what it did, what the world made of it."""
+    """One participant's step: its inputs, its outputs, and the world's verdict."""
 
     name: ParticipantId
     now_ns: int
@@ -70,51 +71,50 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
     heard: tuple[tuple[ParticipantId, int], ...]
     """The inbox by reference: source and sequence of each envelope, in order; empty without outputs."""
     outputs: Outputs | None
-    """None: late, crashed or cut off. Turn by turn it is asked again until it answers, with the same
-    inputs; now_ns stays when they were first given."""
+    """None: late, crashed or disconnected. In virtual time the participant is asked again, with the same inputs, until
+    it answers; now_ns stays the time of the first request."""
     verdict: StepVerdict | None
     skew_ns: int = 0
-    """How far the clock that it read was ahead of now_ns."""
+    """Skew of the clock that it read, positive if it was ahead of now_ns."""
 
 
 class Batch(msgspec.Struct, frozen=True, array_like=True, tag="batch"):
-    """Everybody who acted at one moment, and what became of what they sent."""
+    """All steps of one moment, and the delivery decisions on what they sent."""
 
     now_ns: int
     step_records: tuple[StepRecord, ...]
     decisions: tuple[DeliveryDecision, ...]
     out_of_range: int
-    """Receivers that an envelope did not reach for range."""
+    """Number of receivers that envelopes did not reach because of range."""
     absent: tuple[ParticipantId, ...] = ()
-    """Participants that were asked and gave no outputs."""
+    """Participants that were asked and returned no outputs."""
     fault_stats: tuple[FaultStats, ...] = ()
-    """What the scenario's faults had to do with the verdicts."""
+    """Effects of the scenario's link faults on the decisions."""
     injected: tuple[Envelope, ...] = ()
-    """What a fault put on the air and nobody sent; verdicts may be about it."""
+    """Envelopes that a fault put on the air and no participant sent; decisions may be about them."""
 
 
 class ProcessEvent(msgspec.Struct, frozen=True, array_like=True, tag="incident", gc=False):
-    """Something that befell a process."""
+    """Something that happened to a process."""
 
     now_ns: int
     who: ParticipantId
     """A participant, or world-sim."""
-    what: str
-    """See `outages.Deed`; `leave` and `join` are nobody's deeds."""
+    kind: ProcessEventKind
     fault: int = -1
-    """Its place in the scenario's list; -1: nobody ordered it."""
+    """Index of its fault in the scenario's list; -1: no fault is the cause."""
     step: int = 0
-    """start, join: the step that it goes on from."""
+    """Kinds that take over: the last step that is done."""
     incarnation: int = 0
-    """start, join: its incarnation."""
+    """Kinds that take over: the incarnation that goes on."""
 
 
 class Ending(msgspec.Struct, frozen=True, array_like=True, tag="ending"):
-    """Why and when the run ended."""
+    """Time and reason of the end."""
 
     now_ns: int
     reason: str
-    """`done`, `limit`, `interrupted` or `deserted` (nobody left)."""
+    """`done`, `limit`, `interrupted` or `deserted` (no robot left)."""
 
 
 Record = Opening | Batch | ProcessEvent | Ending
@@ -137,7 +137,7 @@ def opening_of(
     site: WorldSetup,
     first_look: dict[ParticipantId, tuple[Found, ...]],
 ) -> Opening:
-    """The first record of a run."""
+    """The opening record of a run."""
     ground = site.ground
     return Opening(
         VERSION,
@@ -153,18 +153,18 @@ def opening_of(
 
 
 class EnvelopeIndex:
-    """Envelopes of a run by (source, sequence), to turn references back into inboxes."""
+    """Envelopes of a run by (source, sequence), which turns references back into inboxes."""
 
     def __init__(self) -> None:
         self._envelopes: dict[tuple[ParticipantId, int], Envelope] = {}
 
     def inputs(self, step_record: StepRecord) -> Inputs:
-        """What the participant was given. Raises KeyError for an envelope that was never sent."""
+        """Inputs of a step. Raises KeyError for an envelope that was never sent."""
         inbox = tuple(self._envelopes[reference] for reference in step_record.heard)
         return Inputs(step_record.now_ns + step_record.skew_ns, step_record.observation, inbox)
 
-    def post(self, batch: Batch) -> None:
-        """Note what was sent in a batch, and what nobody sent."""
+    def add(self, batch: Batch) -> None:
+        """Add the envelopes of a batch, those that a fault injected included."""
         for envelope in batch.injected:
             self._envelopes[envelope.source, envelope.sequence] = envelope
         for step_record in batch.step_records:

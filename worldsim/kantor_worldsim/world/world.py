@@ -1,4 +1,4 @@
-"""The truth: where robots and targets are, who has energy left, what was consumed and found."""
+"""The truth: poses of robots and targets, energy that is left, what was consumed and found."""
 
 import math
 from typing import NamedTuple
@@ -20,17 +20,17 @@ from kantor_worldsim.world.maps import Ground
 from kantor_worldsim.world.sensors import RangeFinder, sense_targets, sense_targets_in_sight
 
 Found = tuple[int, float, float]
-"""A target with the place where it was found."""
+"""A target (index) with the position (x, y) where it was found."""
 
 SPEED_TOLERANCE = 1e-6
-"""Relative, on the length of one move: rounding, no more."""
+"""Relative tolerance on the length of one move, for rounding alone."""
 
 STANDOFF_CELLS = 1 / 64
-"""A robot that meets a wall stops so far before it, along its way."""
+"""Distance, in cells along its way, at which a robot stops before a wall."""
 
 
 class WorldSetup(NamedTuple):
-    """What a mission starts from, drawn from scenario and seed. All in the world frame, metres."""
+    """Initial truth of a mission, from scenario and seed. World frame, metres."""
 
     samples_m: npt.NDArray[np.float64]
     """(N, 2)"""
@@ -42,11 +42,11 @@ class WorldSetup(NamedTuple):
     ground: Ground | None = None
     """The true map, if the robots explore one. There are no samples then."""
     warnings: tuple[str, ...] = ()
-    """What may be wrong with the map's file, a line each."""
+    """Doubts about the map's file, one line each."""
 
     @classmethod
     def of(cls, scenario: Scenario, seed: int) -> "WorldSetup":
-        """Raises ScenarioError for a file that is no use."""
+        """Draw and read everything that a scenario starts from. Raises ScenarioError for an unusable file."""
         if scenario.mapping:
             return cls._of_map(scenario, seed)
         return cls(
@@ -74,7 +74,7 @@ class WorldSetup(NamedTuple):
         return cls(np.zeros((0, 2)), targets_m, starts_m, ground, tuple(warnings))
 
     def poses(self, scenario: Scenario) -> dict[ParticipantId, Pose]:
-        """Where everybody in the roster is at time 0."""
+        """Pose of every participant at time 0."""
         robots = zip(scenario.robot_ids, self.starts_m.tolist(), strict=True)
         poses = {name: Pose(x_m, y_m) for name, (x_m, y_m) in robots}
         if scenario.centralized:
@@ -96,24 +96,24 @@ def ground_of(scenario: Scenario) -> tuple[Ground, list[str]]:
 
 
 def units_of(scenario: Scenario, samples: int) -> Units:
-    """The mass of a run with so many samples; none in a mission with a map."""
+    """Units of mass of a run with a number of samples; none in a mission with a map."""
     return Units(0, 0, 0) if scenario.mapping else Units.of(scenario.energy.points, samples)
 
 
 class StepVerdict(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """What the world made of a participant's step."""
+    """The world's verdict on a step."""
 
     pose: Pose
-    """Where it now truly is."""
+    """The true pose after the step."""
     found: tuple[Found, ...] = ()
     violations: tuple[str, ...] = ()
-    """Rules it broke: `step`, `speed`, `energy`, `units`. The offending part had no effect."""
+    """Rules that the step broke: `step`, `speed`, `energy`, `units`. That part of the step has no effect."""
     bumped: bool = False
     """The move ended at a wall, which breaks no rule."""
 
 
 class _Body:
-    """A participant as the world knows it."""
+    """The true state of a participant."""
 
     def __init__(self, pose: Pose) -> None:
         self.pose = pose
@@ -127,57 +127,57 @@ class _Body:
 
 
 class World:
-    """Accepts what participants do, as far as the rules allow."""
+    """Accepts the steps of participants, as far as the rules of motion and energy allow."""
 
-    def __init__(self, scenario: Scenario, seed: int, site: WorldSetup) -> None:
-        self.found = np.zeros(site.targets_m.shape[0], dtype=bool)
+    def __init__(self, scenario: Scenario, seed: int, setup: WorldSetup) -> None:
+        self.found = np.zeros(setup.targets_m.shape[0], dtype=bool)
         self._targets = RandomWalk(
-            site.targets_m,
+            setup.targets_m,
             scenario.targets.diffusion_m,
             scenario.period_ns,
             seed,
             Purpose.TARGET_WALK,
         )
-        self._units = units_of(scenario, site.samples_m.shape[0])
-        self._samples = site.samples_m.shape[0]
+        self._units = units_of(scenario, setup.samples_m.shape[0])
+        self._samples = setup.samples_m.shape[0]
         self._budget = scenario.steps_per_robot
         self._speed_m_s = scenario.vehicle.speed_m_s
         self._range_m = scenario.sensor.range_m
-        self._room = np.zeros(site.targets_m.shape[0], dtype=np.int64)
-        self._bodies = {name: _Body(pose) for name, pose in site.poses(scenario).items()}
-        self._ground = site.ground
-        if site.ground is not None:
-            self._range_finder = RangeFinder(scenario.sensor, site.ground, seed)
+        self._room = np.zeros(setup.targets_m.shape[0], dtype=np.int64)
+        self._bodies = {name: _Body(pose) for name, pose in setup.poses(scenario).items()}
+        self._ground = setup.ground
+        if setup.ground is not None:
+            self._range_finder = RangeFinder(scenario.sensor, setup.ground, seed)
             self._places = {name: i for i, name in enumerate(scenario.robot_ids)}
             for name in scenario.robot_ids:
                 self._enter(name, self._bodies[name])
 
     def pose(self, name: ParticipantId) -> Pose:
-        """Where a participant truly is."""
+        """True pose of a participant."""
         return self._bodies[name].pose
 
     def first_look(self) -> dict[ParticipantId, tuple[Found, ...]]:
-        """What the robots see at time 0, before anybody moves."""
+        """Targets that robots detect at time 0, before the first step."""
         return {name: self._sense(name) for name in self._bodies if name != SUPERVISOR}
 
     def observe(self, name: ParticipantId) -> Observation:
-        """What the world tells a participant of its last step, or of the start."""
+        """Observation of a participant after its last step, or at the start."""
         body = self._bodies[name]
         return Observation(body.step, body.pose, body.found, body.scan, body.bumped)
 
     def body(self, name: ParticipantId) -> Body:
-        """What whoever takes a participant over has to know."""
+        """State of a participant as a process that takes it over must know it."""
         body = self._bodies[name]
         return Body(body.pose, body.step, body.energy_spent, body.incarnation)
 
     def begin(self, name: ParticipantId, incarnation: int) -> bool:
-        """Note which incarnation drives a body from now on; whether it is another."""
+        """Set the incarnation that acts from now on; whether it is a new one."""
         body = self._bodies[name]
         other, body.incarnation = incarnation != body.incarnation, incarnation
         return other
 
     def accept(self, name: ParticipantId, now_ns: int, outputs: Outputs) -> StepVerdict:
-        """Judge a step that was made at `now_ns` and let its sound parts happen."""
+        """Judge a step that was made at `now_ns`, and apply the parts that break no rule."""
         body = self._bodies[name]
         if outputs.step <= body.step or now_ns < body.moved_ns:
             return StepVerdict(pose=body.pose, violations=("step",))
@@ -193,11 +193,22 @@ class World:
             body.scan = self._range_finder.scan(self._places[name], body.step, body.pose)
         return StepVerdict(body.pose, self._sense(name), tuple(violations), body.bumped)
 
+    def validate(self) -> None:
+        """Assert the invariants of every participant's true state."""
+        for body in self._bodies.values():
+            assert body.step >= 0
+            assert body.moved_ns >= 0
+            assert body.incarnation >= 0
+            assert 0 <= body.energy_spent <= self._budget
+            assert math.isfinite(body.pose.x_m)
+            assert math.isfinite(body.pose.y_m)
+            assert all(self.found[target] for target in body.found)
+
     def _moves(self, name: ParticipantId, body: _Body, now_ns: int, pose: Pose) -> bool:
         limit_m = 0.0 if name == SUPERVISOR else self._speed_m_s * (now_ns - body.moved_ns) * 1e-9
         start = body.pose
         way_m = math.hypot(pose.x_m - start.x_m, pose.y_m - start.y_m)
-        if not way_m <= limit_m * (1.0 + SPEED_TOLERANCE):  # nor to nowhere
+        if not way_m <= limit_m * (1.0 + SPEED_TOLERANCE):  # also for a pose that is not finite
             return False
         body.pose = pose
         if self._ground is not None and name != SUPERVISOR:
@@ -205,7 +216,7 @@ class World:
         return True
 
     def _enter(self, name: ParticipantId, body: _Body) -> None:
-        """Check that a robot does not start in a wall, and let it look around."""
+        """Check that a robot starts in a free cell, and take its first scan."""
         assert self._ground is not None
         x_m, y_m = body.pose.x_m, body.pose.y_m
         if not is_free(self._ground, x_m, y_m):
@@ -236,15 +247,15 @@ class World:
 
 
 def is_free(ground: Ground, x_m: float, y_m: float) -> bool:
-    """Whether a place in the world lies in a free cell."""
+    """Whether a position lies in a free cell."""
     cell = ground.frame.cell_of(x_m, y_m)
     return cell != NOWHERE and bool(ground.cells.flat[cell] == FREE)
 
 
 def stopped(ground: Ground, start: Pose, end: Pose) -> tuple[Pose, bool]:
-    """Where a straight move from a free cell ends, and whether a wall ended it.
+    """Pose at the end of a straight move from a free cell, and whether a wall ended it.
 
-    A robot that meets a wall stands STANDOFF_CELLS before it, or where it was; it has turned.
+    A robot that meets a wall stops STANDOFF_CELLS before it, or stays where it was; it has turned.
     """
     frame, cells = ground
     dx, dy = end.x_m - start.x_m, end.y_m - start.y_m

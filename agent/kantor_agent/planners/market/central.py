@@ -1,4 +1,4 @@
-"""The market of a supervisor: all tours are known, and goals are sold until no sale pays."""
+"""The market of a supervisor: all tours are known, and goals are sold where a sale shortens the tours."""
 
 from collections.abc import Sequence
 
@@ -10,45 +10,48 @@ from kantor_protocol.base.grid import NOWHERE
 
 
 class CentralMarket:
-    """The supervisor's market."""
+    """The tours of all robots in contact, and their trade; see `planner.py`."""
 
     def __init__(self, rules: MarketRules) -> None:
         self._rules = rules
-        self._tours: dict[int, list[int]] = {}
+        self.tours: dict[int, list[int]] = {}
+        """By robot in contact: its goals in the order of its tour."""
 
     def assign(self, situation: Situation) -> list[Task]:
         """Give up goals, propose goals, sell goals, then a target for each member."""
         team = sorted(situation.members + situation.others)
         fields = [situation.cost_map.optimistic(member.cell) for member in team]
-        self._tours = {member.robot: self._tours.get(member.robot, []) for member in team}
+        self.tours = {member.robot: self.tours.get(member.robot, []) for member in team}
         self._give_up(situation.cost_map, team, fields)
         self._propose(situation, team, fields)
-        self._sell(Costs(situation.cost_map, fields, self._held), [m.robot for m in team])
+        self.sell(Costs(situation.cost_map, fields, self._held), [m.robot for m in team])
         heading = self._rules.heading
         return [
-            Task(heading(situation, m, next(iter(self._tours[m.robot]), NOWHERE)))
+            Task(heading(situation, m, next(iter(self.tours[m.robot]), NOWHERE)))
             for m in situation.members
         ]
 
     @property
     def _held(self) -> list[int]:
-        return [goal for tour in self._tours.values() for goal in tour]
+        return [goal for tour in self.tours.values() for goal in tour]
 
     def _give_up(
         self, cost_map: CostMap, team: Sequence[Member], fields: Sequence[DistanceField]
     ) -> None:
+        """Drop goals that are known or that no way leads to."""
         for member, field in zip(team, fields, strict=True):
-            self._tours[member.robot] = [
+            self.tours[member.robot] = [
                 goal
-                for goal in self._tours[member.robot]
+                for goal in self.tours[member.robot]
                 if is_open(cost_map, goal) and is_reachable(field, goal)
             ]
 
     def _propose(
         self, situation: Situation, team: Sequence[Member], fields: Sequence[DistanceField]
     ) -> None:
+        """Fill empty tours with new goals."""
         for member, field in zip(team, fields, strict=True):
-            tour = self._tours[member.robot]
+            tour = self.tours[member.robot]
             if tour:
                 continue
             goals = self._rules.propose(
@@ -58,18 +61,18 @@ class CentralMarket:
             for goal in goals:
                 tour.insert(costs.insertion(0, tour, goal)[1], goal)
 
-    def _sell(self, costs: Costs, team: Sequence[int]) -> None:
+    def sell(self, costs: Costs, team: Sequence[int]) -> None:
         """One pass: the lowest place first, its goals in the order of its tour."""
         for seller, robot in enumerate(team):
-            for goal in list(self._tours[robot]):
-                price = price_of(costs.saving(seller, self._tours[robot], goal))
+            for goal in list(self.tours[robot]):
+                price = price_of(costs.saving(seller, self.tours[robot], goal))
                 bids = [
-                    (price_of(cost), bidder, slot)
+                    (price_of(cost), bidder, place)
                     for bidder, other in enumerate(team)
-                    if bidder != seller and len(self._tours[other]) < self._rules.capacity
-                    for cost, slot in [costs.insertion(bidder, self._tours[other], goal)]
+                    if bidder != seller and len(self.tours[other]) < self._rules.capacity
+                    for cost, place in [costs.insertion(bidder, self.tours[other], goal)]
                 ]
                 if bids and min(bids)[0] < price:
-                    _, winner, slot = min(bids)
-                    self._tours[robot].remove(goal)
-                    self._tours[team[winner]].insert(slot, goal)
+                    _, winner, place = min(bids)
+                    self.tours[robot].remove(goal)
+                    self.tours[team[winner]].insert(place, goal)

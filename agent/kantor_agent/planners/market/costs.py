@@ -1,4 +1,4 @@
-"""Costs of tours: what it takes to insert a goal, and what its removal saves."""
+"""Costs of tours: how much longer a tour gets by a goal, and how much shorter without one."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -10,26 +10,22 @@ from kantor_agent.mapping.cost_map import CostMap
 from kantor_protocol.base.grid import NOWHERE
 from kantor_protocol.base.kernels import kernel
 
-Cells = Sequence[int]
-
-
 DistanceField = npt.NDArray[np.float64]
-"""(cells,) from one robot's place, over what is unknown as well."""
+"""(cells,) cost of the way from one robot's place to every cell, unknown cells taken for open floor."""
 
-
-NOBODY = -1
-
+NO_ROBOT = -1
+"""In place of a robot."""
 
 PER_CELL = 16
-"""Prices and bids are counted in such parts of a cell: closer ones are equal."""
+"""Prices and bids are whole numbers of this fraction of a cell: closer ones are equal."""
 _PRICE_MAX = 1 << 40
 
 
 class Costs:
-    """What goals cost: from each robot's place to each goal, and from goal to goal, in cells.
+    """Costs of ways from each robot's place to each goal, and from goal to goal, in cells.
 
-    From a place it is the value function, with what is unknown taken for open floor. Between two goals it is
-    the most that follows without a field from either: the straight line, or the difference of what both cost
+    From a place it is the value function, with unknown cells taken for open floor. Between two goals it is
+    the best lower bound without a field from either: the straight line, or the difference of their costs
     from one of the places (the triangle inequality; landmarks, Goldberg and Harrelson 2005). That is a metric
     and agrees with the costs from the places, so that no insertion shortens a tour. A field from every goal
     would cost as much again and make missions no shorter.
@@ -38,6 +34,7 @@ class Costs:
     def __init__(
         self, cost_map: CostMap, fields: Sequence[DistanceField], goals: Iterable[int]
     ) -> None:
+        """fields: one for each place. goals: cells; all goals of the tours that are asked for."""
         cells = np.array(sorted(set(goals)), dtype=np.int64)
         self._index = {cell: i for i, cell in enumerate(cells.tolist())}
         from_places = np.array([field[cells] for field in fields]).reshape(len(fields), cells.size)
@@ -46,32 +43,32 @@ class Costs:
         self._from_places: list[list[float]] = from_places.tolist()
         self._between: list[list[float]] = between.tolist()
 
-    def insertion(self, place: int, tour: Cells, goal: int) -> tuple[float, int]:
-        """How much longer a goal makes the tour from a place, inserted where that is least, and there.
+    def insertion(self, place: int, tour: Sequence[int], goal: int) -> tuple[float, int]:
+        """The cheapest insertion of a goal into the tour from a place: how much longer, and before which goal.
 
-        Of equal insertions the first is taken; infinite if there is none.
+        Of equal insertions the first is taken; infinite, and at the end, if no way leads to the goal.
         """
-        cost, slot, last = math.inf, len(tour), len(tour)
+        cost, place_in_tour, last = math.inf, len(tour), len(tour)
         for i in range(last + 1):
             before = tour[i - 1] if i else NOWHERE
-            longer = self._leg(place, before, goal)
+            longer = self.leg(place, before, goal)
             if i < last:
-                longer += self._leg(place, goal, tour[i]) - self._leg(place, before, tour[i])
+                longer += self.leg(place, goal, tour[i]) - self.leg(place, before, tour[i])
             if longer < cost:  # the difference of two infinite legs is no number, and not less
-                cost, slot = longer, i
-        return cost, slot
+                cost, place_in_tour = longer, i
+        return cost, place_in_tour
 
-    def saving(self, place: int, tour: Cells, goal: int) -> float:
+    def saving(self, place: int, tour: Sequence[int], goal: int) -> float:
         """How much shorter the tour from a place is without one of its goals."""
         i = tour.index(goal)
         before = tour[i - 1] if i else NOWHERE
-        saved = self._leg(place, before, goal)
+        saved = self.leg(place, before, goal)
         if i + 1 < len(tour):
-            saved += self._leg(place, goal, tour[i + 1]) - self._leg(place, before, tour[i + 1])
+            saved += self.leg(place, goal, tour[i + 1]) - self.leg(place, before, tour[i + 1])
         return math.inf if math.isnan(saved) else saved
 
-    def _leg(self, place: int, one: int, other: int) -> float:
-        """From a goal, or from the place (NOWHERE), to a goal."""
+    def leg(self, place: int, one: int, other: int) -> float:
+        """The cost from a goal, or from the place (one = NOWHERE), to a goal."""
         to = self._index[other]
         return (
             self._from_places[place][to] if one == NOWHERE else self._between[self._index[one]][to]
@@ -80,9 +77,9 @@ class Costs:
 
 @kernel
 def separate(from_places: np.ndarray, cells: np.ndarray, columns: int, between: np.ndarray) -> None:
-    """Fill between (goals, goals), the least that ways between goals can cost; see `Costs`.
+    """Write lower bounds on the costs of ways between goals into between (goals, goals); see `Costs`.
 
-    from_places: (places, goals); cells: (goals,). Infinite if one is reached from a place and the other not.
+    from_places: (places, goals); cells: (goals,). Infinite if a place reaches one goal and not the other.
     """
     for a in range(cells.shape[0]):
         for b in range(cells.shape[0]):
@@ -96,11 +93,11 @@ def separate(from_places: np.ndarray, cells: np.ndarray, columns: int, between: 
 
 
 def price_of(cost: float) -> int:
-    """A cost as it is announced."""
+    """A cost as a price or bid: a whole number of 1/PER_CELL of a cell."""
     return round(min(cost * PER_CELL, _PRICE_MAX))
 
 
 def near(cost_map: CostMap, goal: int, others: Iterable[int]) -> bool:
-    """Whether one of others is as good as a goal: it lies within half a sensor range."""
+    """Whether one of the others lies within half a sensor range of a goal, and so is as good."""
     half = 0.5 * cost_map.sensor_cells
     return any(cost_map.cells_between(goal, other) <= half for other in others)

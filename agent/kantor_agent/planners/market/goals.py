@@ -1,4 +1,4 @@
-"""Goals in the unknown: at random, greedily, or from a quadtree."""
+"""Proposals of goals in unexplored space: at random, greedily, or from a quadtree."""
 
 import math
 from collections.abc import Iterable
@@ -12,15 +12,13 @@ from kantor_protocol.base.grid import UNKNOWN
 from kantor_protocol.base.kernels import kernel
 
 _UNKNOWN_SHARE = 0.25
-"""quadtree: a part of the map with more of it unknown is split, or becomes a goal."""
-
-
+"""quadtree: a part of the map of which a larger share is unknown is split, or becomes a goal."""
 _LEAF_RANGES = 2.0
-"""quadtree: a part that is no longer than this is not split."""
+"""quadtree: a part that is no longer than this, in sensor ranges, is not split."""
 
 
 def random_goals(cost_map: CostMap, seed: int, robot: int, tick: int, count: int) -> list[int]:
-    """So many cells anywhere, drawn anew in every tick; those that are known are left out."""
+    """`count` cells drawn from the whole map, anew in every tick, without those that are known."""
     cells = cost_map.frame.cells
     drawn = [
         int(uniform(seed, Purpose.MARKET, robot, tick, index) * cells) for index in range(count)
@@ -30,7 +28,7 @@ def random_goals(cost_map: CostMap, seed: int, robot: int, tick: int, count: int
 
 @kernel
 def clear_disc(values: np.ndarray, columns: int, cell: int, radius_cells: float) -> None:
-    """Make values (cells,) infinite that are less than a radius away from a cell, and its own."""
+    """Set values (cells,) to infinity within less than a radius of a cell, and at the cell itself."""
     row, column = cell // columns, cell % columns
     rows, reach = values.shape[0] // columns, int(radius_cells)
     for i in range(max(0, row - reach), min(rows, row + reach + 1)):
@@ -42,9 +40,9 @@ def clear_disc(values: np.ndarray, columns: int, cell: int, radius_cells: float)
 def greedy_goals(
     cost_map: CostMap, field: DistanceField, held: Iterable[int], count: int
 ) -> list[int]:
-    """The unknown cells that are cheapest to get to, a sensor range from one another.
+    """Unknown cells that are cheapest to get to, at least a sensor range from one another.
 
-    Those within half a range of a held goal are left out; of equal ones the lowest is taken.
+    Cells within half a range of a held goal are left out; of equal ones the lowest is taken.
     """
     columns, range_cells = cost_map.frame.columns, cost_map.sensor_cells
     values = np.where(cost_map.fused_map.cells == UNKNOWN, field, np.inf)
@@ -61,10 +59,10 @@ def greedy_goals(
 
 
 def quadtree_goals(cost_map: CostMap) -> list[int]:
-    """Centres of the leaves of a quadtree over the map, where they are unknown; rising.
+    """Unknown centres of the leaves of a quadtree over the map, rising.
 
-    A part of the map is of no interest if a quarter of it or less is unknown. Otherwise it is halved along
-    both sides if one is longer than two sensor ranges, and a leaf if not.
+    A part of the map of which a quarter or less is unknown is left out. Otherwise it is halved along both
+    sides if one is longer than two sensor ranges, and is a leaf if not.
     """
     rows, columns = cost_map.frame.rows, cost_map.frame.columns
     unknown = (cost_map.fused_map.cells == UNKNOWN).reshape(rows, columns)

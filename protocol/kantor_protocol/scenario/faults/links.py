@@ -18,6 +18,9 @@ Severs = Callable[[ParticipantId, ParticipantId], bool]
 
 COPIES_MAX = 8
 
+FORGED_SEQUENCE_MIN = 1 << 62
+"""Forged envelopes are numbered from here on; no participant sends so many."""
+
 _BRIDGE = -1
 """The side of a participant that hears both halves."""
 

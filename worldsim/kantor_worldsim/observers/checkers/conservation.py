@@ -3,28 +3,30 @@
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.varint import read_int, read_uint
 from kantor_worldsim.observers.checkers.state import (
-    BELOW,
-    BUDGET,
     DIFFERING,
     ENTRIES,
-    GARBLED_LOWERED,
-    GARBLED_SPENT,
+    INCARNATION_ID,
     KEYFRAME,
     KEYFRAMES,
+    POINTS,
+    SEQUENCE,
+    WRITES,
+    CheckerState,
+    Limits,
+    note_violation,
+)
+from kantor_worldsim.observers.checkers.violations import (
+    BELOW,
+    BUDGET,
+    GARBLED_LOWERED,
+    GARBLED_SPENT,
     MISCOUNT,
     NO_SAMPLE,
     NO_WEIGHT,
     NOT_ITS_OWN,
     NOT_REBUILT,
     POINT,
-    POINTS,
     RISE,
-    SEQUENCE,
-    SLOT,
-    WRITES,
-    CheckerState,
-    Limits,
-    note_violation,
 )
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch
@@ -35,7 +37,7 @@ def check_energy(state: CheckerState, limits: Limits, columns: ColumnarBatch, ro
     """A step spends units that are left, one point at a time, within the budget."""
     step_record = columns.step_records[row]
     who = step_record[of.PLACE]
-    book, slot = state.book[who], state.book[who, SLOT]
+    participant, slot = state.participants[who], state.participants[who, INCARNATION_ID]
     if step_record[of.SPENT_COUNT] == of.NOT_DECODED:
         note_violation(state, GARBLED_SPENT, row, 0, 0, 0, 0.0, 0.0)
         return
@@ -49,8 +51,8 @@ def check_energy(state: CheckerState, limits: Limits, columns: ColumnarBatch, ro
             entry[0], entry[1] = sample, units
             state.shipped[slot, ENTRIES] += 1
     state.shipped[slot, WRITES] += step_record[of.SPENT_COUNT] > 0
-    book[POINTS] += step_record[of.SPENT_COUNT] > 0
-    points = book[POINTS]
+    participant[POINTS] += step_record[of.SPENT_COUNT] > 0
+    points = participant[POINTS]
     if shipped > limits.point_units:
         note_violation(state, POINT, row, 0, shipped, 0, 0.0, 0.0)
     if points > limits.budget:
@@ -63,7 +65,10 @@ def check_energy(state: CheckerState, limits: Limits, columns: ColumnarBatch, ro
 def check_weights(state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int) -> None:
     """Weights only fall, and by what was spent or merged."""
     step_record = columns.step_records[row]
-    book, view = state.book[step_record[of.PLACE]], state.views[step_record[of.PLACE]]
+    participant, view = (
+        state.participants[step_record[of.PLACE]],
+        state.views[step_record[of.PLACE]],
+    )
     if step_record[of.LOWERED_COUNT] == of.NOT_DECODED:
         note_violation(state, GARBLED_LOWERED, row, 0, 0, 0, 0.0, 0.0)
     for i in range(
@@ -75,7 +80,7 @@ def check_weights(state: CheckerState, limits: Limits, columns: ColumnarBatch, r
         if left < limits.sample_units - state.consumed[sample]:
             note_violation(state, BELOW, row, sample, 0, 0, 0.0, 0.0)
         published = state.published[step_record[of.PLACE], sample]
-        book[DIFFERING] += (published != left) - (published != view[sample])
+        participant[DIFFERING] += (published != left) - (published != view[sample])
         view[sample] = left
 
 
@@ -84,16 +89,19 @@ def check_published(state: CheckerState, columns: ColumnarBatch, row: int) -> No
     """What has changed since the message before; a keyframe is left to `Checker`, to inflate it."""
     step_record = columns.step_records[row]
     payload, at = columns.payload, step_record[of.WEIGHTS]
-    book, view = state.book[step_record[of.PLACE]], state.views[step_record[of.PLACE]]
+    participant, view = (
+        state.participants[step_record[of.PLACE]],
+        state.views[step_record[of.PLACE]],
+    )
     published = state.published[step_record[of.PLACE]]
     sequence, base, size, at, end = of.parts_of_weights(
         payload, at, at + step_record[of.WEIGHTS_BYTES]
     )
     if end >= 0 and base == 0:
-        book[SEQUENCE], book[KEYFRAME] = sequence, row + 1
-        state.found[KEYFRAMES] += 1
+        participant[SEQUENCE], participant[KEYFRAME] = sequence, row + 1
+        state.counts[KEYFRAMES] += 1
         return
-    sound = end >= 0 and base == book[SEQUENCE] and size == view.shape[0]
+    sound = end >= 0 and base == participant[SEQUENCE] and size == view.shape[0]
     sample = 0
     while sound and at < end:
         step, at = read_int(payload, at)
@@ -103,13 +111,13 @@ def check_published(state: CheckerState, columns: ColumnarBatch, row: int) -> No
             sound = False
             break
         left = view[sample]
-        book[DIFFERING] += (units != left) - (published[sample] != left)
+        participant[DIFFERING] += (units != left) - (published[sample] != left)
         published[sample] = units
     if end >= 0:
-        book[SEQUENCE] = sequence if sound else 0
+        participant[SEQUENCE] = sequence if sound else 0
     if not sound:
         note_violation(state, NOT_REBUILT, row, 0, 0, 0, 0.0, 0.0)
-    elif book[DIFFERING]:
+    elif participant[DIFFERING]:
         note_violation(state, NOT_ITS_OWN, row, 0, 0, 0, 0.0, 0.0)
 
 

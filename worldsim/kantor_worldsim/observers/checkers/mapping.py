@@ -1,18 +1,20 @@
-"""What the referees hold against the record of a mapping run, beside the rules of every run.
+"""The rules on the record of a mission on a map, beside the rules of every run.
 
-`Checker` asks for these rules when a mission has a map. What robots send is followed by the `Survey`,
-which notes faults as numbers; here they are put into words.
+`Checker` applies them when a mission has a map. The `MapTracker` follows what robots send and notes violations
+as numbers; here they are put into words.
 """
 
-import math
 from collections.abc import Callable
 
 from kantor_protocol.base.grid import FREE, NOWHERE, free_way
 from kantor_protocol.base.machine import SUPERVISOR, ParticipantId, State
+from kantor_worldsim.observers.checkers.links import Links
+from kantor_worldsim.observers.checkers.sight import Sight
+from kantor_worldsim.observers.checkers.state import DROPPED
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
 from kantor_worldsim.observers.metrics.map_tracker_kernels import (
     FALSE_CELL,
-    FAR_VOID,
+    FAR_FRONTIER,
     FOREIGN,
     FORGETS,
     GAP,
@@ -22,18 +24,15 @@ from kantor_worldsim.observers.metrics.map_tracker_kernels import (
     SHORT,
     UNREADABLE,
 )
-from kantor_worldsim.radio.channel import DROPPED, DeliveryDecision
-from kantor_worldsim.radio.link_faults import LinkFaults
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, StepRecord
-from kantor_worldsim.world.sensors import walls_between
 
-Complain = Callable[[str, ParticipantId, str], None]
-"""Takes rule, who and what."""
+Report = Callable[[str, ParticipantId, str], None]
+"""Takes the rule, the participant and the text of a violation."""
 
-_WORDS = {
-    UNREADABLE: ("map", "sends what nobody can read"),
+_TEXTS = {
+    UNREADABLE: ("map", "sends a message that does not decode"),
     NOT_ITS_SCANS: ("map", "its log from {b} on is not what its scans say"),
-    FAR_VOID: ("map", "calls a frontier none where it never stood, in its log at {b}"),
+    FAR_FRONTIER: ("map", "declares a frontier dead where it never stood, in its log at {b}"),
     GAP: ("map", "sends its log from {b} on and has not sent what comes before"),
     SHORT: ("map", "its log has {a} entries, its scans gave {b}"),
     FORGETS: ("map", "holds {a} entries of a log of which it held {b}"),
@@ -41,28 +40,28 @@ _WORDS = {
     MORE: ("union", "holds {a} entries of a log that has {b}"),
     FALSE_CELL: ("truth", "sees cell {a} as {kind}, which it is not"),
 }
-"""Rule and text of each fault."""
+"""Rule and text of each violation."""
 
 
 class MapChecker:
-    """Follows the records of one mapping run and complains.
+    """Follows the records of one mission on a map and reports violations.
 
     Rules
     -----
     wall        no robot is accepted in a cell that is not free, nor on a straight way through one
     map         what a robot sends of its log is what its scans say, entry for entry, but for frontiers that
-                it calls none where it stood; a version vector never falls, so that no cell is forgotten
+                it declares dead where it stood; a version vector never falls, so that no cell is forgotten
     truth       no scan calls a cell free or occupied that is not (without noise)
-    union       what is forwarded of a log is what its robot sent, and nobody holds more of it than that;
-                so that what robots hold by their version vectors is the union of these prefixes
-    sight       nothing is delivered through walls that the radio minds
-    finish      who says that it has finished can reach no frontier by what it holds (without noise)
+    union       what is forwarded of a log is what its robot sent, and no participant holds more of it than
+                that; so that what robots hold by their version vectors is the union of these prefixes
+    sight       nothing is delivered through walls that block the radio
+    finish      a robot that reports that it has finished can reach no frontier by what it holds (without noise)
     """
 
-    def __init__(self, map_tracker: MapTracker, complain: Complain) -> None:
-        """survey: may be shared with other referees of the same run."""
+    def __init__(self, map_tracker: MapTracker, report: Report) -> None:
+        """map_tracker: may be shared with other observers of the same run."""
         self._map_tracker = map_tracker
-        self._complain = complain
+        self._report = report
 
     def open(self, opening: Opening) -> None:
         """Begin with the first record."""
@@ -70,30 +69,30 @@ class MapChecker:
         self._exact = opening.scenario.sensor.noise_m == 0.0
         self._names = opening.scenario.roster
         self._poses_m = dict(zip(self._names, self._map_tracker.poses_m, strict=False))
-        self._radio = opening.scenario.radio
         self._senders_m = dict(self._poses_m)
         supervisor = opening.scenario.supervisor
         if supervisor.pose_m is not None:
             self._senders_m[SUPERVISOR] = supervisor.pose_m
-        self._faults = LinkFaults(opening.scenario, opening.seed)
+        self._places = {name: place for place, name in enumerate(self._names)}
+        self._links = Links(opening.scenario, opening.seed)
+        self._sight = Sight(opening.scenario.radio, *self._map_tracker.ground)
         self._finished: set[ParticipantId] = set()
         for name in self._poses_m:
             if not self._is_free(name):
-                self._complain("wall", name, "starts where it is not free")
+                self._report("wall", name, "starts where it is not free")
 
-    def befall(self, incident: ProcessEvent) -> None:
-        """Follow what befell a process."""
+    def follow_event(self, incident: ProcessEvent) -> None:
+        """Follow an event of a process."""
         self._map_tracker.observe(incident)
 
     def check(self, batch: Batch) -> int:
-        """Follow one batch; how many faults went without a complaint, since there are too many."""
-        if self._radio.line_of_sight or self._radio.wall_loss_m > 0.0:
-            for decision in batch.decisions:
-                self._check_sight(batch.now_ns, decision)
+        """Follow one batch; the number of violations beyond those that are kept as texts."""
+        if self._sight.counts:
+            self._check_sight(batch)
         self._map_tracker.observe(batch)
-        faults, count = self._map_tracker.faults
-        for fault, row, _, a, b in faults.tolist():
-            self._put_into_words(batch, fault, row, a, b)
+        noted, count = self._map_tracker.violations
+        for kind, row, _, a, b in noted.tolist():
+            self._describe(batch, kind, row, a, b)
         for step_record in batch.step_records:
             if (
                 step_record.verdict is not None
@@ -102,30 +101,30 @@ class MapChecker:
             ):
                 self._check_way(step_record)
                 self._check_finish(step_record)
-        return count - len(faults)
+        return count - len(noted)
 
-    def _put_into_words(self, batch: Batch, fault: int, row: int, a: int, b: int) -> None:
-        rule, text = _WORDS[fault]
-        origin = self._names[a % len(self._names)] if fault == FOREIGN else ""
-        kind = "occupied" if b else "free"
-        self._complain(
-            rule, batch.step_records[row].name, text.format(a=a, b=b, origin=origin, kind=kind)
+    def _describe(self, batch: Batch, kind: int, row: int, a: int, b: int) -> None:
+        rule, text = _TEXTS[kind]
+        origin = self._names[a % len(self._names)] if kind == FOREIGN else ""
+        seen = "occupied" if b else "free"
+        self._report(
+            rule, batch.step_records[row].name, text.format(a=a, b=b, origin=origin, kind=seen)
         )
 
-    def _check_sight(self, now_ns: int, decision: DeliveryDecision) -> None:
-        """From where both were before anybody moved; range alone is a rule of every run."""
-        if decision.due_ns == DROPPED:
-            return
-        here, there = (self._senders_m.get(name) for name in (decision.source, decision.target))
-        if here is None or there is None:
-            return
-        frame, cells = self._map_tracker.ground
-        walls = walls_between(cells, *frame.uv(*here), *frame.uv(*there))
-        range_m = self._faults.reach_m(now_ns, decision.source, decision.target)
-        hidden = self._radio.line_of_sight and walls > 0
-        if hidden or not math.dist(here, there) <= range_m - walls * self._radio.wall_loss_m:
-            heard = f"{decision.source}#{decision.sequence}"
-            self._complain("sight", decision.target, f"hears {heard} through {walls} walls")
+    def _check_sight(self, batch: Batch) -> None:
+        """By the poses before the batch moves them. Range alone is a rule of every run."""
+        self._links.move_to(batch.now_ns)
+        range_m = self._links.table.range_m
+        for decision in batch.decisions:
+            here_m = self._senders_m.get(decision.source)
+            there_m = self._senders_m.get(decision.target)
+            if decision.due_ns == DROPPED or here_m is None or there_m is None:
+                continue
+            walls = self._sight.walls(here_m, there_m)
+            ends = self._places[decision.source], self._places[decision.target]
+            if not self._sight.reaches(here_m, there_m, float(range_m[ends]), walls):
+                heard = f"{decision.source}#{decision.sequence}"
+                self._report("sight", decision.target, f"hears {heard} through {walls} walls")
 
     def _check_way(self, step_record: StepRecord) -> None:
         assert step_record.verdict is not None
@@ -138,11 +137,11 @@ class MapChecker:
         self._poses_m[step_record.name] = self._senders_m[step_record.name] = now
         frame, cells = self._map_tracker.ground
         if not self._is_free(step_record.name):
-            self._complain(
+            self._report(
                 "wall", step_record.name, f"stands at {now[0]:.6g}, {now[1]:.6g} m in a wall"
             )
         elif free_way(cells, FREE, *frame.uv(*before), *frame.uv(*now)) < 1.0:
-            self._complain(
+            self._report(
                 "wall", step_record.name, f"went to {now[0]:.6g}, {now[1]:.6g} m through a wall"
             )
 
@@ -158,4 +157,4 @@ class MapChecker:
         self._finished.add(step_record.name)
         cell = self._map_tracker.reachable(step_record.name) if self._exact else NEVER
         if cell != NEVER:
-            self._complain("finish", step_record.name, f"could go to the frontier in cell {cell}")
+            self._report("finish", step_record.name, f"could go to the frontier in cell {cell}")

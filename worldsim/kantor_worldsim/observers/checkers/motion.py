@@ -1,4 +1,4 @@
-"""Rules on steps: who may step, what the world made of it, and how fast a robot moves."""
+"""Rules on steps: which participant may step, what world-sim accepts of it, and how fast a robot moves."""
 
 import math
 
@@ -6,36 +6,38 @@ from kantor_protocol.base.kernels import kernel
 from kantor_worldsim.observers.checkers.state import (
     FORGED_FIRST,
     MOVED_NS,
-    NOT,
-    REFUSALS,
+    NOT_STOPPED,
     REFUSALS_SO_FAR,
-    REFUSED,
-    SKEW,
     SKEW_BEFORE_NS,
-    SPEED,
-    STALE,
-    STEP,
     STEPS,
-    STOPPED,
     STOPPED_NS,
     CheckerState,
     Limits,
     note_violation,
 )
+from kantor_worldsim.observers.checkers.violations import (
+    REFUSALS,
+    REFUSED,
+    SKEW,
+    SPEED,
+    STALE,
+    STEP,
+    STOPPED,
+)
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch
-from kantor_worldsim.world.world import SPEED_TOLERANCE
+
+_ROUNDING = 2e-6
+"""By so much of the limit a move may be longer, for rounding."""
 
 
 @kernel
-def check_incarnation(
-    state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int
-) -> None:
-    """Whether it can act at all, and by what clock."""
+def check_running(state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int) -> None:
+    """Only a participant that runs acts, and its clock is wrong only by a fault."""
     step_record = columns.step_records[row]
-    stopped_ns = state.book[step_record[of.PLACE], STOPPED_NS]
-    if stopped_ns != NOT and (
-        limits.virtual or step_record[of.NOW_NS] > stopped_ns + limits.patience_ns
+    stopped_ns = state.participants[step_record[of.PLACE], STOPPED_NS]
+    if stopped_ns != NOT_STOPPED and (
+        limits.virtual or step_record[of.NOW_NS] > stopped_ns + limits.signal_slack_ns
     ):
         note_violation(state, STOPPED, row, 0, 0, 0, stopped_ns * 1e-9, 0.0)
     if step_record[of.SKEW_NS] != 0 and not limits.clocks:
@@ -44,11 +46,11 @@ def check_incarnation(
 
 @kernel
 def check_verdict(state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int) -> None:
-    """Who is too fast since its clock has gained on time cannot know, and is not to blame."""
+    """World-sim refuses nothing, but the speed of a robot whose clock has gained on time since its last step."""
     step_record = columns.step_records[row]
-    book = state.book[step_record[of.PLACE]]
-    excused = limits.clocks and step_record[of.SKEW_NS] > book[SKEW_BEFORE_NS]
-    book[SKEW_BEFORE_NS] = step_record[of.SKEW_NS]
+    participant = state.participants[step_record[of.PLACE]]
+    excused = limits.clocks and step_record[of.SKEW_NS] > participant[SKEW_BEFORE_NS]
+    participant[SKEW_BEFORE_NS] = step_record[of.SKEW_NS]
     for item in range(step_record[of.VIOLATIONS]):
         if not (excused and item + 1 == step_record[of.TOO_FAST]):
             note_violation(state, REFUSED, row, item, 0, 0, 0.0, 0.0)
@@ -58,28 +60,28 @@ def check_verdict(state: CheckerState, limits: Limits, columns: ColumnarBatch, r
 def check_order(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
     """Steps are numbered without gaps, and made with the newest observation."""
     step_record = columns.step_records[row]
-    book = state.book[step_record[of.PLACE]]
-    if step_record[of.STEP] != book[STEPS] + 1:
-        note_violation(state, STEP, row, 0, step_record[of.STEP], book[STEPS] + 1, 0.0, 0.0)
-    elif step_record[of.OBSERVED] != book[STEPS]:
+    participant = state.participants[step_record[of.PLACE]]
+    if step_record[of.STEP] != participant[STEPS] + 1:
+        note_violation(state, STEP, row, 0, step_record[of.STEP], participant[STEPS] + 1, 0.0, 0.0)
+    elif step_record[of.OBSERVED] != participant[STEPS]:
         note_violation(
             state, STALE, row, 0, step_record[of.STEP], step_record[of.OBSERVED], 0.0, 0.0
         )
-    book[STEPS] = step_record[of.STEP]
+    participant[STEPS] = step_record[of.STEP]
 
 
 @kernel
 def check_refusals(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
-    """It refuses what is forged, and nothing else."""
+    """A participant refuses what is forged, and nothing else."""
     step_record = columns.step_records[row]
-    book = state.book[step_record[of.PLACE]]
+    participant = state.participants[step_record[of.PLACE]]
     forged = 0
     for item in range(step_record[of.HEARD], step_record[of.HEARD] + step_record[of.HEARD_COUNT]):
         forged += columns.heard[item, of.SEQUENCE] >= FORGED_FIRST
-    refused = step_record[of.REFUSED] - book[REFUSALS_SO_FAR]
+    refused = step_record[of.REFUSED] - participant[REFUSALS_SO_FAR]
     if refused != forged:
         note_violation(state, REFUSALS, row, 0, refused, forged, 0.0, 0.0)
-    book[REFUSALS_SO_FAR] = step_record[of.REFUSED]
+    participant[REFUSALS_SO_FAR] = step_record[of.REFUSED]
 
 
 @kernel
@@ -87,12 +89,12 @@ def check_speed(state: CheckerState, limits: Limits, columns: ColumnarBatch, row
     """A participant moves no farther than its speed allows since its last step."""
     step_record = columns.step_records[row]
     who = step_record[of.PLACE]
-    elapsed_ns = step_record[of.NOW_NS] - state.book[who, MOVED_NS]
+    elapsed_ns = step_record[of.NOW_NS] - state.participants[who, MOVED_NS]
     limit_m_s = 0.0 if who == limits.supervisor else limits.speed_m_s
-    limit_m = limit_m_s * elapsed_ns * 1e-9 * (1.0 + 2.0 * SPEED_TOLERANCE)
+    limit_m = limit_m_s * elapsed_ns * 1e-9 * (1.0 + _ROUNDING)
     x_m, y_m = columns.poses_m[row, 0], columns.poses_m[row, 1]
     way_m = math.hypot(x_m - state.poses_m[who, 0], y_m - state.poses_m[who, 1])
     if not way_m <= limit_m:
         note_violation(state, SPEED, row, 0, 0, 0, way_m, limit_m)
-    state.book[who, MOVED_NS] = step_record[of.NOW_NS]
+    state.participants[who, MOVED_NS] = step_record[of.NOW_NS]
     state.poses_m[who, 0], state.poses_m[who, 1] = x_m, y_m

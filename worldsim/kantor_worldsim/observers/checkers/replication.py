@@ -1,22 +1,24 @@
-"""Rules on knowledge: what a message says, its sender has written or heard."""
+"""Rules on replication: a message holds entries of logs as their origins wrote them."""
 
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.varint import read_int, read_uint
-from kantor_protocol.replication.replica_kernels import LENGTH_MAX
 from kantor_worldsim.observers.checkers.state import (
     ENTRIES,
-    EPOCH,
-    FOREIGN_LOG,
-    FORGETS,
-    LOG,
-    NOBODYS,
-    SLOT,
-    TOLD,
-    UNREADABLE,
+    INCARNATION_ID,
+    VECTOR_SENT,
     CheckerState,
     Limits,
     note_violation,
 )
+from kantor_worldsim.observers.checkers.violations import (
+    FOREIGN_LOG,
+    FORGETS,
+    LOG,
+    NO_INCARNATION,
+    OTHER_INCARNATION,
+    UNREADABLE,
+)
+from kantor_worldsim.observers.metrics.gossip_reader import ANY_ORIGIN, count_incarnations, is_log
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch
 
@@ -25,89 +27,71 @@ from kantor_worldsim.record.columnar import ColumnarBatch
 def check_gossip(
     state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int, item: int
 ) -> None:
-    """Entries that a participant sends are the ones that their origin consumed, one for one."""
-    who, participants = columns.step_records[row, of.PLACE], state.book.shape[0]
+    """A message names its sender's incarnation, and its entries are those of their origins, one for one."""
+    who, roster = columns.step_records[row, of.PLACE], state.participants.shape[0]
     sent = columns.sent[columns.step_records[row, of.SENT] + item]
     payload = columns.payload
-    incarnation, version_vector, have_end, at, end = of.parts_of_gossip(
+    incarnation, version_vector, vector_end, logs, end = of.parts_of_gossip(
         payload, sent[of.BODY], sent[of.BODY_END]
     )
-    if end >= 0 and incarnation != state.book[who, SLOT] // participants:
-        now = state.book[who, SLOT] // participants
-        note_violation(state, EPOCH, row, item, incarnation, now, 0.0, 0.0)
+    current = state.participants[who, INCARNATION_ID] // roster
+    if end >= 0 and incarnation != current:
+        note_violation(state, OTHER_INCARNATION, row, item, incarnation, current, 0.0, 0.0)
     if not limits.ledger:
         return
-    slots = (
-        count_incarnations(payload, version_vector, have_end, participants, limits.claims)
-        if end >= 0
-        else 0
-    )
-    if slots == 0 or not is_log(payload, at, end):
+    ids = 0
+    if end >= 0:
+        parts = 2 if limits.claims else 1
+        ids = count_incarnations(payload, version_vector, vector_end, roster, parts)
+    if ids == 0 or not is_log(payload, logs, end, 2, ANY_ORIGIN):
         note_violation(state, UNREADABLE, row, item, 0, 0, 0.0, 0.0)
         return
-    check_version_vector(state, payload, version_vector, slots, who, row)
-    while at < end:
-        origin, at = read_uint(payload, at)
-        start, at = read_uint(payload, at)
-        _span, at = read_uint(payload, at)
-        count, at = read_uint(payload, at)
-        made = state.shipped[origin, ENTRIES] if origin < state.shipped.shape[0] else 0
-        sample = 0
-        for told in range(start, start + count):
-            step, at = read_int(payload, at)
-            units, at = read_uint(payload, at)
-            sample += step
-            if not (
-                told < made
-                and state.logs[origin, told, 0] == sample
-                and state.logs[origin, told, 1] == units
-            ):
-                own = origin == state.book[who, SLOT]
-                note_violation(state, LOG if own else FOREIGN_LOG, row, origin, start, 0, 0.0, 0.0)
-                return
+    check_version_vector(state, payload, version_vector, ids, who, row)
+    while logs < end:
+        logs = check_suffix(state, payload, logs, who, row)
+        if logs < 0:
+            return
 
 
 @kernel
-def count_incarnations(payload: bytes, at: int, end: int, participants: int, claims: bool) -> int:
-    """How many origins the version vector in payload[at:end] is about; 0 if it is none."""
-    numbers = 0
-    while 0 <= at < end:
-        _value, at = read_uint(payload, at)
-        numbers += 1
-    width = (2 if claims else 1) * participants
-    return participants * (numbers // width) if at == end and numbers % width == 0 else 0
+def check_suffix(state: CheckerState, payload: bytes, at: int, who: int, row: int) -> int:
+    """One suffix of a log; the position after it, or less than 0 for a violation."""
+    origin, at = read_uint(payload, at)
+    start, at = read_uint(payload, at)
+    _span, at = read_uint(payload, at)
+    count, at = read_uint(payload, at)
+    written = state.shipped[origin, ENTRIES] if origin < state.shipped.shape[0] else 0
+    sample = 0
+    for position in range(start, start + count):
+        step, at = read_int(payload, at)
+        units, at = read_uint(payload, at)
+        sample += step
+        if not (
+            position < written
+            and state.logs[origin, position, 0] == sample
+            and state.logs[origin, position, 1] == units
+        ):
+            own = origin == state.participants[who, INCARNATION_ID]
+            note_violation(state, LOG if own else FOREIGN_LOG, row, origin, start, 0, 0.0, 0.0)
+            return -1
+    return at
 
 
 @kernel
 def check_version_vector(
-    state: CheckerState, payload: bytes, at: int, slots: int, who: int, row: int
+    state: CheckerState, payload: bytes, at: int, ids: int, who: int, row: int
 ) -> None:
-    """A version vector does not fall, and is about origins that were there."""
+    """A version vector of so many incarnation ids does not fall, and is about incarnations that were there."""
     version_vector = state.version_vector[who]
-    state.book[who, TOLD] = 1
-    for origin in range(max(slots, version_vector.shape[0])):
+    state.participants[who, VECTOR_SENT] = 1
+    for origin in range(max(ids, version_vector.shape[0])):
         length = 0
-        if origin < slots:
+        if origin < ids:
             length, at = read_uint(payload, at)
         if origin >= version_vector.shape[0]:
             if length > 0:
-                note_violation(state, NOBODYS, row, origin, 0, 0, 0.0, 0.0)
+                note_violation(state, NO_INCARNATION, row, origin, 0, 0, 0.0, 0.0)
             continue
         if length < version_vector[origin]:
             note_violation(state, FORGETS, row, origin, length, version_vector[origin], 0.0, 0.0)
         version_vector[origin] = length
-
-
-@kernel
-def is_log(payload: bytes, at: int, end: int) -> bool:
-    """Whether payload[at:end] is a row of suffixes, see News.logs."""
-    while 0 <= at < end:
-        _origin, at = read_uint(payload, at)
-        start, at = read_uint(payload, at)
-        _span, at = read_uint(payload, at)
-        count, at = read_uint(payload, at)
-        if at < 0 or start > LENGTH_MAX or count > end - at:
-            return False
-        for _ in range(2 * count):
-            _value, at = read_uint(payload, at)
-    return at == end

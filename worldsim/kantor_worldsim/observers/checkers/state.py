@@ -1,135 +1,58 @@
-"""The state of the checkers, and how a violation is noted and put into words."""
+"""The state of the checkers: arrays that one compiled pass over a batch reads and changes."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.kernels import kernel
+from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.observers.checkers.links import LinkTable
+from kantor_worldsim.observers.checkers.violations import VIOLATIONS_MAX
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch
+from kantor_worldsim.record.records import Opening
 
-VIOLATIONS_MAX = 100
-"""A broken record is broken; further complaints only count."""
+DROPPED = -1
+"""Instead of the time at which a copy arrives: the radio has lost it."""
 
+FORGED_FIRST = 1 << 62
+"""Forged envelopes are numbered from there on."""
 
-# Faults that kernels find.
-UNHEARD, NEVER_SENT, FOR_ANOTHER, TOO_FAR = 0, 1, 2, 3
+NOT_STOPPED = -1
 
+# Columns of CheckerState.participants.
+STEPS, INCARNATION_ID, MOVED_NS, POINTS, ASKED, POSTED, UNDER_WAY, VECTOR_SENT = range(8)
+SEQUENCE, DIFFERING, _COMING, KEYFRAME, STOPPED_NS = 8, 9, 10, 13, 14
+REFUSALS_SO_FAR, NUMBER, SKEW_BEFORE_NS = 15, 16, 17
+_PARTICIPANT_COLUMNS = 18
 
-STEP, SPEED, GARBLED_SPENT, POINT, BUDGET, MISCOUNT = 4, 5, 6, 7, 8, 9
+# Columns of CheckerState.shipped.
+ENTRIES, WRITES = 0, 1
 
+# Slots of CheckerState.counts.
+NOTED, KEYFRAMES, FORGED = 0, 1, 2
 
-GARBLED_LOWERED, RISE, BELOW, UNREADABLE, LOG = 10, 11, 12, 13, 14
+_NO_LOGS, _NO_POSTED, _NO_DELIVERIES, _NO_FORGED = -1, -2, -3, -4
 
-
-STRANGER, REFUSED, NOT_REBUILT, NOT_ITS_OWN, NO_SAMPLE, NO_WEIGHT = 15, 16, 17, 18, 19, 20
-
-
-WITHHELD, OUT_OF_TURN, AGAIN, STOPPED, STALE, REFUSALS = 21, 22, 23, 24, 25, 26
-
-
-EPOCH, FOREIGN_LOG, FORGETS, NOBODYS, SKEW, CUT = 27, 28, 29, 30, 31, 32
-
-
-OF_DECISIONS = (NEVER_SENT, FOR_ANOTHER, TOO_FAR, CUT)
-
-
-_NO_LOGS, _NO_POSTED, _NO_FLIGHTS, _NO_FORGED = -1, -2, -3, -4
-
-
-GROWING = {
+_GROWING = {
     _NO_LOGS: "logs",
     _NO_POSTED: "posted",
-    _NO_FLIGHTS: "flights",
+    _NO_DELIVERIES: "deliveries",
     _NO_FORGED: "forged",
 }
 
 
-WORDS = {
-    UNHEARD: ("delivery", "heard {what}, which was not delivered"),
-    NEVER_SENT: ("delivery", "{what} was never sent"),
-    FOR_ANOTHER: ("delivery", "delivered what was for somebody else"),
-    TOO_FAR: ("range", "{what} over {x:.6g} m, allowed {y:.6g} m"),
-    CUT: ("cut", "{what} over a link that is cut"),
-    STEP: ("order", "step {a}, expected {b}"),
-    SPEED: ("speed", "moved {x:.6g} m, allowed {y:.6g} m"),
-    GARBLED_SPENT: ("energy", "spending that does not decode"),
-    POINT: ("energy", "{a} units in one point"),
-    BUDGET: ("energy", "{a} points shipped"),
-    MISCOUNT: ("energy", "counts {a} of {b} points"),
-    GARBLED_LOWERED: ("weights", "entries that do not decode"),
-    RISE: ("weights", "sample {item} from {a} to {b} units"),
-    BELOW: ("credit", "its view of sample {item} is below the truth"),
-    UNREADABLE: ("ledger", "sends what nobody can read{what}"),
-    LOG: ("ledger", "its log from {a} on is not what it consumed"),
-    STRANGER: ("order", "not in the roster"),
-    REFUSED: ("ruling", "the world refused its {what}"),
-    NOT_REBUILT: ("weights", "publishes a vector that cannot be rebuilt"),
-    NOT_ITS_OWN: ("weights", "publishes a vector that is not its own"),
-    NO_SAMPLE: ("goal", "{what} is no sample"),
-    NO_WEIGHT: ("goal", "{what} has no weight left in its view"),
-    WITHHELD: ("delivery", "did not hear {what}, which had arrived"),
-    OUT_OF_TURN: ("delivery", "heard {what} after what arrived later"),
-    AGAIN: ("delivery", "sends under number {a}, which it has used"),
-    STOPPED: ("dead", "acts, and is stopped since {x:.3f} s"),
-    STALE: ("hold", "makes step {a} and has seen what became of step {b}"),
-    REFUSALS: ("refusal", "refused {a} messages; {b} were forged"),
-    EPOCH: ("epoch", "speaks as incarnation {a} and is {b}"),
-    FOREIGN_LOG: ("ledger", "forwards an entry at {a} of {what}'s log that it never made"),
-    FORGETS: ("ledger", "holds {a} entries of {what}'s log of which it held {b}"),
-    NOBODYS: ("ledger", "holds entries of {what}, who was never there"),
-    SKEW: ("clock", "its clock is {a} ns ahead, which no fault says"),
-}
-"""Rule and text of each fault."""
-
-
-# Columns of State.book.
-STEPS, SLOT, MOVED_NS, POINTS, OPEN, POSTED, FLYING, TOLD = 0, 1, 2, 3, 4, 5, 6, 7
-
-
-SEQUENCE, DIFFERING, _COMING, KEYFRAME, STOPPED_NS = 8, 9, 10, 13, 14
-
-
-REFUSALS_SO_FAR, NUMBER, SKEW_BEFORE_NS = 15, 16, 17
-
-
-BOOK_COLUMNS = 18
-
-
-# Columns of State.shipped.
-ENTRIES, WRITES = 0, 1
-
-
-# Slots of State.found.
-FAULTS, KEYFRAMES, FORGED = 0, 1, 2
-
-
-FORGED_FIRST = 1 << 62
-"""What is forged has numbers from there on."""
-
-
-NOT = -1
-"""In the book: not stopped."""
-
-
-STOPS = {"kill": "start", "pause": "resume", "fill": "free", "leave": "join"}
-"""What stops a process, and what has it go on."""
-
-
-STARTS = ("start", "join")
-
-
 class CheckerState(NamedTuple):
-    """What the kernels keep of the run so far. n participants, N samples."""
+    """The run so far, for the kernels. n participants, N samples; ids: incarnation ids, see `incarnations.py`."""
 
-    book: npt.NDArray[np.int64]
-    """(n, 18): last step; origin slot; time of the last move; points shipped by all its incarnations;
-    whether it has a turn that it has not answered; rows used of posted and flights; whether this
-    incarnation has sent a version vector; sequence of what it published last, entries in which that
-    differs from its view; rows that this batch brings to logs, posted and flights; 1 + the act with which
-    it publishes a keyframe in this batch; since when it is stopped, or _NOT; messages it has refused;
-    the highest number of what it has sent; how far its clock was ahead in its last step."""
+    participants: npt.NDArray[np.int64]
+    """(n, 18): last step; incarnation id; time of the last move; points shipped by all its incarnations;
+    whether it was asked for a step and has not answered; rows used of posted and deliveries; whether this
+    incarnation has sent a version vector; sequence of its last publication, entries in which that
+    differs from its view; rows that this batch brings to logs, posted and deliveries; 1 + the step record
+    with which it publishes a keyframe in this batch; since when it is stopped, or NOT_STOPPED; messages it
+    has refused; the highest number of an envelope it has sent; how far its clock was ahead in its last step."""
     poses_m: npt.NDArray[np.float64]
     """(n, 2) world frame."""
     views: npt.NDArray[np.int64]
@@ -139,89 +62,162 @@ class CheckerState(NamedTuple):
     consumed: npt.NDArray[np.int64]
     """(N,) units shipped by all."""
     shipped: npt.NDArray[np.int64]
-    """(slots, 2): entries of each log, points shipped. Incarnation e of participant i has slot e n + i."""
+    """(ids, 2): entries of each log, points shipped."""
     logs: npt.NDArray[np.int64]
-    """(slots, rows, 2): sample, units; what each has consumed."""
+    """(ids, rows, 2): sample and units of each entry that an incarnation has consumed."""
     posted: npt.NDArray[np.int64]
-    """(n, rows, 2): sequence, target of what each has sent."""
-    flights: npt.NDArray[np.int64]
-    """(n, rows, 4): source, sequence, due_ns of what is on its way to each; whether it was handed over with
-    the turn that is open."""
+    """(n, rows, 2): sequence and target of each envelope that a participant has sent."""
+    deliveries: npt.NDArray[np.int64]
+    """(n, rows, 4): source, sequence, due_ns of each delivery under way to a participant; whether it was
+    handed over with the step request that is open."""
     forged: npt.NDArray[np.int64]
-    """(1, rows, 3): source, sequence, target of what faults have put on the air."""
+    """(1, rows, 3): source, sequence, target of the envelopes that faults have put on the air."""
     version_vector: npt.NDArray[np.int64]
-    """(n, slots) log lengths that each said last it holds."""
-    faults: npt.NDArray[np.int64]
-    """(rows, 5): fault, act or verdict, item of it, two numbers."""
+    """(n, ids) the log lengths in the last message of each."""
+    violations: npt.NDArray[np.int64]
+    """(rows, 5): kind of the violation, step record or delivery decision, item of it, two numbers."""
     lengths_m: npt.NDArray[np.float64]
-    """(rows, 2): lengths of the fault."""
-    found: npt.NDArray[np.int64]
-    """(3,) how many faults and how many keyframes this batch has; rows used of forged."""
+    """(rows, 2): two lengths for the text of the violation."""
+    counts: npt.NDArray[np.int64]
+    """(3,): violations and keyframes in this batch; rows used of forged."""
     samples_m: npt.NDArray[np.float64]
     """(N, 2) at the start."""
     by_x: npt.NDArray[np.int64]
     """(N,) samples in the order of their x."""
 
+    @classmethod
+    def of(cls, opening: Opening) -> "CheckerState":
+        """The state at the start of a run. Raises RefusedError."""
+        scenario, site = opening.scenario, opening.site
+        count, samples = len(scenario.roster), site.samples_m.shape[0]
+        poses_m = np.zeros((count, 2))
+        poses_m[-1] = scenario.supervisor_m
+        poses_m[: scenario.robots.count] = site.starts_m
+        participants = np.zeros((count, _PARTICIPANT_COLUMNS), dtype=np.int64)
+        participants[:, INCARNATION_ID] = np.arange(count)
+        participants[:, STOPPED_NS] = NOT_STOPPED
+        return cls(
+            participants,
+            poses_m,
+            views=np.full((count, samples), opening.units.sample, dtype=np.int64),
+            published=np.zeros((count, samples), dtype=np.int64),
+            consumed=np.zeros(samples, dtype=np.int64),
+            shipped=np.zeros((count, 2), dtype=np.int64),
+            logs=np.zeros((count, 256, 2), dtype=np.int64),
+            posted=np.zeros((count, 256, 2), dtype=np.int64),
+            deliveries=np.zeros((count, 64, 4), dtype=np.int64),
+            forged=np.zeros((1, 64, 3), dtype=np.int64),
+            version_vector=np.zeros((count, count), dtype=np.int64),
+            violations=np.zeros((VIOLATIONS_MAX, 5), dtype=np.int64),
+            lengths_m=np.zeros((VIOLATIONS_MAX, 2)),
+            counts=np.zeros(3, dtype=np.int64),
+            samples_m=site.samples_m.copy(),
+            by_x=np.argsort(site.samples_m[:, 0]),
+        )
+
+    def with_incarnations(self, more: int) -> "CheckerState":
+        """The same with room for so many more incarnation ids."""
+        return self._replace(
+            shipped=np.pad(self.shipped, ((0, more), (0, 0))),
+            logs=np.pad(self.logs, ((0, more), (0, 0), (0, 0))),
+            version_vector=np.pad(self.version_vector, ((0, 0), (0, more))),
+        )
+
+    def lengthened(self, missing: int) -> "CheckerState":
+        """The same with twice the room where `missing_capacity` found too little."""
+        name = _GROWING[missing]
+        rows = getattr(self, name)
+        return self._replace(**{name: np.concatenate((rows, np.zeros_like(rows)), axis=1)})
+
 
 class Limits(NamedTuple):
-    """What the scenario allows."""
+    """What the scenario allows, for the kernels."""
 
     sample_units: int
     point_units: int
     budget: int
     ledger: bool
     supervisor: int
-    """Its place, or a place that nobody has."""
+    """Its place in the roster, or one beyond the roster if there is none."""
     speed_m_s: float
-    range_m: float
-    supervisor_range_m: float
     transport: bool
     """Every goal is a sample that has weight."""
     claims: bool
     """Version vectors have a second half, of claims."""
     virtual: bool
-    """Who steps has heard all that had arrived."""
+    """A participant that steps has heard all that had arrived."""
     clocks: bool
-    """There are faults of clocks."""
-    patience_ns: int
-    """How much later than it was stopped somebody may have acted: signals take a while."""
+    """There are clock faults."""
+    signal_slack_ns: int
+    """In real time: how much later than the event that stops a process its last step may be, since signals
+    take a while."""
+
+    @classmethod
+    def of(cls, opening: Opening, *, virtual: bool, clocks: bool) -> "Limits":
+        """Those of a run."""
+        scenario, units = opening.scenario, opening.units
+        return cls(
+            sample_units=units.sample,
+            point_units=units.point,
+            budget=scenario.steps_per_robot,
+            ledger=has_ledger(scenario),
+            supervisor=scenario.robots.count,
+            speed_m_s=scenario.vehicle.speed_m_s,
+            transport=scenario.planner.name == "transport" and scenario.samples.diffusion_m == 0.0,
+            claims=scenario.claiming,
+            virtual=virtual,
+            clocks=clocks,
+            signal_slack_ns=scenario.period_ns,
+        )
+
+
+def has_ledger(scenario: Scenario) -> bool:
+    """Whether spending is replicated entry by entry."""
+    return scenario.merge == "ledger" and not scenario.mapping
+
+
+def arguments(state: CheckerState, limits: Limits, links: LinkTable) -> tuple[Any, ...]:
+    """What the compiled pass takes behind a batch: a NamedTuple of arrays is dear at the border to Python."""
+    return (*state, *limits, *links)
 
 
 @kernel
 def note_violation(
-    state: CheckerState, fault: int, row: int, item: int, a: int, b: int, x_m: float, y_m: float
+    state: CheckerState, kind: int, row: int, item: int, a: int, b: int, x_m: float, y_m: float
 ) -> None:
     """Note a violation as numbers; it is put into words with the record at hand."""
-    at = state.found[FAULTS]
-    state.found[FAULTS] += 1
-    if at < state.faults.shape[0]:
-        noted = state.faults[at]
-        noted[0], noted[1], noted[2], noted[3], noted[4] = fault, row, item, a, b
+    at = state.counts[NOTED]
+    state.counts[NOTED] += 1
+    if at < state.violations.shape[0]:
+        noted = state.violations[at]
+        noted[0], noted[1], noted[2], noted[3], noted[4] = kind, row, item, a, b
         state.lengths_m[at, 0], state.lengths_m[at, 1] = x_m, y_m
 
 
 @kernel
 def missing_capacity(state: CheckerState, columns: ColumnarBatch) -> int:
-    """Which array has no room for this batch behind what is held of somebody, or 0."""
-    book = state.book
-    book[:, _COMING : KEYFRAME + 1] = 0
+    """Which array has no room for this batch behind the rows it holds, or 0."""
+    participants = state.participants
+    participants[:, _COMING : KEYFRAME + 1] = 0
     for row in range(columns.sizes[of.ACTS]):
         step_record = columns.step_records[row]
         if step_record[of.PLACE] >= 0 and step_record[of.PRESENT]:
-            book[step_record[of.PLACE], _COMING] += max(0, step_record[of.SPENT_COUNT])
+            participants[step_record[of.PLACE], _COMING] += max(0, step_record[of.SPENT_COUNT])
     for row in range(columns.sizes[of.ALL_SENT]):
         if columns.sent[row, of.SOURCE] >= 0:
-            book[columns.sent[row, of.SOURCE], _COMING + 1] += 1
+            participants[columns.sent[row, of.SOURCE], _COMING + 1] += 1
     for row in range(columns.sizes[of.VERDICTS]):
         if columns.decisions[row, of.TARGET] >= 0:
-            book[columns.decisions[row, of.TARGET], _COMING + 2] += 1
-    if state.found[FORGED] + columns.sizes[of.INJECTED] > state.forged.shape[1]:
+            participants[columns.decisions[row, of.TARGET], _COMING + 2] += 1
+    if state.counts[FORGED] + columns.sizes[of.INJECTED] > state.forged.shape[1]:
         return _NO_FORGED
-    for who in range(book.shape[0]):
-        if state.shipped[book[who, SLOT], ENTRIES] + book[who, _COMING] > state.logs.shape[1]:
+    for who in range(participants.shape[0]):
+        participant = participants[who]
+        entries = state.shipped[participant[INCARNATION_ID], ENTRIES]
+        if entries + participant[_COMING] > state.logs.shape[1]:
             return _NO_LOGS
-        if book[who, POSTED] + book[who, _COMING + 1] > state.posted.shape[1]:
+        if participant[POSTED] + participant[_COMING + 1] > state.posted.shape[1]:
             return _NO_POSTED
-        if book[who, FLYING] + book[who, _COMING + 2] > state.flights.shape[1]:
-            return _NO_FLIGHTS
+        if participant[UNDER_WAY] + participant[_COMING + 2] > state.deliveries.shape[1]:
+            return _NO_DELIVERIES
     return 0

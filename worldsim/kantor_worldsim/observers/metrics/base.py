@@ -14,7 +14,6 @@ from kantor_protocol.scenario.faults.schedule import kind_of
 from kantor_protocol.transport.rate_limit import Excess
 from kantor_worldsim.observers.metrics.result import (
     LINK_COUNTERS,
-    PROCESS_COUNTERS,
     BytesPerRobotTick,
     FaultCounts,
     Rejoining,
@@ -38,6 +37,7 @@ from kantor_worldsim.observers.metrics.tally import (
     follow,
 )
 from kantor_worldsim.record.columnar import ColumnarDecoder
+from kantor_worldsim.record.process_events import EVENTS, TAKE_OVER, ProcessEventKind
 from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record
 
 
@@ -154,13 +154,13 @@ class RunMetrics:
 
     def _befall(self, incident: ProcessEvent) -> None:
         """Follow what befell a process."""
-        name, what = incident.who, incident.what
-        if incident.fault >= 0 and what in PROCESS_COUNTERS:
-            self._tolls[incident.fault, PROCESS_COUNTERS[what]] += 1
-        if what in {"kill", "leave"}:
+        name, what = incident.who, incident.kind
+        if incident.fault >= 0 and (counter := EVENTS[what].counter):
+            self._tolls[incident.fault, counter] += 1
+        if what in {ProcessEventKind.KILL, ProcessEventKind.LEAVE}:
             self._gone.add(name)
             self._started_ns.pop(name, None)
-        elif what in {"start", "join"}:
+        elif what in TAKE_OVER:
             self._restarts += name in self._gone
             if name in self._epochs:
                 self._take_over(incident)

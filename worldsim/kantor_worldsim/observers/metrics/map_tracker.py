@@ -1,11 +1,11 @@
-"""What the robots of a mapping run have seen, followed once for all referees.
+"""The cells that the robots of a mapping run have seen, followed once for all observers.
 
-Everything is made anew from the record: a robot's evidence is what its recorded scans say (`Evidence`),
-and what it holds of others are the prefixes of their logs that its version vectors name. What it says
-otherwise is a fault, noted here as numbers and put into words by the checker.
+Everything is derived from the record again: a robot's evidence follows from its recorded scans
+(`OccupancyLog`), and what it holds of others are the prefixes of their logs that its version vectors name.
+Messages that say otherwise are violations, noted here as numbers and put into words by the checker.
 
 Only cells that can ever be seen count (`starts.observable`). Ticks are periods. A cell is stamped with
-the tick of the step in which somebody first took in a scan of it.
+the tick of the step in which a robot first took in a scan of it.
 """
 
 import math
@@ -19,42 +19,43 @@ from kantor_protocol.base.machine import Observation, ParticipantId, Pose
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
 from kantor_protocol.wire.messages import RefusedError
 from kantor_worldsim.observers.metrics.map_tracker_kernels import (
-    FAULTS,
-    FAULTS_MAX,
+    AS_SENT,
+    DEAD,
+    DEAD_ENTRIES,
+    DEAD_FRONTIER_CELLS,
     FRONTIERS,
     HELD_CELLS,
     LOG_BYTES,
-    MADE,
     NEVER,
+    NOTED,
     OWN,
     OWN_CELLS,
+    SCANNED,
     SEEN,
     STOOD,
-    TOLD,
-    VOID,
-    VOID_CELLS,
-    VOIDS,
+    VIOLATIONS_MAX,
     GroundTruth,
     MapTrackerState,
     find_way,
     follow,
-    look,
+    take_scan,
 )
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch, ColumnarDecoder
+from kantor_worldsim.record.process_events import TAKE_OVER
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record
 from kantor_worldsim.world.starts import observable
 from kantor_worldsim.world.world import StepVerdict
 
 
 class MapTracker:
-    """Follows the records of a mapping run. Several referees may share one; each record counts once.
+    """Follows the records of a mapping run. Several observers may share one; each record counts once.
 
-    Whoever wants to know how things stood before a record asks before anybody hands it on.
+    An observer that needs the state before a record reads it before the first of them hands the record on.
     """
 
     def __init__(self, decoder: ColumnarDecoder | None = None) -> None:
-        """reader: the one that another referee of the same run reads by."""
+        """decoder: that of another observer of the same run, to share its work."""
         self._decoder = decoder or ColumnarDecoder()
         self._record: Record | None = None
 
@@ -67,8 +68,8 @@ class MapTracker:
             self._open(record)
         elif isinstance(record, Batch):
             self._follow(record)
-        elif isinstance(record, ProcessEvent) and record.what in {"start", "join"}:
-            self._take_over(record)
+        elif isinstance(record, ProcessEvent) and record.kind in TAKE_OVER:
+            self._begin_incarnation(record)
 
     def _open(self, opening: Opening) -> None:
         self._decoder.read(opening)
@@ -79,24 +80,24 @@ class MapTracker:
         self.observable = observable(site.ground, site.starts_m)
         """(rows, columns)"""
         self.total = int(self.observable.sum())
-        """How many cells can ever be seen."""
+        """The number of cells that can ever be seen."""
         self.tick = 0
-        robots, cells, everybody = scenario.robots.count, self.frame.cells, len(scenario.roster)
+        robots, cells, count = scenario.robots.count, self.frame.cells, len(scenario.roster)
         assert entries(self.frame) < 2**31
         self.state = MapTrackerState(
             first_tick=np.full(cells, NEVER, dtype=np.int32),
             frontier=np.zeros(cells, dtype=np.bool_),
             held=np.zeros((robots, cells), dtype=np.uint8),
-            made=np.zeros((everybody, 4096), dtype=np.int32),
-            told=np.zeros((everybody, 4096), dtype=np.int32),
-            version_vector=np.zeros((everybody, everybody), dtype=np.int64),
-            folded=np.zeros((robots, everybody), dtype=np.int64),
-            written=np.zeros((everybody, 4), dtype=np.int64),
-            slots=np.arange(everybody),
+            scanned=np.zeros((count, 4096), dtype=np.int32),
+            as_sent=np.zeros((count, 4096), dtype=np.int32),
+            version_vector=np.zeros((count, count), dtype=np.int64),
+            folded=np.zeros((robots, count), dtype=np.int64),
+            written=np.zeros((count, 4), dtype=np.int64),
+            incarnation_ids=np.arange(count),
             counts=np.zeros((robots, 3), dtype=np.int64),
             stood=np.full((robots, 256), NEVER, dtype=np.int32),
-            union=np.zeros(4, dtype=np.int64),
-            faults=np.zeros((FAULTS_MAX, 5), dtype=np.int64),
+            totals=np.zeros(4, dtype=np.int64),
+            violations=np.zeros((VIOLATIONS_MAX, 5), dtype=np.int64),
         )
         self._ground = GroundTruth(
             np.ascontiguousarray(self.ground.cells),
@@ -107,12 +108,12 @@ class MapTracker:
         self.poses_m: list[tuple[float, float]] = [(x, y) for x, y in site.starts_m.tolist()]
         """Where the robots are, world frame."""
         self.ways_m = [0.0] * robots
-        """How far each has driven."""
+        """The distance that each has driven."""
         self.bumps: list[tuple[float, float]] = []
         """Where robots ended a move at a wall."""
         self._patience = scenario.planner.patience
-        self._strived: list[tuple[tuple[float, float] | None, int]] = [(None, 0)] * robots
-        """The goal of each, and for how many steps it has been that."""
+        self._pursued: list[tuple[tuple[float, float] | None, int]] = [(None, 0)] * robots
+        """The goal of each, and for how many steps it has had it."""
         self.completed_tick: int | None = None
         self.t95_tick: int | None = None
         self.t99_tick: int | None = None
@@ -123,14 +124,14 @@ class MapTracker:
         self._queue = np.zeros(cells, dtype=np.int32)
         self._scenario = scenario
         self._evidence = [self._new_evidence() for _ in range(robots)]
-        self._looked: list[tuple[int, Pose | None]] = [(NEVER, None)] * robots
+        self._scanned: list[tuple[int, Pose | None]] = [(NEVER, None)] * robots
         for place in range(robots):
             self._stand(place, self.cell_of(place))
 
     @property
     def seen(self) -> int:
-        """Cells that anybody has seen."""
-        return self.state.union.item(SEEN)
+        """Cells that any robot has seen."""
+        return self.state.totals.item(SEEN)
 
     @property
     def stamps(self) -> npt.NDArray[np.int32]:
@@ -150,14 +151,14 @@ class MapTracker:
 
     @property
     def log_bytes(self) -> int:
-        """Of logs in all that robots have sent."""
-        return self.state.union.item(LOG_BYTES)
+        """Bytes of logs in all that robots have sent."""
+        return self.state.totals.item(LOG_BYTES)
 
     @property
-    def faults(self) -> tuple[npt.NDArray[np.int64], int]:
-        """Of the last batch, as in Books, and how many there are."""
-        count = self.state.union.item(FAULTS)
-        return self.state.faults[: min(count, FAULTS_MAX)], count
+    def violations(self) -> tuple[npt.NDArray[np.int64], int]:
+        """The violations in the last batch, as in MapTrackerState, and how many there are."""
+        count = self.state.totals.item(NOTED)
+        return self.state.violations[: min(count, VIOLATIONS_MAX)], count
 
     def cell_of(self, place: int) -> int:
         """The cell in which a robot is, or NOWHERE."""
@@ -167,23 +168,21 @@ class MapTracker:
     def reachable(self, name: ParticipantId) -> int:
         """A frontier that a robot can reach by all that it holds, or NEVER.
 
-        Frontiers that it may have called none in entries that it has not sent yet do not count.
+        Frontiers that it may have declared dead in entries that it has not sent yet do not count.
         """
         place, state = self.places[name], self.state
         start = self.cell_of(place)
         if start == NOWHERE:
             return NEVER
         held = state.held[place]
-        slot = state.slots[place]
-        untold = (
-            state.version_vector[place, slot]
-            > state.written[slot, MADE] + state.written[slot, VOIDS]
-        )
+        own = state.incarnation_ids[place]
+        known = state.written[own, SCANNED] + state.written[own, DEAD_ENTRIES]
+        unsent = state.version_vector[place, own] > known
         while True:
             cell = int(find_way(held, start, self.frame.columns, self._queue))
-            if cell == NEVER or not untold or not self._is_near(place, cell):
+            if cell == NEVER or not unsent or not self._is_near(place, cell):
                 return cell
-            held[cell] |= VOID
+            held[cell] |= DEAD
 
     def _is_near(self, place: int, cell: int) -> bool:
         stood = self.state.stood[place, : self.state.counts[place, STOOD]]
@@ -191,80 +190,82 @@ class MapTracker:
         apart = np.maximum(
             abs(stood // self.frame.columns - row), abs(stood % self.frame.columns - column)
         )
-        return bool((apart <= VOID_CELLS).any())
+        return bool((apart <= DEAD_FRONTIER_CELLS).any())
 
     def _follow(self, batch: Batch) -> None:
-        self.state.union[FAULTS] = 0
+        self.state.totals[NOTED] = 0
         self.tick = batch.now_ns // self._period_ns
         columns = ColumnarBatch(*self._decoder.read(batch))
-        acted = [
+        stepped = [
             (row, self.places[step_record.name], step_record)
             for row, step_record in enumerate(batch.step_records)
             if step_record.name in self.places
             and step_record.outputs is not None
             and step_record.verdict is not None
         ]
-        for row, place, step_record in acted:
-            self._look(place, step_record.observation, row)
+        for row, place, step_record in stepped:
+            self._take_scan(place, step_record.observation, row)
         step_records = columns.step_records[: columns.sizes[of.ACTS]]
-        self._reserve("told", "written", TOLD, int(step_records[:, of.BODY_BYTES].max(initial=0)))
+        self._reserve(
+            "as_sent", "written", AS_SENT, int(step_records[:, of.BODY_BYTES].max(initial=0))
+        )
         follow(*columns, *self._arguments)
-        for _, place, step_record in acted:
+        for _, place, step_record in stepped:
             assert step_record.verdict is not None
             assert step_record.outputs is not None
             self._move(place, step_record.verdict)
-            self._strive(place, step_record.outputs.goal)
+            self._follow_goal(place, step_record.outputs.goal)
         self._note_moments()
 
     def _new_evidence(self) -> OccupancyLog:
         scenario = self._scenario
         return OccupancyLog(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
 
-    def _take_over(self, incident: ProcessEvent) -> None:
+    def _begin_incarnation(self, incident: ProcessEvent) -> None:
         """A new incarnation of a robot knows nothing, and writes a new log."""
         names = self._scenario.roster
         if incident.who not in names:
             return
         who, roster = names.index(incident.who), len(names)
-        slot = incident.incarnation * roster + who
-        if not self.state.slots[who] < slot <= INCARNATIONS_MAX * roster + who:
+        incarnation_id = incident.incarnation * roster + who
+        if not self.state.incarnation_ids[who] < incarnation_id <= INCARNATIONS_MAX * roster + who:
             return
-        while slot >= self.state.version_vector.shape[1]:
-            self._add_slots(roster)
+        while incarnation_id >= self.state.version_vector.shape[1]:
+            self._add_incarnations(roster)
         state = self.state
-        state.slots[who] = slot
+        state.incarnation_ids[who] = incarnation_id
         state.version_vector[who] = 0
         if who < state.held.shape[0]:
             state.held[who] &= OWN  # a body counts a cell once
             state.folded[who] = 0
             state.counts[who, [HELD_CELLS, STOOD]] = 0
             self._evidence[who] = self._new_evidence()
-            self._looked[who], self._strived[who] = (NEVER, None), (None, 0)
+            self._scanned[who], self._pursued[who] = (NEVER, None), (None, 0)
             self._stand(who, self.cell_of(who))
 
-    def _add_slots(self, more: int) -> None:
-        """Room for another incarnation of everybody."""
+    def _add_incarnations(self, more: int) -> None:
+        """Make room for another incarnation of every participant."""
         state = self.state
         self.state = state._replace(
-            made=np.pad(state.made, ((0, more), (0, 0))),
-            told=np.pad(state.told, ((0, more), (0, 0))),
+            scanned=np.pad(state.scanned, ((0, more), (0, 0))),
+            as_sent=np.pad(state.as_sent, ((0, more), (0, 0))),
             written=np.pad(state.written, ((0, more), (0, 0))),
             version_vector=np.pad(state.version_vector, ((0, 0), (0, more))),
             folded=np.pad(state.folded, ((0, 0), (0, more))),
         )
         self._arguments = (*self.state, *self._ground)
 
-    def _look(self, place: int, observation: Observation, row: int) -> None:
+    def _take_scan(self, place: int, observation: Observation, row: int) -> None:
         """A robot takes in each new scan once; it learns of ranges when it has moved."""
-        step, before = self._looked[place]
+        step, before = self._scanned[place]
         if observation.step <= step:
             return
         pose = observation.pose
-        self._looked[place] = observation.step, pose
-        news = self._evidence[place].observe(observation.scan, pose, moved=pose != before)
-        if news.shape[0]:
-            self._reserve("made", "written", MADE, news.shape[0])
-            look(*self._arguments, news, place, row, self.tick)
+        self._scanned[place] = observation.step, pose
+        seen = self._evidence[place].observe(observation.scan, pose, moved=pose != before)
+        if seen.shape[0]:
+            self._reserve("scanned", "written", SCANNED, seen.shape[0])
+            take_scan(*self._arguments, seen, place, row, self.tick)
 
     def _move(self, place: int, verdict: StepVerdict) -> None:
         x_m, y_m = self.poses_m[place]
@@ -276,11 +277,11 @@ class MapTracker:
             self.poses_m[place] = pose.x_m, pose.y_m
             self._stand(place, self.cell_of(place))
 
-    def _strive(self, place: int, goal: tuple[float, float] | None) -> None:
-        """A robot that has headed for the same goal for long enough may speak of it as if it stood there."""
-        before, steps = self._strived[place]
-        self._strived[place] = goal, steps + 1 if goal == before else 1
-        if goal is None or self._strived[place][1] != self._patience:
+    def _follow_goal(self, place: int, goal: tuple[float, float] | None) -> None:
+        """A robot that has headed for a goal for `patience` steps may declare it dead as if it stood there."""
+        before, steps = self._pursued[place]
+        self._pursued[place] = goal, steps + 1 if goal == before else 1
+        if goal is None or self._pursued[place][1] != self._patience:
             return
         cell = self.frame.cell_of(*goal)
         if cell != NOWHERE:
@@ -296,7 +297,7 @@ class MapTracker:
         self.state.counts[place, STOOD] += 1
 
     def _reserve(self, name: str, counted: str, column: int, more: int) -> None:
-        """Room for so many more entries in one of the arrays that grow with the run."""
+        """Make room for so many more entries in one of the arrays that grow with the run."""
         rows = getattr(self.state, name)
         needed = int(getattr(self.state, counted)[:, column].max()) + more
         if needed <= rows.shape[1]:
@@ -307,9 +308,9 @@ class MapTracker:
         self._arguments = (*self.state, *self._ground)
 
     def _note_moments(self) -> None:
-        """When the union was complete, and when nearly everything was known to somebody, to everybody."""
+        """Note the ticks at which the map was complete, and nearly all of it was known to a robot, to every robot."""
         seen, total, tick = self.seen, self.total, self.tick
-        if self.completed_tick is None and seen and not self.state.union[FRONTIERS]:
+        if self.completed_tick is None and seen and not self.state.totals[FRONTIERS]:
             self.completed_tick = tick
         if self.t95_tick is None and 100 * seen >= 95 * total:
             self.t95_tick = tick

@@ -8,78 +8,78 @@ import numpy.typing as npt
 from kantor_protocol.base.grid import FREE
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.varint import read_int, read_uint
-from kantor_protocol.replication.replica_kernels import LENGTH_MAX
+from kantor_worldsim.observers.metrics.gossip_reader import count_incarnations, is_log
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch
 
 NEVER = -1
 
 
-KIND, VOID, OWN = 3, 4, 8
-"""What Books.held says of a cell: its kind, that it is no frontier, that the robot saw it itself."""
+KIND, DEAD, OWN = 3, 4, 8
+"""Bits of MapTrackerState.held: kind of a cell, dead frontier, seen by the robot itself."""
 
 
-# Columns of Books.written and Books.counts, and slots of Books.union.
-MADE, TOLD, MATCHED, VOIDS = 0, 1, 2, 3
+# Columns of MapTrackerState.written and .counts, and incarnation_ids of .totals.
+SCANNED, AS_SENT, MATCHED, DEAD_ENTRIES = 0, 1, 2, 3
 
 
 OWN_CELLS, HELD_CELLS, STOOD = 0, 1, 2
 
 
-SEEN, FRONTIERS, LOG_BYTES, FAULTS = 0, 1, 2, 3
+SEEN, FRONTIERS, LOG_BYTES, NOTED = 0, 1, 2, 3
 
 
-# Faults in what robots send, and of what their scans say.
-UNREADABLE, NOT_ITS_SCANS, FAR_VOID, GAP, SHORT, FORGETS = 0, 1, 2, 3, 4, 5
+# Violations in what robots send, and in what their scans say.
+UNREADABLE, NOT_ITS_SCANS, FAR_FRONTIER, GAP, SHORT, FORGETS = 0, 1, 2, 3, 4, 5
 
 
 FOREIGN, MORE, FALSE_CELL = 6, 7, 8
 
 
-FAULTS_MAX = 100
+VIOLATIONS_MAX = 100
 
 
-VOID_CELLS = 2
-"""How far from a frontier that it calls none a robot may have stood, in cells along either axis."""
+DEAD_FRONTIER_CELLS = 2
+"""How far from a frontier that it declares dead a robot may have stood, in cells along either axis."""
 
 
 class MapTrackerState(NamedTuple):
-    """All that is followed, for the kernels. n robots, p participants, c cells.
+    """The state of the map tracker, for the kernels. n robots, p participants, c cells.
 
-    Incarnation e of participant i writes the log of slot e p + i.
+    ids: incarnation ids. Incarnation e of participant i writes the log of id e p + i.
     """
 
     first_tick: npt.NDArray[np.int32]
-    """(c,) when anybody first saw a cell, or NEVER."""
+    """(c,) the tick at which a robot first saw a cell, or NEVER."""
     frontier: npt.NDArray[np.bool_]
-    """(c,) seen by anybody and truly free and reachable, with a neighbour that nobody has seen."""
+    """(c,) seen and truly free and reachable, with a neighbour that no robot has seen."""
     held: npt.NDArray[np.uint8]
     """(n, c) what each robot knows, by its own scans and the logs that it holds."""
-    made: npt.NDArray[np.int32]
-    """(slots, rows) the entries that each robot's scans gave."""
-    told: npt.NDArray[np.int32]
-    """(slots, rows) its log as it sends it: the same, and frontiers that are none."""
+    scanned: npt.NDArray[np.int32]
+    """(ids, rows) the entries that each robot's scans gave."""
+    as_sent: npt.NDArray[np.int32]
+    """(ids, rows) its log as it sends it: the same, and dead frontiers."""
     version_vector: npt.NDArray[np.int64]
-    """(p, slots) the version vector that each has sent last."""
+    """(p, ids) the version vector that each has sent last."""
     folded: npt.NDArray[np.int64]
-    """(n, slots) entries of others' logs that are in `held`."""
+    """(n, ids) entries of others' logs that are in `held`."""
     written: npt.NDArray[np.int64]
-    """(slots, 4) entries made and told; of those told, such that were made, and voids."""
-    slots: npt.NDArray[np.int64]
-    """(p,) the slot of each."""
+    """(ids, 4) entries scanned and sent; of those sent, such that were scanned, and dead frontiers."""
+    incarnation_ids: npt.NDArray[np.int64]
+    """(p,) the id of each one's newest incarnation."""
     counts: npt.NDArray[np.int64]
     """(n, 3) cells seen by itself and known in all; cells in `stood`."""
     stood: npt.NDArray[np.int32]
     """(n, rows) the cells in which a robot stood, in order."""
-    union: npt.NDArray[np.int64]
-    """(4,) cells seen by anybody; how many are frontiers; bytes of logs that robots sent; faults in
-    the last batch."""
-    faults: npt.NDArray[np.int64]
-    """(rows, 5): fault, act, envelope of it, two numbers."""
+    totals: npt.NDArray[np.int64]
+    """(4,) cells seen by any robot; frontiers; bytes of logs that robots sent; violations in the last
+    batch."""
+    violations: npt.NDArray[np.int64]
+    """(rows, 5): kind of the violation, step record, envelope of it, two numbers."""
 
 
 class GroundTruth(NamedTuple):
-    """What is true, for the kernels."""
+    """The true map, for the kernels."""
 
     truth: npt.NDArray[np.uint8]
     """(rows, columns)"""
@@ -90,12 +90,12 @@ class GroundTruth(NamedTuple):
 
 
 @kernel
-def _note(state: MapTrackerState, fault: int, row: int, item: int, a: int, b: int) -> None:
-    at = state.union[FAULTS]
-    state.union[FAULTS] += 1
-    if at < state.faults.shape[0]:
-        noted = state.faults[at]
-        noted[0], noted[1], noted[2], noted[3], noted[4] = fault, row, item, a, b
+def _note(state: MapTrackerState, kind: int, row: int, item: int, a: int, b: int) -> None:
+    at = state.totals[NOTED]
+    state.totals[NOTED] += 1
+    if at < state.violations.shape[0]:
+        noted = state.violations[at]
+        noted[0], noted[1], noted[2], noted[3], noted[4] = kind, row, item, a, b
 
 
 @kernel
@@ -112,7 +112,7 @@ def is_frontier(known: np.ndarray, mask: int, cell: int, columns: int) -> bool:
 
 @kernel
 def _renew(state: MapTrackerState, ground: GroundTruth, cell: int) -> None:
-    """Whether a cell is a frontier of what anybody has seen."""
+    """Note whether a cell is a frontier of all that robots have seen."""
     rows, columns = ground.truth.shape
     first, column = state.first_tick, cell % columns
     now = False
@@ -123,16 +123,16 @@ def _renew(state: MapTrackerState, ground: GroundTruth, cell: int) -> None:
             or (cell >= columns and first[cell - columns] < 0)
             or (cell + columns < rows * columns and first[cell + columns] < 0)
         )
-    state.union[FRONTIERS] += int(now) - int(state.frontier[cell])
+    state.totals[FRONTIERS] += int(now) - int(state.frontier[cell])
     state.frontier[cell] = now
 
 
 @kernel
 def _stamp(state: MapTrackerState, ground: GroundTruth, cell: int, tick: int) -> None:
-    """Somebody sees a cell for the first time."""
+    """A robot is the first to see a cell."""
     columns = ground.truth.shape[1]
     state.first_tick[cell] = tick
-    state.union[SEEN] += ground.counting[cell]
+    state.totals[SEEN] += ground.counting[cell]
     _renew(state, ground, cell)
     if cell % columns > 0:
         _renew(state, ground, cell - 1)
@@ -146,64 +146,64 @@ def _stamp(state: MapTrackerState, ground: GroundTruth, cell: int, tick: int) ->
 
 @kernel
 def _hold(state: MapTrackerState, ground: GroundTruth, who: int, entry: int) -> None:
-    """A robot learns an entry, its own or another's."""
+    """A robot takes in an entry, its own or another's."""
     cells = state.first_tick.shape[0]
     held = state.held[who]
     if entry >= 3 * cells:
         return
     if entry >= 2 * cells:
-        held[entry - 2 * cells] |= VOID
+        held[entry - 2 * cells] |= DEAD
         return
     cell = entry >> 1
     state.counts[who, HELD_CELLS] += held[cell] & KIND == 0 and ground.counting[cell]
-    held[cell] = (held[cell] & (VOID | OWN)) | (FREE + (entry & 1))
+    held[cell] = (held[cell] & (DEAD | OWN)) | (FREE + (entry & 1))
 
 
 @kernel
-def look(
+def take_scan(
     first_tick: np.ndarray,
     frontier: np.ndarray,
     held: np.ndarray,
-    made: np.ndarray,
-    told: np.ndarray,
+    scanned: np.ndarray,
+    as_sent: np.ndarray,
     version_vector: np.ndarray,
     folded: np.ndarray,
     written: np.ndarray,
-    slots: np.ndarray,
+    incarnation_ids: np.ndarray,
     counts: np.ndarray,
     stood: np.ndarray,
-    union: np.ndarray,
-    faults: np.ndarray,
+    totals: np.ndarray,
+    violations: np.ndarray,
     truth: np.ndarray,
     counting: np.ndarray,
     exact: bool,
-    news: np.ndarray,
+    entries_seen: np.ndarray,
     who: int,
     row: int,
     tick: int,
 ) -> None:
-    """A robot takes in what a scan says. news: (k,) entries; `made` has room for them."""
+    """A robot takes in a scan. entries_seen: (k,) its entries; `scanned` has room for them."""
     state = MapTrackerState(
         first_tick,
         frontier,
         held,
-        made,
-        told,
+        scanned,
+        as_sent,
         version_vector,
         folded,
         written,
-        slots,
+        incarnation_ids,
         counts,
         stood,
-        union,
-        faults,
+        totals,
+        violations,
     )
     ground = GroundTruth(truth, counting, exact)
     cells, columns = first_tick.shape[0], truth.shape[1]
-    for i in range(news.shape[0]):
-        entry = news[i]
-        made[slots[who], written[slots[who], MADE]] = entry
-        written[slots[who], MADE] += 1
+    for i in range(entries_seen.shape[0]):
+        entry = entries_seen[i]
+        scanned[incarnation_ids[who], written[incarnation_ids[who], SCANNED]] = entry
+        written[incarnation_ids[who], SCANNED] += 1
         _hold(state, ground, who, entry)
         if entry >= 2 * cells:
             continue
@@ -217,47 +217,32 @@ def look(
 
 
 @kernel
-def _is_log(payload: bytes, at: int, end: int, origins: int) -> bool:
-    """Whether payload[at:end] is a row of suffixes of bare entries, see News.logs."""
-    while 0 <= at < end:
-        origin, at = read_uint(payload, at)
-        start, at = read_uint(payload, at)
-        span, at = read_uint(payload, at)
-        count, at = read_uint(payload, at)
-        if at < 0 or origin >= origins or start > LENGTH_MAX or count > end - at or count != span:
-            return False
-        for _ in range(count):
-            _step, at = read_int(payload, at)
-    return at == end
-
-
-@kernel
 def _is_near(state: MapTrackerState, who: int, cell: int, columns: int) -> bool:
     """Whether a robot has ever stood near a cell."""
     for i in range(state.counts[who, STOOD] - 1, -1, -1):
         stood = state.stood[who, i]
         rows_apart = abs(stood // columns - cell // columns)
-        if max(rows_apart, abs(stood % columns - cell % columns)) <= VOID_CELLS:
+        if max(rows_apart, abs(stood % columns - cell % columns)) <= DEAD_FRONTIER_CELLS:
             return True
     return False
 
 
 @kernel
 def _append(state: MapTrackerState, ground: GroundTruth, who: int, entry: int) -> int:
-    """A robot tells the next entry of its log: a fault, or NEVER."""
-    cells, slot = state.first_tick.shape[0], state.slots[who]
-    written = state.written[slot]
+    """A robot sends the next entry of its log: the kind of a violation, or NEVER."""
+    cells, own = state.first_tick.shape[0], state.incarnation_ids[who]
+    written = state.written[own]
     if 2 * cells <= entry < 3 * cells:
         if not _is_near(state, who, entry - 2 * cells, ground.truth.shape[1]):
-            return FAR_VOID
-        written[VOIDS] += 1
+            return FAR_FRONTIER
+        written[DEAD_ENTRIES] += 1
         _hold(state, ground, who, entry)
-    elif written[MATCHED] < written[MADE] and state.made[slot, written[MATCHED]] == entry:
+    elif written[MATCHED] < written[SCANNED] and state.scanned[own, written[MATCHED]] == entry:
         written[MATCHED] += 1
     else:
         return NOT_ITS_SCANS
-    state.told[slot, written[TOLD]] = entry
-    written[TOLD] += 1
+    state.as_sent[own, written[AS_SENT]] = entry
+    written[AS_SENT] += 1
     return NEVER
 
 
@@ -265,27 +250,27 @@ def _append(state: MapTrackerState, ground: GroundTruth, who: int, entry: int) -
 def _follow_entry(
     state: MapTrackerState, ground: GroundTruth, who: int, origin: int, position: int, entry: int
 ) -> int:
-    """An entry of a slot's log as `who` sends it: a fault, or NEVER."""
-    own = origin == state.slots[who]
-    if position < state.written[origin, TOLD]:
-        same = state.told[origin, position] == entry
+    """A participant sends an entry of a log: the kind of a violation, or NEVER."""
+    own = origin == state.incarnation_ids[who]
+    if position < state.written[origin, AS_SENT]:
+        same = state.as_sent[origin, position] == entry
         return NEVER if same else NOT_ITS_SCANS if own else FOREIGN
     if not own or who >= state.held.shape[0]:
         return FOREIGN
-    if position == state.written[origin, TOLD]:
+    if position == state.written[origin, AS_SENT]:
         return int(_append(state, ground, who, entry))
     return GAP
 
 
 @kernel
 def _follow_version_vector(
-    state: MapTrackerState, payload: bytes, at: int, told: int, who: int, row: int, item: int
+    state: MapTrackerState, payload: bytes, at: int, ids: int, who: int, row: int, item: int
 ) -> None:
-    """A version vector of `told` slots never falls and never names what nobody has told."""
+    """A version vector of so many incarnation ids never falls, and names no entry that was never sent."""
     robots = state.held.shape[0]
-    for origin in range(max(told, state.version_vector.shape[1])):
+    for origin in range(max(ids, state.version_vector.shape[1])):
         length = 0
-        if origin < told:
+        if origin < ids:
             length, at = read_uint(payload, at)
         if origin >= state.version_vector.shape[1]:
             if length > 0:
@@ -294,12 +279,12 @@ def _follow_version_vector(
         before, state.version_vector[who, origin] = state.version_vector[who, origin], length
         if length < before:
             _note(state, FORGETS, row, item, length, before)
-        if origin != state.slots[who] or who >= robots:
-            known = state.written[origin, TOLD]
+        if origin != state.incarnation_ids[who] or who >= robots:
+            known = state.written[origin, AS_SENT]
             if length > known:
                 _note(state, MORE, row, item, length, known)
         else:
-            known = state.written[origin, MADE] + state.written[origin, VOIDS]
+            known = state.written[origin, SCANNED] + state.written[origin, DEAD_ENTRIES]
             if not known <= length <= known + state.first_tick.shape[0]:
                 _note(state, SHORT, row, item, length, known)
 
@@ -314,7 +299,7 @@ def _follow_logs(
     at: int,
     end: int,
 ) -> None:
-    """The suffixes in payload[at:end], up to the first fault."""
+    """Follow the suffixes in payload[at:end], up to the first violation."""
     who, payload = columns.step_records[row, of.PLACE], columns.payload
     while at < end:
         origin, at = read_uint(payload, at)
@@ -325,49 +310,39 @@ def _follow_logs(
         for _ in range(count):
             step, at = read_int(payload, at)
             entry += step
-            fault = _follow_entry(state, ground, who, origin, position, entry)
-            if fault != NEVER:
-                _note(state, fault, row, item, origin, position)
+            kind = _follow_entry(state, ground, who, origin, position, entry)
+            if kind != NEVER:
+                _note(state, kind, row, item, origin, position)
                 return
             position += 1
 
 
 @kernel
-def _follow_news(
+def _follow_gossip(
     state: MapTrackerState, ground: GroundTruth, columns: ColumnarBatch, row: int, item: int
 ) -> None:
-    """One envelope: its logs, then its version vector, then what the sender holds by it."""
+    """Follow an envelope: its logs, then its version vector, then what the sender holds by it."""
     who = columns.step_records[row, of.PLACE]
     sent = columns.sent[columns.step_records[row, of.SENT] + item]
     payload = columns.payload
-    _incarnation, version_vector, have_end, at, end = of.parts_of_gossip(
+    _incarnation, version_vector, vector_end, at, end = of.parts_of_gossip(
         payload, sent[of.BODY], sent[of.BODY_END]
     )
-    roster, robots = state.slots.shape[0], state.held.shape[0]
-    slots = _slots(payload, version_vector, have_end, roster) if end >= 0 else 0
-    if slots == 0 or not _is_log(payload, at, end, state.version_vector.shape[1]):
+    roster, robots = state.incarnation_ids.shape[0], state.held.shape[0]
+    ids = count_incarnations(payload, version_vector, vector_end, roster, 1) if end >= 0 else 0
+    if ids == 0 or not is_log(payload, at, end, 1, state.version_vector.shape[1]):
         _note(state, UNREADABLE, row, item, 0, 0)
         return
     if who < robots:
-        state.union[LOG_BYTES] += end - at
+        state.totals[LOG_BYTES] += end - at
     _follow_logs(state, ground, columns, row, item, at, end)
-    _follow_version_vector(state, payload, version_vector, slots, who, row, item)
+    _follow_version_vector(state, payload, version_vector, ids, who, row, item)
     for origin in range(state.version_vector.shape[1] if who < robots else 0):
-        last = min(state.version_vector[who, origin], state.written[origin, TOLD])
-        if origin != state.slots[who]:
+        last = min(state.version_vector[who, origin], state.written[origin, AS_SENT])
+        if origin != state.incarnation_ids[who]:
             for i in range(state.folded[who, origin], last):
-                _hold(state, ground, who, state.told[origin, i])
+                _hold(state, ground, who, state.as_sent[origin, i])
             state.folded[who, origin] = max(last, state.folded[who, origin])
-
-
-@kernel
-def _slots(payload: bytes, at: int, end: int, roster: int) -> int:
-    """How many slots the version vector in payload[at:end] is for; 0 if it is none."""
-    numbers = 0
-    while 0 <= at < end:
-        _length, at = read_uint(payload, at)
-        numbers += 1
-    return numbers if at == end and numbers % roster == 0 else 0
 
 
 @kernel
@@ -384,35 +359,35 @@ def follow(
     first_tick: np.ndarray,
     frontier: np.ndarray,
     held: np.ndarray,
-    made: np.ndarray,
-    told: np.ndarray,
+    scanned: np.ndarray,
+    as_sent: np.ndarray,
     version_vector: np.ndarray,
     folded: np.ndarray,
     written: np.ndarray,
-    slots: np.ndarray,
+    incarnation_ids: np.ndarray,
     counts: np.ndarray,
     stood: np.ndarray,
-    union: np.ndarray,
-    faults: np.ndarray,
+    totals: np.ndarray,
+    violations: np.ndarray,
     truth: np.ndarray,
     counting: np.ndarray,
     exact: bool,
 ) -> None:
-    """Follow what is sent in one batch; `told` has room for it."""
+    """Follow what is sent in one batch; `as_sent` has room for it."""
     state = MapTrackerState(
         first_tick,
         frontier,
         held,
-        made,
-        told,
+        scanned,
+        as_sent,
         version_vector,
         folded,
         written,
-        slots,
+        incarnation_ids,
         counts,
         stood,
-        union,
-        faults,
+        totals,
+        violations,
     )
     ground = GroundTruth(truth, counting, exact)
     columns = ColumnarBatch(
@@ -422,14 +397,14 @@ def follow(
         who = step_records[row, of.PLACE]
         if who >= 0 and step_records[row, of.PRESENT]:
             for item in range(step_records[row, of.SENT_COUNT]):
-                _follow_news(state, ground, columns, row, item)
+                _follow_gossip(state, ground, columns, row, item)
 
 
 @kernel
 def find_way(held: np.ndarray, start: int, columns: int, queue: np.ndarray) -> int:
     """A frontier that can be reached from a cell over known free cells, or NEVER.
 
-    held: (c,) as in Books, of one robot; cells in the queue are marked meanwhile. queue: (c,) room.
+    held: (c,) as in MapTrackerState, of one robot; cells in the queue are marked meanwhile. queue: (c,) room.
     """
     reached = 2 * OWN
     count, found = 1, NEVER
@@ -442,7 +417,7 @@ def find_way(held: np.ndarray, start: int, columns: int, queue: np.ndarray) -> i
         if (
             found == NEVER
             and held[cell] & KIND == FREE
-            and held[cell] & VOID == 0
+            and held[cell] & DEAD == 0
             and is_frontier(held, KIND, cell, columns)
         ):
             found = cell

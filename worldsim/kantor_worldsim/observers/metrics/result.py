@@ -105,23 +105,6 @@ class FaultCounts(msgspec.Struct, frozen=True, kw_only=True):
 LINK_COUNTERS = ("dropped", "delayed", "doubled", "replayed", "forged")
 
 
-PROCESS_COUNTERS = {
-    "kill": "killed",
-    "start": "started",
-    "pause": "paused",
-    "resume": "resumed",
-    "fill": "filled",
-    "free": "freed",
-    "slow": "slowed",
-    "quicken": "quickened",
-    "skew": "skewed",
-    "right": "righted",
-    "pretend": "refused",
-    "let in": "let_in",
-}
-"""What a fault is counted for by what it did, see `outages.Deed`."""
-
-
 class Rejoining(msgspec.Struct, frozen=True, kw_only=True):
     """How long participants that had started again took to their first step, in simulated seconds."""
 

@@ -1,0 +1,169 @@
+"""The links of a mission by its scenario alone: which are cut, and how far the others reach.
+
+A plain reading of the link faults for the checkers. It shares no code with the radio and works in another
+way: the mission is divided at every moment at which a cut or a shorter range begins, ends or flaps. From one
+such moment to the next the links are two matrices, in which kernels look up a pair of participants.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from kantor_protocol.base.counter_rng import Purpose, uniform
+from kantor_protocol.base.machine import SUPERVISOR, ParticipantId
+from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.links import OneWay, Partition, Range
+from kantor_protocol.scenario.schema import Scenario
+
+_ALWAYS_NS = 1 << 62
+"""Later than the end of any mission."""
+_FLAP_SHARE = 0.5
+"""Share of the time in which a flapping cut is there, unless its fault says otherwise."""
+_COPY_BITS = 16
+"""The last word of a draw's counter is the place of the fault in the scenario's list, above so many bits."""
+
+
+class LinkTable(NamedTuple):
+    """All links at one moment, for kernels. n participants, in the order of the roster."""
+
+    cut: npt.NDArray[np.bool_]
+    """(n, n): whether nothing passes from one (row) to another (column)."""
+    range_m: npt.NDArray[np.float64]
+    """(n, n): how far a link reaches, before walls."""
+
+
+class _Cut(NamedTuple):
+    """A one-way fault or a partition."""
+
+    place: int
+    """In the scenario's list."""
+    fault: OneWay | Partition
+    severed: npt.NDArray[np.bool_]
+    """(n, n): the links that it cuts while it is there."""
+    flap_ns: int
+    """Length of the slots in which it is there or not; 0: it is always there."""
+
+    def is_there(self, now_ns: int, seed: int) -> bool:
+        """Whether it cuts its links within its window."""
+        if not self.flap_ns:
+            return True
+        assert isinstance(self.fault, Partition)
+        purpose, slot = Purpose.FAULT_FLAP.value, now_ns // self.flap_ns
+        draw = uniform(seed, purpose, 0, slot, self.place << _COPY_BITS)
+        return bool(draw < (self.fault.flap_share or _FLAP_SHARE))
+
+
+class Links:
+    """The links of a mission as time passes."""
+
+    def __init__(self, scenario: Scenario, seed: int) -> None:
+        self._names = scenario.roster
+        self._seed = seed
+        self._whole_m = _ranges_m(scenario)
+        self._cuts = [
+            _Cut(place, fault, _severed(fault, self._names), _flap_ns(fault))
+            for place, fault in enumerate(scenario.faults)
+            if isinstance(fault, OneWay | Partition)
+        ]
+        self._ranges = [fault for fault in scenario.faults if isinstance(fault, Range)]
+        self.table = LinkTable(np.zeros(self._whole_m.shape, dtype=np.bool_), self._whole_m.copy())
+        """As it is since the last `move_to`; always the same arrays."""
+        self._from_ns = self._until_ns = -1
+
+    def move_to(self, now_ns: int) -> None:
+        """Bring the table to a time, in nanoseconds since the mission's start."""
+        if self._from_ns <= now_ns < self._until_ns:
+            return
+        cut, range_m = self.table
+        cut[:], range_m[:] = False, self._whole_m
+        for each in self._cuts:
+            if each.fault.holds(now_ns) and each.is_there(now_ns, self._seed):
+                cut |= each.severed
+        for fault in self._ranges:
+            if fault.holds(now_ns):
+                np.minimum(range_m, self._shortened_m(fault), out=range_m)
+        edges_ns = list(self._edges_ns(now_ns))
+        self._from_ns = max((edge_ns for edge_ns in edges_ns if edge_ns <= now_ns), default=0)
+        self._until_ns = min(
+            (edge_ns for edge_ns in edges_ns if edge_ns > now_ns), default=_ALWAYS_NS
+        )
+
+    def _shortened_m(self, fault: Range) -> npt.NDArray[np.float64]:
+        """(n, n): what one fault leaves of every range."""
+        touched = _at_an_end(fault.robots or self._names, self._names)
+        left_m = (
+            np.minimum(self._whole_m, fault.range_m)
+            if fault.range_m is not None
+            else self._whole_m * (fault.factor or 0.0)
+        )
+        return np.where(touched, left_m, self._whole_m)
+
+    def _edges_ns(self, now_ns: int) -> Iterator[int]:
+        """The moments around a time at which a link may change."""
+        faults: list[Fault] = [*(each.fault for each in self._cuts), *self._ranges]
+        for fault in faults:
+            yield fault.from_ns
+            yield _ALWAYS_NS if fault.until_ns is None else fault.until_ns
+        for each in self._cuts:
+            if each.flap_ns and each.fault.holds(now_ns):
+                slot = now_ns // each.flap_ns
+                yield slot * each.flap_ns
+                yield (slot + 1) * each.flap_ns
+
+
+def _ranges_m(scenario: Scenario) -> npt.NDArray[np.float64]:
+    """(n, n): how far links reach without faults; that of the supervisor has its own range."""
+    names = scenario.roster
+    ranges_m = np.full((len(names), len(names)), scenario.radio.range_m)
+    ranges_m[_at_an_end((SUPERVISOR,), names)] = scenario.supervisor.range_m
+    return ranges_m
+
+
+def _flap_ns(fault: OneWay | Partition) -> int:
+    flap_s = fault.flap_s if isinstance(fault, Partition) else None
+    return round((flap_s or 0.0) * 1e9)
+
+
+def _among(
+    some: Iterable[ParticipantId], names: tuple[ParticipantId, ...]
+) -> npt.NDArray[np.bool_]:
+    """(n,): whether each of the names is among some."""
+    wanted = frozenset(some)
+    return np.array([name in wanted for name in names], dtype=np.bool_)
+
+
+def _at_an_end(
+    some: Iterable[ParticipantId], names: tuple[ParticipantId, ...]
+) -> npt.NDArray[np.bool_]:
+    """(n, n): whether a link has one of some participants at an end."""
+    among = _among(some, names)
+    return np.logical_or.outer(among, among)
+
+
+def _severed(fault: OneWay | Partition, names: tuple[ParticipantId, ...]) -> npt.NDArray[np.bool_]:
+    """(n, n): the links that a fault cuts while it is there."""
+    if isinstance(fault, OneWay):
+        senders, receivers = fault.senders or names, fault.receivers or names
+        return np.logical_and.outer(_among(senders, names), _among(receivers, names))
+    together = np.zeros((len(names), len(names)), dtype=np.bool_)
+    for part in _parts(fault, names):
+        inside = _among(part, names)
+        together |= np.logical_and.outer(inside, inside)
+    return ~together
+
+
+def _parts(fault: Partition, names: tuple[ParticipantId, ...]) -> Iterator[Iterable[ParticipantId]]:
+    """The parts into which the team falls. A link stands if some part has both its ends."""
+    count = len(names)
+    if fault.shape == "halves":  # of an odd team, the first half has one more
+        yield from (names[: count - count // 2], names[count - count // 2 :])
+    elif fault.shape == "bridge":  # the one in the middle belongs to both
+        yield from (names[: count // 2 + 1], names[count // 2 :])
+    elif fault.shape == "ring":  # each with the one after it, the last with the first
+        yield from ((names[i - 1], names[i]) for i in range(count))
+    else:
+        groups = fault.groups if fault.shape == "groups" else [(name,) for name in fault.robots]
+        yield from groups
+        yield set(names).difference(*groups)
