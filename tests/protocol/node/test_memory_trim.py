@@ -3,10 +3,11 @@
 import subprocess
 import sys
 
+import pytest
+
 _SCRIPT = """
 import re
 from pathlib import Path
-import pytest
 
 import numpy as np
 from numba import njit
