@@ -1,26 +1,33 @@
 # Two commands are all a newcomer needs: `make demo` and `make test`.
+unexport PYTHONDONTWRITEBYTECODE  # processes start faster with compiled files
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 KANTOR := $(BIN)/kantor
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup
 
-.PHONY: help demo test check lint types contracts format paper bench campaign mutants fuzz clean
+.PHONY: help demo test test-fast check lint types contracts format paper bench campaign mutants fuzz clean
 
 help:
-	@echo "make demo    set up, then five robot processes explore on the bus and leave a picture"
-	@echo "make test    set up, then run the tests"
-	@echo "make check   lint, types and import contracts"
-	@echo "make paper   the first paper's figures with a verdict beside each number (kantor reproduce all)"
-	@echo "make bench   speed, as ratios in one run"
-	@echo "make campaign  2000 drawn missions full of faults, every referee on"
-	@echo "make mutants  planted bugs, and which referee catches each: docs/mutants.md"
-	@echo "make fuzz    a million inputs for every decoder"
+	@echo "make demo       set up, then five robot processes explore on the bus and leave a picture"
+	@echo "make test       set up, then run all tests"
+	@echo "make test-fast  set up, then run the unit tests with fewer drawn examples: at most a minute"
+	@echo "make check      lint, types and import contracts"
+	@echo "make format     format the code and fix what the linter can"
+	@echo "make paper      the first paper's figures with a verdict beside each number (kantor reproduce all)"
+	@echo "make bench      speed, as ratios in one run"
+	@echo "make campaign   2000 drawn missions full of faults, with every checker"
+	@echo "make mutants    planted bugs, and which checker catches each: docs/mutants.md"
+	@echo "make fuzz       a million inputs for every decoder"
 
 demo: $(VENV)/.installed $(VENV)/.kernels
 	$(KANTOR) run fleet --exchange realtime --speed 4
 
 test: $(VENV)/.developing $(VENV)/.kernels
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(PYTEST)
+
+test-fast: $(VENV)/.developing $(VENV)/.kernels
+	$(PYTEST) -m unit --hypothesis-profile fast
 
 check: lint types contracts
 
@@ -68,6 +75,8 @@ $(VENV)/.developing: $(VENV)/.installed
 # Numba keeps a kernel until its own file changes; one that has another file's code inlined goes stale.
 $(VENV)/.kernels: $(shell find $(wildcard */kantor_*) -name "*.py") | $(VENV)/.installed
 	find $(wildcard */kantor_*) -name '*.nb[ic]' -delete
+	@echo "compiling kernels: minutes, once"
+	$(BIN)/python -c 'from kantor_fleet.execution.preload import warm_up; warm_up()'
 	@touch $@
 
 clean:

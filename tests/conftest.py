@@ -1,4 +1,4 @@
-"""What tests of processes share: the kantor command, and fleets that are gone afterwards."""
+"""The tiers of the tests, the order in which groups start, and the `kantor` command as a fixture."""
 
 import os
 import signal
@@ -11,15 +11,59 @@ from typing import NamedTuple
 import pytest
 from hypothesis import settings
 
+from support.limits import EVENT_LIMIT_S
+
 settings.register_profile("kantor", deadline=None, print_blob=True)
+settings.register_profile("fast", settings.get_profile("kantor"), max_examples=25)
 settings.load_profile("kantor")
 
-COMMAND_S = 120.0
+TESTS = Path(__file__).parent
+TIERS = ("unit", "processes", "papers", "campaign", "containers", "fuzz")
+TIER_OF_PLACE = {
+    **dict.fromkeys(("agent", "fleet", "protocol", "supervisor", "worldsim"), "unit"),
+    **{tier: tier for tier in TIERS[1:]},
+    "fleet/test_report.py": "processes",
+    "fleet/test_report_of_maps.py": "processes",
+    "fleet/test_reproduce.py": "papers",
+    "fleet/test_reproduce_maps.py": "papers",
+    "fleet/test_reproduce_resilience.py": "papers",
+    "test_digests.py": "processes",
+    "test_readme.py": "processes",
+    "test_tiers.py": "unit",
+}
+"""The tier of a folder or file of this folder; the longest path counts, and a mark of the test above all."""
+LONGEST_FIRST = ("containers", "papers", "processes", "campaign", "fuzz", "unit")
+"""Tiers in the order in which they start: a long test that starts last leaves the other worker idle."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """`--rewrite` brings the transcripts up to date."""
     parser.addoption("--rewrite", action="store_true", help="rewrite transcripts of robots")
+
+
+def tier_of(item: pytest.Item) -> str:
+    """The tier of a test: its own mark, `processes` if it runs the command, or that of its place."""
+    own = [mark.name for mark in item.iter_markers() if mark.name in TIERS]
+    if len(own) > 1:
+        raise pytest.UsageError(f"{item.nodeid}: several tiers: {', '.join(own)}; keep one")
+    if own:
+        return own[0]
+    path = item.path.relative_to(TESTS)
+    places = [place.as_posix() for place in (path, *path.parents)]
+    tier = next((TIER_OF_PLACE[place] for place in places if place in TIER_OF_PLACE), None)
+    if tier is None:
+        raise pytest.UsageError(f"{item.nodeid}: no tier; add {path} to tests/conftest.py")
+    return "processes" if tier == "unit" and "kantor" in item.fixturenames else tier
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark every test with its tier, and start the tiers with long tests first."""
+    tiers = {item: tier_of(item) for item in items}
+    for item, tier in tiers.items():
+        if item.get_closest_marker(tier) is None:
+            item.add_marker(tier)
+    items.sort(key=lambda item: LONGEST_FIRST.index(tiers[item]))
 
 
 class Finished(NamedTuple):
@@ -40,7 +84,7 @@ class Kantor:
     def __call__(self, *arguments: object, **environment: str) -> Finished:
         """Run to the end."""
         process = self.start(*arguments, **environment)
-        out, err = process.communicate(timeout=COMMAND_S)
+        out, err = process.communicate(timeout=EVENT_LIMIT_S)
         return Finished(process.returncode, out, err)
 
     def start(self, *arguments: object, **environment: str) -> subprocess.Popen[str]:
@@ -66,7 +110,7 @@ class Kantor:
         for process in self._started:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
-            process.communicate(timeout=COMMAND_S)
+            process.communicate(timeout=EVENT_LIMIT_S)
 
 
 @pytest.fixture

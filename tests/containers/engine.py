@@ -15,12 +15,11 @@ from typing import Any
 
 from kantor_fleet.processes.compose import ComposeConfig, prepare, text
 from kantor_fleet.security.authority import Wanted, issue, today
+from support.limits import EVENT_LIMIT_S
 
 ROOT = Path(__file__).parents[2]
 IMAGE = "kantor-test"
 BASE = "python:3.11-slim-bookworm"
-PATIENCE_S = 90.0
-_ENGINE_S = 60.0
 _PACKAGES = ("docker.io", "docker-compose", "debootstrap")
 
 
@@ -52,7 +51,7 @@ def an_engine() -> Iterator[None]:
     with Path(f"{tempfile.mkdtemp()}/dockerd.log").open("w", encoding="utf-8") as log:
         engine = subprocess.Popen(["dockerd"], stdout=log, stderr=log, start_new_session=True)
         try:
-            give_up = time.monotonic() + _ENGINE_S
+            give_up = time.monotonic() + EVENT_LIMIT_S
             while not _answers():
                 if engine.poll() is not None or time.monotonic() > give_up:
                     raise NoEngineError(f"dockerd does not come up; see {log.name}")
@@ -60,7 +59,7 @@ def an_engine() -> Iterator[None]:
             yield
         finally:
             engine.terminate()
-            engine.wait(_ENGINE_S)
+            engine.wait(EVENT_LIMIT_S)
 
 
 def _answers() -> bool:
@@ -168,7 +167,7 @@ class Fleet:
 
     def await_log(self, service: str, pattern: str) -> str:
         """The first line of a log with a pattern, once it is there."""
-        give_up = time.monotonic() + PATIENCE_S
+        give_up = time.monotonic() + EVENT_LIMIT_S
         while time.monotonic() < give_up:
             for line in self.log(service).splitlines():
                 if re.search(pattern, line):
@@ -178,7 +177,7 @@ class Fleet:
 
     def await_state(self, service: str, state: str, key: str = "Status") -> None:
         """Return once a container is in a state."""
-        give_up = time.monotonic() + PATIENCE_S
+        give_up = time.monotonic() + EVENT_LIMIT_S
         while time.monotonic() < give_up:
             now = self.inspect(service)["State"]
             if state in {now[key], now.get("Health", {}).get("Status")}:

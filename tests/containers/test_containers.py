@@ -19,11 +19,12 @@ from kantor_fleet.scenarios.catalog import find
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.world.world import WorldSetup
 from support.fleets import incidents_of, result_of
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     from conftest import Kantor
 
-pytestmark = [pytest.mark.xdist_group("containers"), pytest.mark.timeout(600)]
+pytestmark = pytest.mark.xdist_group("containers")
 
 MakeFleet = Callable[..., Fleet]
 FIVE = ComposeConfig(5, supervisor=True)
@@ -65,7 +66,7 @@ def test_five_robots_explore_to_the_end(fleet_of: MakeFleet) -> None:
         assert fleet.inspect(name)["HostConfig"]["ReadonlyRootfs"]
         owner = Path(f"/proc/{state['Pid']}").stat().st_uid
         assert owner != 0
-    out, _ = up.communicate(timeout=120.0)
+    out, _ = up.communicate(timeout=EVENT_LIMIT_S)
 
     assert up.returncode == 0, out[-2000:]
     result = check_record(fleet)
@@ -77,7 +78,7 @@ def test_a_supervisor_comes_with_its_profile(fleet_of: MakeFleet) -> None:
     """The same file, centralized."""
     fleet = fleet_of(FIVE, speed="8", set="coordination=centralized")
     up = fleet.start("--profile", "centralized", "up", "--exit-code-from", "worldsim")
-    out, _ = up.communicate(timeout=180.0)
+    out, _ = up.communicate(timeout=EVENT_LIMIT_S)
 
     assert up.returncode == 0, out[-2000:]
     rate = float(str(check_record(fleet)["detection_rate"]))
@@ -110,7 +111,7 @@ def test_a_storm_over_containers(fleet_of: MakeFleet, kantor: "Kantor") -> None:
     fleet.compose("up", "--detach")
     (kantor.folder / "storm.toml").write_text(STORM)
     chaos = kantor.start("chaos", "docker", "storm.toml", "--project", fleet.project)
-    out, err = chaos.communicate(timeout=300.0)
+    out, err = chaos.communicate(timeout=EVENT_LIMIT_S)
 
     assert chaos.returncode == 0, out + err
     assert len(re.findall(r"^ok .*on record, (?:leave|join)", out, re.MULTILINE)) == 6
@@ -174,7 +175,7 @@ def test_isolated_robots_cannot_reach_each_other(fleet_of: MakeFleet) -> None:
     assert not reaches("r1", address)
     assert not reaches("r1", "r2")
     fleet.await_state("worldsim", "exited")
-    listener.communicate(timeout=60.0)
+    listener.communicate(timeout=EVENT_LIMIT_S)
     assert fleet.inspect("worldsim")["State"]["ExitCode"] == 0
     check_record(fleet)
 

@@ -9,8 +9,9 @@ import pytest
 from containers.engine import IMAGE, Fleet, keys
 from kantor_fleet.processes.compose import ComposeConfig
 from kantor_fleet.security.authority import Wanted
+from support.limits import EVENT_LIMIT_S
 
-pytestmark = [pytest.mark.xdist_group("containers"), pytest.mark.timeout(600)]
+pytestmark = pytest.mark.xdist_group("containers")
 
 MakeFleet = Callable[..., Fleet]
 
@@ -58,7 +59,7 @@ def run(fleet: Fleet, folder: Path, *command: object) -> "subprocess.CompletedPr
             "docker", "run", "--rm", "--network", f"{fleet.project}_fleet", "--user", "10001:10001",
             "--volume", f"{folder}:/stolen:ro", *map(str, command),
         ],
-        capture_output=True, text=True, check=False, timeout=60.0,
+        capture_output=True, text=True, check=False, timeout=EVENT_LIMIT_S,
     )  # fmt: skip
 
 

@@ -49,6 +49,7 @@ from kantor_worldsim.observers.metrics.result import (
 )
 from support.claims import number, runs_of
 from support.files import rows_of, wait_until
+from support.limits import EVENT_LIMIT_S
 from support.strategies import examples
 
 if TYPE_CHECKING:
@@ -476,7 +477,7 @@ def test_interrupted_it_goes_on_where_it_was_stopped(kantor: "Kantor") -> None:
     running = kantor.start(*order)
     wait_until(lambda: kept(folder) >= 2)
     running.send_signal(signal.SIGINT)
-    _, told = running.communicate(timeout=60.0)
+    _, told = running.communicate(timeout=EVENT_LIMIT_S)
     before = kept(folder)
 
     assert running.returncode == 130

@@ -12,6 +12,7 @@ import pytest
 
 from support.files import rows_of, wait_until
 from support.fleets import result_of
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     from conftest import Finished, Kantor
@@ -221,7 +222,7 @@ def test_ctrl_c_leaves_a_valid_partial_record(kantor: "Kantor") -> None:
     while not process.stdout.readline().startswith("t="):
         pass
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
+    process.communicate(timeout=EVENT_LIMIT_S)
 
     (folder,) = kantor.runs()
     assert process.returncode == 130
@@ -237,11 +238,11 @@ def test_ctrl_c_while_kernels_are_compiled_ends_the_command_at_once(kantor: "Kan
     wait_until(lambda: any(cache.rglob("*.nbi")))
     started = psutil.Process(process.pid).children(recursive=True)
     os.killpg(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     assert process.returncode == 130
     assert "Traceback" not in err
-    assert psutil.wait_procs(started, timeout=10)[1] == []
+    assert psutil.wait_procs(started, timeout=EVENT_LIMIT_S)[1] == []
 
 
 def test_a_full_disk_cuts_the_record_and_not_the_mission(kantor: "Kantor") -> None:
@@ -257,7 +258,7 @@ def test_a_full_disk_cuts_the_record_and_not_the_mission(kantor: "Kantor") -> No
 
     finished = subprocess.run(
         [sys.executable, "-c", script], cwd=kantor.folder, capture_output=True, text=True,
-        timeout=120, check=False,
+        timeout=EVENT_LIMIT_S, check=False,
     )  # fmt: skip
 
     (folder,) = kantor.runs()

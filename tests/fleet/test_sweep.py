@@ -21,6 +21,7 @@ from kantor_fleet.sweep.plan import RunKey, SweepError, parse_seeds, plan
 from kantor_fleet.sweep.run import SweepConfig, sweep
 from kantor_fleet.sweep.summary import Distribution
 from support.files import rows_of, wait_until
+from support.limits import EVENT_LIMIT_S
 from support.strategies import mission
 from support.workers import DEADLY_SEED, die_of_a_seed, fail_of_a_seed
 
@@ -391,7 +392,7 @@ def test_interrupted_and_resumed_it_leaves_the_same_table(
     wait_until(lambda: len(journal_lines(folder)) >= RUNS // 3)
     started = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     kept = journal_lines(folder)
     assert process.returncode == 130
@@ -399,7 +400,7 @@ def test_interrupted_and_resumed_it_leaves_the_same_table(
     assert err == ""
     assert RUNS // 3 <= len(kept) < RUNS
     assert len(rows_of(folder / "table.csv")) == len(kept)
-    assert psutil.wait_procs(started, timeout=10)[1] == []
+    assert psutil.wait_procs(started, timeout=EVENT_LIMIT_S)[1] == []
 
     finished = kantor("sweep", "fleet", *FULL, "--jobs", 2)
 
@@ -415,7 +416,7 @@ def test_sigterm_ends_it_with_143(kantor: "Kantor") -> None:
     wait_until(lambda: bool(journal_lines(kantor.folder / "sweeps" / "fleet")))
     process.terminate()
 
-    process.communicate(timeout=60)
+    process.communicate(timeout=EVENT_LIMIT_S)
     assert process.returncode == 143
 
 
@@ -427,7 +428,7 @@ def test_a_worker_that_is_killed_costs_nothing(kantor: "Kantor", reference: Path
     wait_until(lambda: bool(journal_lines(folder)))
     worker = json.loads(journal_lines(folder)[0])["outcome"]["worker"]
     os.kill(int(worker.rpartition(":")[2]), signal.SIGKILL)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     assert (process.returncode, err) == (0, "")
     assert same(folder, reference)

@@ -16,6 +16,7 @@ from kantor_protocol.transport import credentials, zenoh_config
 from kantor_protocol.transport.credentials import Certificate, Password
 from kantor_protocol.transport.endpoint import free_endpoint
 from support.intruders import plain_session
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -130,8 +131,8 @@ def test_nobody_reads_or_writes_past_the_radio(kantor: "Kantor", kind: str) -> N
             rogue.put(f"{ROOT}/r2/tx", payload, congestion_control=zenoh.CongestionControl.BLOCK)
         scribe.put(f"{ROOT}/r1/tx", b"forged by an observer")
         for robot in robots:
-            assert robot.wait(timeout=100) == 0
-        out, err = world.communicate(timeout=60)
+            assert robot.wait(timeout=EVENT_LIMIT_S) == 0
+        out, err = world.communicate(timeout=EVENT_LIMIT_S)
         traffic = drained(seen)
         token.undeclare()
 
@@ -162,10 +163,10 @@ def test_an_oversized_message_does_not_reach_world_sim(kantor: "Kantor") -> None
         )
         rogue.put(f"{ROOT}/r1/tx", b"small", congestion_control=zenoh.CongestionControl.BLOCK)
         robot = kantor.start("agent", "r1", "--connect", endpoint)
-        out, err = world.communicate(timeout=60)
+        out, err = world.communicate(timeout=EVENT_LIMIT_S)
 
     assert world.returncode == 0, out + err
-    assert robot.wait(timeout=30) == 0
+    assert robot.wait(timeout=EVENT_LIMIT_S) == 0
     result = json.loads((kantor.runs()[0] / "result.json").read_text())
     assert result["messages_refused"] == 1
     assert result["energy_spent"] == 150

@@ -26,13 +26,13 @@ from kantor_protocol.transport.session import BusError
 from kantor_protocol.wire import keys
 from support.fleets import await_line
 from support.intruders import plain_session
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     from conftest import Kantor
 
 FLEET, ROSTER = "demo", ("r1", "r2", "r3")
 NOW = datetime.now(UTC)
-PATIENCE_S = 20.0
 BLOCK = zenoh.CongestionControl.BLOCK
 
 
@@ -57,7 +57,7 @@ def hosted(who: Certificate, endpoint: str, said: list[str]) -> Iterator[HubRout
 
 def join(endpoint: str, who: Identity) -> None:
     """Come and go."""
-    with participant_session(endpoint, who, "nonce", PATIENCE_S):
+    with participant_session(endpoint, who, "nonce", EVENT_LIMIT_S):
         pass
 
 
@@ -117,7 +117,7 @@ def test_world_sim_and_whoever_is_refused_both_say_why(kantor: "Kantor") -> None
     ]
     join(endpoint, ours)
     world.send_signal(signal.SIGINT)
-    out, err = world.communicate(timeout=60)
+    out, err = world.communicate(timeout=EVENT_LIMIT_S)
 
     assert [text.removeprefix(f"{endpoint}: ") for text in told] == [
         "refuses r1: its certificate has expired; `kantor keys demo --renew r1` makes a new one",
@@ -189,14 +189,16 @@ def test_a_revoked_robot_without_manners_is_not_heard(folder: Path) -> None:
         token = rogue.liveliness().declare_token(keys.alive(FLEET, "r3", "forged"))
         for name in ROSTER:
             rogue.put(keys.tx(FLEET, name), b"forged", congestion_control=BLOCK)
-        with participant_session(endpoint, identity(folder, "r1"), "nonce", PATIENCE_S) as honest:
-            assert host.next(PATIENCE_S) == Joined("r1", "nonce")
+        with participant_session(
+            endpoint, identity(folder, "r1"), "nonce", EVENT_LIMIT_S
+        ) as honest:
+            assert host.next(EVENT_LIMIT_S) == Joined("r1", "nonce")
             for name in ROSTER:
                 host.send(name, b"secret", patiently=True)
-            assert honest.next(PATIENCE_S) == b"secret"
+            assert honest.next(EVENT_LIMIT_S) == b"secret"
             honest.send(b"true", patiently=True)
-            assert host.next(PATIENCE_S) == Heard("r1", b"true")
-        assert host.next(PATIENCE_S) == Left("r1", "nonce")
+            assert host.next(EVENT_LIMIT_S) == Heard("r1", b"true")
+        assert host.next(EVENT_LIMIT_S) == Left("r1", "nonce")
         token.undeclare()
         assert {sample.payload.to_bytes() for sample in heard} == {b"forged"}  # its own words
 
@@ -212,20 +214,20 @@ def test_a_robot_that_is_revoked_meanwhile_is_told(folder: Path) -> None:
         with hosted(identity(folder, "worldsim"), endpoint, said) as host:
             r1, r3 = (
                 robots.enter_context(
-                    participant_session(endpoint, identity(folder, name), name, PATIENCE_S)
+                    participant_session(endpoint, identity(folder, name), name, EVENT_LIMIT_S)
                 )
                 for name in ("r1", "r3")
             )
-            assert {host.next(PATIENCE_S), host.next(PATIENCE_S)} == {
+            assert {host.next(EVENT_LIMIT_S), host.next(EVENT_LIMIT_S)} == {
                 Joined("r1", "r1"), Joined("r3", "r3"),
             }  # fmt: skip
         make(folder, revoke=("r3",))
         with hosted(identity(folder, "worldsim"), endpoint, said) as host:
-            assert host.next(PATIENCE_S) == Joined("r1", "r1")
+            assert host.next(EVENT_LIMIT_S) == Joined("r1", "r1")
             with pytest.raises(BusError, match="refuses r3: its certificate has been revoked"):
-                r3.next(PATIENCE_S)
+                r3.next(EVENT_LIMIT_S)
             host.send("r1", b"go on", patiently=True)
-            assert r1.next(PATIENCE_S) == b"go on"
+            assert r1.next(EVENT_LIMIT_S) == b"go on"
 
     assert [text.partition(";")[0] for text in said] == [
         "refused r3: its certificate has been revoked"
@@ -275,10 +277,10 @@ def test_a_certificate_counts_until_it_expires(folder: Path) -> None:
     r1 = identity(folder, "r1")
     with (
         hosted(identity(folder, "worldsim"), endpoint := free_endpoint("tls"), []) as host,
-        participant_session(endpoint, r1, "nonce", PATIENCE_S),
+        participant_session(endpoint, r1, "nonce", EVENT_LIMIT_S),
     ):
-        assert host.next(PATIENCE_S) == Joined("r1", "nonce")
-        assert host.next(PATIENCE_S) == Left("r1", "nonce")
+        assert host.next(EVENT_LIMIT_S) == Joined("r1", "nonce")
+        assert host.next(EVENT_LIMIT_S) == Left("r1", "nonce")
         assert datetime.now(UTC) >= r1.until
         assert "its certificate has expired" in refusal(endpoint, r1)
 
@@ -302,7 +304,7 @@ def test_who_hangs_up_without_a_reason_has_not_objected(
 
         def wrap_socket(self, raw: socket.socket, server_hostname: str) -> ssl.SSLSocket:
             secured = ours.wrap_socket(raw, server_hostname=server_hostname)
-            gone.result(PATIENCE_S)
+            gone.result(EVENT_LIMIT_S)
             return secured
 
     monkeypatch.setattr(tls, "context", lambda _identity: Slow())
@@ -385,7 +387,7 @@ def test_world_sim_warns_of_what_expires(kantor: "Kantor") -> None:
     )  # fmt: skip
     await_line(world, "t=")
     world.send_signal(signal.SIGINT)
-    _, err = world.communicate(timeout=60)
+    _, err = world.communicate(timeout=EVENT_LIMIT_S)
 
     warnings = [text for text in err.splitlines() if "warning" in text]
     assert len(warnings) == 4

@@ -20,6 +20,7 @@ from kantor_fleet.exits import Exit
 from kantor_fleet.sweep.plan import SweepPlan, plan
 from kantor_fleet.sweep.run import SweepConfig, sweep
 from support import workers
+from support.limits import EVENT_LIMIT_S
 from support.strategies import mission
 
 if TYPE_CHECKING:
@@ -111,7 +112,7 @@ def test_a_worker_dies_and_the_table_is_that_of_one_machine(
     process = kantor.start(*sweep_command(folder, "--cluster", cluster.address))
     await_run(process)
     cluster.workers[0].send_signal(signal.SIGKILL)
-    _, err = process.communicate(timeout=120)
+    _, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     assert (process.returncode, err) == (0, "")
     assert same(folder, reference)
@@ -141,7 +142,7 @@ def test_the_scheduler_goes_and_the_sweep_goes_on_elsewhere(
     process = kantor.start(*sweep_command(folder, "--cluster", cluster.address))
     await_run(process)
     cluster.scheduler.kill()
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     assert process.returncode == 4
     assert err == f"kantor: {cluster.address}: the scheduler is gone\n"
@@ -159,7 +160,7 @@ def test_ctrl_c_gives_up_what_a_cluster_is_running(kantor: "Kantor", cluster: Cl
     process = kantor.start(*sweep_command(folder, "--cluster", cluster.address))
     await_run(process)
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     assert (process.returncode, err) == (130, "")
     assert [worker.poll() for worker in cluster.workers] == [None, None]
@@ -206,7 +207,7 @@ def test_slurm_jobs_are_asked_for_and_given_back(kantor: "Kantor", reference: Pa
     jobs = (kantor.folder / "jobs").read_text().split()
     assert (kantor.folder / "cancelled").read_text().split() == jobs
     gone = [psutil.Process(int(job)) for job in jobs if psutil.pid_exists(int(job))]
-    assert psutil.wait_procs(gone, timeout=10)[1] == []
+    assert psutil.wait_procs(gone, timeout=EVENT_LIMIT_S)[1] == []
 
 
 def test_slurm_that_takes_no_jobs(kantor: "Kantor") -> None:

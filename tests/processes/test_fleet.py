@@ -15,6 +15,7 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.observers.metrics.density import DensityMetrics
 from kantor_worldsim.world.world import WorldSetup
 from support.fleets import await_line, children_named, result_of
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -97,7 +98,7 @@ def test_a_killed_robot_does_not_stop_the_others(kantor: "Kantor", exchange: str
     await_line(process, "t=", "energy")
     (folder,) = kantor.runs()
     os.kill(children_named(process, folder / "logs" / "r3.log"), signal.SIGKILL)
-    out, err = process.communicate(timeout=100)
+    out, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     result = result_of(folder)
     assert process.returncode == 3, out + err
@@ -113,12 +114,12 @@ def test_ctrl_c_ends_every_process_and_leaves_a_valid_record(kantor: "Kantor") -
     await_line(process, "t=", "energy")
     family = psutil.Process(process.pid).children(recursive=True)
     os.killpg(process.pid, signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     (folder,) = kantor.runs()
     assert process.returncode == 130, out + err
     assert len(family) >= 6
-    assert psutil.wait_procs(family, timeout=10)[1] == []
+    assert psutil.wait_procs(family, timeout=EVENT_LIMIT_S)[1] == []
     assert result_of(folder)["ended"] == "interrupted"
     assert (folder / "report.png").exists()
     assert kantor("verify", folder).code == 0
@@ -140,10 +141,10 @@ def test_robots_start_by_hand_in_any_order(kantor: "Kantor") -> None:
     await_line(world, "t=")
     others = [kantor.start("supervisor", *connect), kantor.start("agent", "r1", *connect)]
 
-    out, err = world.communicate(timeout=100)
+    out, err = world.communicate(timeout=EVENT_LIMIT_S)
     assert world.returncode == 0, out + err
     for participant in (early, *others):
-        told, complaint = participant.communicate(timeout=30)
+        told, complaint = participant.communicate(timeout=EVENT_LIMIT_S)
         assert participant.returncode == 0, complaint
         assert told.splitlines()[-1].endswith("mission over: done")
     assert result_of(kantor.runs()[0])["energy_spent"] == 200
@@ -163,10 +164,10 @@ def test_a_robot_may_come_late(kantor: "Kantor") -> None:
     while "energy 0/" in await_line(world, "t=", "energy"):
         pass
     robots.append(kantor.start("agent", "r5", "--connect", endpoint))
-    out, err = world.communicate(timeout=100)
+    out, err = world.communicate(timeout=EVENT_LIMIT_S)
 
     for robot in robots:
-        assert robot.wait(timeout=30) == 0
+        assert robot.wait(timeout=EVENT_LIMIT_S) == 0
     assert "all rules held" in out, out + err
     from kantor_worldsim.record.journal import read
     from kantor_worldsim.record.records import Batch
@@ -218,7 +219,7 @@ def test_ids_and_credentials_are_checked(kantor: "Kantor") -> None:
     assert "refuses r1; its credentials are not this world-sim's" in wrong.err
     assert (kantor.folder / "credentials" / "r1.toml").stat().st_mode & 0o077 == 0
     world.send_signal(signal.SIGINT)
-    assert world.wait(timeout=30) == 130
+    assert world.wait(timeout=EVENT_LIMIT_S) == 130
 
 
 def test_tap_prints_the_bus_decoded(kantor: "Kantor") -> None:
@@ -236,8 +237,8 @@ def test_tap_prints_the_bus_decoded(kantor: "Kantor") -> None:
     assert len(tapped.out.splitlines()) == 3
     assert all("r1" in line and "[21, 1, " in line for line in tapped.out.splitlines())
     world.send_signal(signal.SIGTERM)
-    assert world.wait(timeout=30) == 143
-    assert robot.wait(timeout=30) == 0
+    assert world.wait(timeout=EVENT_LIMIT_S) == 143
+    assert robot.wait(timeout=EVENT_LIMIT_S) == 0
 
 
 def test_a_second_world_sim_on_the_port_is_refused(kantor: "Kantor") -> None:
@@ -253,7 +254,7 @@ def test_a_second_world_sim_on_the_port_is_refused(kantor: "Kantor") -> None:
     assert f"cannot listen on {endpoint}" in second.err
     assert not (kantor.folder / "second").exists()
     first.send_signal(signal.SIGINT)
-    assert first.wait(timeout=30) == 130
+    assert first.wait(timeout=EVENT_LIMIT_S) == 130
 
 
 def test_a_robot_process_imports_only_what_it_uses(kantor: "Kantor") -> None:

@@ -24,12 +24,12 @@ from kantor_protocol.transport.rate_limit import BURST_BYTES, BURST_MESSAGES, Ra
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.zenoh_config import POSE_BYTES_MAX, SHOWN_PER_S
 from kantor_protocol.wire import keys
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     from conftest import Kantor
 
 FLEET, ROSTER = "kantor", ("r1", "r2")
-PATIENCE_S = 20.0
 MESSAGES, LARGE_MESSAGES = 5000, 40
 MIB = 1 << 20
 QUOTA = RateLimit(100.0, 1e6)
@@ -45,7 +45,9 @@ def hosted(folder: Path) -> Iterator[tuple[HubRouter, ParticipantSession, Partic
         host = stack.enter_context(HubRouter(identities[credentials.HOST], endpoint, users, ROSTER))
         host.limit(dict.fromkeys(ROSTER, QUOTA))
         robots = [
-            stack.enter_context(participant_session(endpoint, identities[name], name, PATIENCE_S))
+            stack.enter_context(
+                participant_session(endpoint, identities[name], name, EVENT_LIMIT_S)
+            )
             for name in ROSTER
         ]
         joined = {next_of(host, Joined).name for _ in ROSTER}
@@ -55,7 +57,7 @@ def hosted(folder: Path) -> Iterator[tuple[HubRouter, ParticipantSession, Partic
 
 def next_of(host: HubRouter, kind: type) -> Joined:
     """The next event, which is of a kind."""
-    event = host.next(PATIENCE_S)
+    event = host.next(EVENT_LIMIT_S)
     assert isinstance(event, kind)
     return event  # type: ignore[return-value]
 
@@ -63,7 +65,7 @@ def next_of(host: HubRouter, kind: type) -> Joined:
 def until(host: HubRouter, payload: bytes) -> tuple[list[Heard], list[Flooded]]:
     """What comes before a message."""
     heard, flooded = [], []
-    while (event := host.next(PATIENCE_S)) is not None:
+    while (event := host.next(EVENT_LIMIT_S)) is not None:
         if isinstance(event, Heard):
             if event.payload == payload:
                 return heard, flooded
@@ -84,7 +86,7 @@ def test_nobody_waits_behind_a_flood(tmp_path: Path) -> None:
         ahead, elapsed_s = len(before), time.monotonic() - start_s
         while sum(excess.messages for excess in host.excess.values()) + len(before) < MESSAGES:
             event = host.next(0.02)  # what is beyond the quota is no event
-            assert time.monotonic() < start_s + PATIENCE_S
+            assert time.monotonic() < start_s + EVENT_LIMIT_S
             before += [event] if isinstance(event, Heard) else []
             flooded += [event] if isinstance(event, Flooded) else []
 
@@ -112,7 +114,7 @@ def test_what_observers_see_is_limited_by_the_router(tmp_path: Path) -> None:
     """No pose is longer than a pose, and there are no more than can be looked at; others' are untouched."""
     with hosted(tmp_path) as (_, honest, hostile, endpoint):
         observer = credentials.find(tmp_path, credentials.OBSERVER)
-        with observer_session(endpoint, observer, keys.everything(FLEET), PATIENCE_S) as seen:
+        with observer_session(endpoint, observer, keys.everything(FLEET), EVENT_LIMIT_S) as seen:
             start_s = time.monotonic()
             hostile.publish_pose(bytes(POSE_BYTES_MAX + 1))
             for _ in range(MESSAGES):
@@ -128,7 +130,7 @@ def test_what_observers_see_is_limited_by_the_router(tmp_path: Path) -> None:
             counts: dict[tuple[str, bytes], int] = {}
             ends = 0
             while ends < len(ROSTER):
-                message = seen.next(PATIENCE_S)
+                message = seen.next(EVENT_LIMIT_S)
                 assert message is not None
                 ends += message[1] == b"end"
                 counts[message] = counts.get(message, 0) + 1
@@ -150,14 +152,14 @@ def test_a_mission_after_a_flood_is_the_mission_without_it(kantor: "Kantor") -> 
     assert world.stdout is not None
     assert any(text.startswith("t=") for text in world.stdout)
     identity = credentials.find(kantor.folder / "credentials", "r2")
-    with participant_session(endpoint, identity, "flood", PATIENCE_S) as hostile:
-        assert hostile.next(PATIENCE_S) is not None  # it is let in, and so is heard
+    with participant_session(endpoint, identity, "flood", EVENT_LIMIT_S) as hostile:
+        assert hostile.next(EVENT_LIMIT_S) is not None  # it is let in, and so is heard
         for _ in range(MESSAGES):
             hostile.send(b"flood", patiently=True)
     robots = [kantor.start("agent", name, "--connect", endpoint) for name in ("r1", "r2")]
     for robot in robots:
-        assert robot.wait(timeout=100) == 0
-    out, err = world.communicate(timeout=60)
+        assert robot.wait(timeout=EVENT_LIMIT_S) == 0
+    out, err = world.communicate(timeout=EVENT_LIMIT_S)
 
     assert world.returncode == 0, out + err
     assert out.count("r2 floods the bus") == 1

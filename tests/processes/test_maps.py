@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from support.fleets import await_line, children_named, result_of
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -56,7 +57,7 @@ def test_the_others_explore_what_a_killed_robot_leaves(kantor: "Kantor") -> None
     await_line(process, "t=", "explored")
     (folder,) = kantor.runs()
     os.kill(children_named(process, folder / "logs" / "r2.log"), signal.SIGKILL)
-    out, err = process.communicate(timeout=100)
+    out, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     result = result_of(folder)
     assert process.returncode == 3, out + err

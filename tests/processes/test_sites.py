@@ -26,12 +26,12 @@ from support.fleets import (
     result_of,
 )
 from support.intruders import plain_session
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     from conftest import Kantor
 
 ROOT = "kantor/v1/kantor"
-PATIENCE_S = 60.0
 FORGED = b"forged"
 BLOCK = zenoh.CongestionControl.BLOCK
 MISSION = (
@@ -133,20 +133,20 @@ def test_a_mission_through_a_site_is_the_one_in_process(place: Place) -> None:
             for kind in ("tx", "rx", "pose", "weights"):
                 liar.put(f"{ROOT}/{name}/{kind}", FORGED, congestion_control=BLOCK)
         guest.put(f"{ROOT}/r3/tx", FORGED, congestion_control=BLOCK)
-        out, err = world.communicate(timeout=PATIENCE_S)
+        out, err = world.communicate(timeout=EVENT_LIMIT_S)
         assert drained(stolen) + drained(overheard) == []
         for token in tokens:
             token.undeclare()
 
     assert world.returncode == 0, out + err
     for robot in robots.values():
-        assert robot.wait(timeout=PATIENCE_S) == 0
+        assert robot.wait(timeout=EVENT_LIMIT_S) == 0
     first, second = map(result_of, kantor.runs())
     assert first["digest"] == second["digest"]
     assert second["messages_refused"] == 0
     assert second["violations"] == 0
     site.send_signal(signal.SIGTERM)
-    assert site.wait(timeout=PATIENCE_S) == 143
+    assert site.wait(timeout=EVENT_LIMIT_S) == 143
 
 
 def test_a_site_speaks_for_its_own_robots_only(place: Place) -> None:
@@ -161,13 +161,13 @@ def test_a_site_speaks_for_its_own_robots_only(place: Place) -> None:
             for name in ("r3", "r9", "observer", "worldsim"):
                 rogue.put(f"{ROOT}/{name}/{kind}", FORGED, congestion_control=BLOCK)
         rogue.put(f"{ROOT}/r2/tx", b"malformed", congestion_control=BLOCK)
-        out, err = world.communicate(timeout=PATIENCE_S)
+        out, err = world.communicate(timeout=EVENT_LIMIT_S)
         assert drained(stolen) == []
         tokens[0].undeclare()
 
     assert world.returncode == 0, out + err
     for robot in robots.values():
-        assert robot.wait(timeout=PATIENCE_S) == 0
+        assert robot.wait(timeout=EVENT_LIMIT_S) == 0
     result = result_of(kantor.runs()[0])
     assert result["messages_refused"] == 1  # in the name of its own robot
     assert result["violations"] == 0
@@ -191,11 +191,11 @@ def test_robots_hold_while_their_site_is_gone(place: Place) -> None:
     left = [await_incident(folder, name, "leave") for name in ("r1", "r2")]
     place.site()
     joined = [await_incident(folder, name, "join") for name in ("r1", "r2")]
-    out, err = world.communicate(timeout=PATIENCE_S)
+    out, err = world.communicate(timeout=EVENT_LIMIT_S)
 
     assert world.returncode == 0, out + err
     for robot in robots.values():
-        assert robot.wait(timeout=PATIENCE_S) == 0
+        assert robot.wait(timeout=EVENT_LIMIT_S) == 0
     result = result_of(folder)
     assert (result["ended"], result["violations"]) == ("done", 0)
     assert {incident.who for incident in incidents_of(folder)} == {"r1", "r2"}
@@ -228,11 +228,11 @@ def test_a_site_finds_world_sim_again(place: Place) -> None:
     os.killpg(world.pid, signal.SIGKILL)
     await_line(site, place.hub, "not there")
     again = place.world_sim("--resume", folder)
-    out, err = again.communicate(timeout=PATIENCE_S)
+    out, err = again.communicate(timeout=EVENT_LIMIT_S)
 
     assert again.returncode == 0, out + err
     for robot in robots.values():
-        assert robot.wait(timeout=PATIENCE_S) == 0
+        assert robot.wait(timeout=EVENT_LIMIT_S) == 0
     first, second = map(result_of, kantor.runs())
     assert first["digest"] == second["digest"]
     assert second["violations"] == 0

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from kantor_protocol.transport.endpoint import free_endpoint
 from support.fleets import await_line, incidents_of, result_of
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -26,7 +27,7 @@ def test_killed_it_goes_on_and_done_it_begins_anew(kantor: "Kantor") -> None:
     second = kantor(*command)
 
     assert second.code == 0, second.err
-    assert robot.wait(60) == 0
+    assert robot.wait(EVENT_LIMIT_S) == 0
     (run,) = kantor.runs()
     assert result_of(run)["ended"] == "done"
     assert [i.kind for i in incidents_of(run) if i.who == "worldsim"] == ["leave", "join"]
@@ -34,7 +35,7 @@ def test_killed_it_goes_on_and_done_it_begins_anew(kantor: "Kantor") -> None:
     third = kantor.start(*command)
     await_line(third, "t=", "waiting for r1")
     third.send_signal(signal.SIGTERM)
-    assert third.wait(60) == 143
+    assert third.wait(EVENT_LIMIT_S) == 143
     assert len(kantor.runs()) == 2
 
 
@@ -48,7 +49,7 @@ def test_a_mission_that_was_not_met_is_not_tried_again(kantor: "Kantor") -> None
     first = kantor.start(*command)
     await_line(first, "  kantor agent r1")
     kantor.start("agent", "r1", "--connect", endpoint)
-    first.communicate(timeout=60)
+    first.communicate(timeout=EVENT_LIMIT_S)
     again = kantor(*command)
 
     assert (first.returncode, again.code) == (1, 1)

@@ -22,6 +22,7 @@ from support.fleets import (
     records_of,
     result_of,
 )
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     from conftest import Kantor
@@ -215,7 +216,7 @@ def test_a_world_sim_that_somebody_kills_goes_on_from_its_record(
         await_act(folder, "r1", 60 * times)
         os.kill(pid_of(folder / "logs" / "worldsim.log"), signal.SIGKILL)
         await_resumed(folder / "logs" / "worldsim.log", times)
-    out, err = process.communicate(timeout=100)
+    out, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     assert "world-sim ended with signal 9; it goes on from its record" in out, err
     result = result_of(folder)
@@ -269,11 +270,11 @@ class ByHand:
     def end(self) -> None:
         """Interrupted, the record is sound, and everybody was told."""
         self.world.send_signal(signal.SIGINT)
-        out, err = self.world.communicate(timeout=60)
+        out, err = self.world.communicate(timeout=EVENT_LIMIT_S)
         assert self.world.returncode == 130, err
         assert "all rules held" in out, out
         for robot in self.robots.values():
-            assert robot.wait(timeout=30) == 0
+            assert robot.wait(timeout=EVENT_LIMIT_S) == 0
         assert self.kantor("verify", self.folder).code == 0
 
 
@@ -311,7 +312,7 @@ def test_of_a_frozen_robot_and_its_successor_one_goes_on(by_hand: ByHand) -> Non
     by_hand.robots["r2"] = by_hand.start_robot("r2")
     assert await_incident(by_hand.folder, "r2", "join", 2).incarnation == 1
     frozen.send_signal(signal.SIGCONT)
-    _, complaint = frozen.communicate(timeout=30)
+    _, complaint = frozen.communicate(timeout=EVENT_LIMIT_S)
     assert frozen.returncode == 2
     assert "another process has taken its place" in complaint
 
@@ -387,7 +388,7 @@ def test_a_slow_reader_does_not_fill_world_sims_memory(kantor: "Kantor") -> None
     await_act(folder, "r1", 2500)
     grown = world.memory_info().rss - before
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=60)
+    process.communicate(timeout=EVENT_LIMIT_S)
     shutil.rmtree(folder)
 
     assert grown < 30e6

@@ -5,12 +5,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-_GIVE_UP_S = 120.0
+from support.limits import EVENT_LIMIT_S
 
 
 def wait_until(condition: Callable[[], bool]) -> None:
     """Look until a condition on files holds: a file has no event to wait for."""
-    give_up = time.monotonic() + _GIVE_UP_S
+    give_up = time.monotonic() + EVENT_LIMIT_S
     while not condition():
         assert time.monotonic() < give_up
         time.sleep(0.005)

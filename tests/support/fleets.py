@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 
 from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.records import Batch, ProcessEvent, Record, StepRecord
+from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     import subprocess
-
-PATIENCE_S = 60.0
 
 
 def result_of(folder: Path) -> dict[str, object]:
@@ -59,7 +58,7 @@ def acts_of(records: Iterable[Record], name: str) -> list[StepRecord]:
 
 def await_incident(folder: Path, who: str, what: str, count: int = 1) -> ProcessEvent:
     """The incident of this kind, once it is on record."""
-    give_up = time.monotonic() + PATIENCE_S
+    give_up = time.monotonic() + EVENT_LIMIT_S
     while time.monotonic() < give_up:
         found = [i for i in incidents_of(folder) if (i.who, i.kind) == (who, what)]
         if len(found) >= count:
@@ -70,7 +69,7 @@ def await_incident(folder: Path, who: str, what: str, count: int = 1) -> Process
 
 def await_act(folder: Path, name: str, after: int = 0) -> StepRecord:
     """The first step of a participant after a number of steps, once it is on record."""
-    give_up = time.monotonic() + PATIENCE_S
+    give_up = time.monotonic() + EVENT_LIMIT_S
     while time.monotonic() < give_up:
         step_records = acts_of(records_of(folder), name)
         if len(step_records) > after:

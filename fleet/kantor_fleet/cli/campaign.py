@@ -16,6 +16,7 @@ def campaign(
     processes: bool = False,
     speed: float = 8.0,
     storm: float = 40.0,
+    rejoin: float = 2.0,
 ) -> int:
     """Draw missions full of faults, seed by seed, and check every event, until a rule is broken.
 
@@ -38,6 +39,7 @@ def campaign(
         processes: On real processes over the bus.
         speed: With --processes: simulated seconds in a real one.
         storm: With --processes: real seconds of each mission in which faults occur.
+        rejoin: With --processes: real seconds within which 99 % of the restarts must have rejoined.
     """
     from kantor_fleet.campaign.run import numbered  # noqa: PLC0415
 
@@ -51,11 +53,13 @@ def campaign(
         check_speed(speed)
         if not 10.0 <= storm <= 600.0:
             fail(Exit.USAGE, f"--storm {storm:g}: give 10 to 600 seconds")
+        if not rejoin > 0.0:
+            fail(Exit.USAGE, f"--rejoin {rejoin:g}: give a time above 0")
         terms = on_processes.Terms(speed, storm)
         if replay is not None:
             return on_processes.replay(replay, out, terms)
         drawn = numbered(seeds or ("18" if minutes is None else "1000"))
-        return on_processes.soak(on_processes.Soak(drawn, out, terms, minutes))
+        return on_processes.soak(on_processes.Soak(drawn, out, terms, minutes, rejoin))
 
     from kantor_fleet.campaign.mission import attempt  # noqa: PLC0415
     from kantor_fleet.campaign.run import CampaignConfig  # noqa: PLC0415

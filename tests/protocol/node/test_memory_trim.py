@@ -3,9 +3,12 @@
 import subprocess
 import sys
 
+import pytest
+
 _SCRIPT = """
 import re
 from pathlib import Path
+
 import numpy as np
 from numba import njit
 from kantor_protocol.node.memory_trim import release_file_pages
@@ -31,6 +34,7 @@ assert compiled(3)(np.arange(4.0)) == 18.0
 """
 
 
+@pytest.mark.processes
 def test_what_a_file_holds_is_release_file_pages_and_comes_back() -> None:
     """Tens of megabytes are not resident any more; what is compiled runs, and the next compiles."""
     done = subprocess.run(

@@ -104,6 +104,7 @@ for coordination in ("centralized", "decentralized"):
 """
 
 
+@pytest.mark.processes
 def test_record_does_not_depend_on_the_hash_seed() -> None:
     """No set or dictionary order of the interpreter reaches a record."""
     from support.strategies import SMALL

@@ -761,6 +761,7 @@ def test_a_mission_on_a_density_outlives_every_fault(
     assert result.finished_tick is not None
 
 
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", SCHEDULE)
 @pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
 def test_a_mission_on_a_map_outlives_every_fault(coordination: str, name: str) -> None:

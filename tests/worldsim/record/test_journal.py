@@ -251,6 +251,7 @@ def test_run_leaves_a_whole_record(whole_run: tuple[Path, Result]) -> None:
     assert load(folder / SCENARIO) == mission(*LONG)
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("size", ["100k", "400k", "700k", "1m"])
 def test_full_disk_cuts_the_record_not_the_mission(
     whole_run: tuple[Path, Result], tmp_path: Path, size: str
@@ -281,6 +282,7 @@ recording.finish()
 """
 
 
+@pytest.mark.processes
 def test_file_size_limit_cuts_the_record(whole_run: tuple[Path, Result], tmp_path: Path) -> None:
     """A limit on the size of a file is a full disk for the journal alone."""
     source, result = whole_run
@@ -314,6 +316,7 @@ sys.stdin.read()
 """
 
 
+@pytest.mark.processes
 def test_killed_writer_loses_nothing_that_it_took(
     whole_run: tuple[Path, Result], tmp_path: Path
 ) -> None:
