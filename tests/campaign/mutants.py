@@ -646,7 +646,7 @@ def register_off_by_one(patch: Patch) -> None:
 @mutant("a step is noted after it was told, and the diary is trusted", _has(Kill))
 def late_write(patch: Patch) -> None:
     def kill(self: KillableNode) -> None:
-        self._life = None
+        self._node = None
         del self._wal._inputs[-1:]
 
     patch.setattr(KillableNode, "kill", kill)
@@ -671,7 +671,7 @@ def amnesia(patch: Patch) -> None:
     def start(self: KillableNode, body: Body, disk: str) -> tuple[int, int]:
         self._wal = InMemoryLog()
         newborn = Body(body.pose, 0, 0, body.incarnation)
-        self._life = RecoverableNode(self._build, self._wal, newborn)
+        self._node = RecoverableNode(self._build, self._wal, newborn)
         return body.incarnation, body.step
 
     patch.setattr(KillableNode, "start", start)
@@ -682,7 +682,7 @@ def amnesia(patch: Patch) -> None:
     _has(Kill, disk=("torn", "lost")),
 )
 def old_incarnation_used_again(patch: Patch) -> None:
-    patch.setattr(recovery, "_reborn", lambda body: body)
+    patch.setattr(recovery, "_reincarnated", lambda body: body)
 
 
 @mutant("every start is a new incarnation, though the diary is whole", _has(Kill, disk=("kept",)))
@@ -695,11 +695,11 @@ def needless_incarnation(patch: Patch) -> None:
 
 @mutant("asked again, a robot does its step once more", _has(Kill, mid_step=(True,)))
 def answering_a_turn_twice(patch: Patch) -> None:
-    def take(self: RecoverableNode, entry: bytes) -> Any:
-        self._wal.note(entry)
-        return self._live(decode_inputs(entry))
+    def step_encoded(self: RecoverableNode, entry: bytes) -> Any:
+        self._wal.append(entry)
+        return self._advance(decode_inputs(entry))
 
-    patch.setattr(RecoverableNode, "take", take)
+    patch.setattr(RecoverableNode, "step_encoded", step_encoded)
 
 
 @mutant("a step is not counted now and then", _density)
