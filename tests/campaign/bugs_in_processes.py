@@ -34,7 +34,7 @@ def _strikes_several(scenario: Scenario) -> bool:
 @mutant("a step is logged after it was reported, and the log is trusted", has(Kill))
 def late_write(patch: Patch) -> None:
     def kill(self: KillableNode) -> None:
-        self._life = None
+        self._node = None
         del self._wal._inputs[-1:]
 
     patch.setattr(KillableNode, "kill", kill)
@@ -59,7 +59,7 @@ def amnesia(patch: Patch) -> None:
     def start(self: KillableNode, body: Body, disk: str) -> tuple[int, int]:
         self._wal = InMemoryLog()
         newborn = Body(body.pose, 0, 0, body.incarnation)
-        self._life = RecoverableNode(self._build, self._wal, newborn)
+        self._node = RecoverableNode(self._build, self._wal, newborn)
         return body.incarnation, body.step
 
     patch.setattr(KillableNode, "start", start)
@@ -84,8 +84,8 @@ def needless_incarnation(patch: Patch) -> None:
 @mutant("asked again, a robot does its step once more", has(Kill, mid_step=(True,)))
 def answering_a_turn_twice(patch: Patch) -> None:
     def step(self: RecoverableNode, entry: bytes) -> Any:
-        self._wal.note(entry)
-        return self._live(decode_inputs(entry))
+        self._wal.append(entry)
+        return self._advance(decode_inputs(entry))
 
     patch.setattr(RecoverableNode, "step_encoded", step)
 
@@ -141,7 +141,7 @@ def late_joiner_comes_early(patch: Patch) -> None:
 
 @mutant("an impostor is let in", has(Impostor))
 def impostor_let_in(patch: Patch) -> None:
-    patch.setattr(InProcessExchange, "pretend", lambda _self, _name: True)
+    patch.setattr(InProcessExchange, "admits_impostor", lambda _self, _name: True)
 
 
 @mutant(
@@ -155,7 +155,7 @@ def clock_skew_leaks_into_physics(patch: Patch) -> None:
 
         return acted
 
-    wrap(patch, Simulation, "_act", make)
+    wrap(patch, Simulation, "_accept", make)
 
 
 @mutant(
@@ -200,7 +200,7 @@ def _rescheduled(
 def process_starts_early(patch: Patch) -> None:
     def earlier(scheduled: ScheduledProcessFault, scenario: Scenario) -> ScheduledProcessFault:
         fault = scenario.faults[scheduled.fault]
-        if scheduled.what != "start" or fault.until_ns is None:
+        if scheduled.kind != "start" or fault.until_ns is None:
             return scheduled
         early_ns = (fault.until_ns - fault.from_ns) // 10
         return scheduled._replace(at_ns=scheduled.at_ns - early_ns)

@@ -270,7 +270,9 @@ def one_way_the_other_way(patch: Patch) -> None:
 # Who hears an envelope.
 
 
-def _hears_by_the_longer_axis(field: channel.Field, one: int, other: int, range_m: float) -> bool:
+def _hears_by_the_longer_axis(
+    field: channel.LinkGeometry, one: int, other: int, range_m: float
+) -> bool:
     dx = abs(field.xy_m[other, 0] - field.xy_m[one, 0])
     dy = abs(field.xy_m[other, 1] - field.xy_m[one, 1])
     return max(dx, dy) <= range_m

@@ -48,7 +48,7 @@ def _merging(
 
         return learnt
 
-    wrap(patch, Replica, "learn", make)
+    wrap(patch, Replica, "merge", make)
 
 
 @mutant("min: takes the larger of two weights", minimum)
@@ -151,7 +151,7 @@ def inventing_acknowledgements(patch: Patch) -> None:
     def make(compose: Any) -> Any:
         def composed(self: Replica, target: int = -1) -> tuple[bytes, bytes, bytes]:
             parts: tuple[bytes, bytes, bytes] = compose(self, target)
-            slots = self.slots
+            slots = self.origins
             self.store.known[:, :slots] = np.maximum(self.store.known[:, :slots], self.store.length)
             return parts
 
@@ -164,7 +164,7 @@ def inventing_acknowledgements(patch: Patch) -> None:
 def forgetting_to_forward(patch: Patch) -> None:
     def make(compose: Any) -> Any:
         def composed(self: Replica, target: int = -1) -> tuple[bytes, bytes, bytes]:
-            slots, me = self.slots, self.config.me
+            slots, me = self.origins, self.config.me
             foreign = np.arange(slots) != me
             known = self.store.known[:, :slots]
             known[:, foreign] = np.maximum(known[:, foreign], self.store.length[foreign])
@@ -186,7 +186,7 @@ def hostile_message_taken_in(patch: Patch) -> None:
 
         return heard
 
-    wrap(patch, Gossip, "hear", make)
+    wrap(patch, Gossip, "receive", make)
 
 
 @mutant("sound messages are refused now and then")
@@ -199,7 +199,7 @@ def sound_message_refused(patch: Patch) -> None:
 
         return heard
 
-    wrap(patch, Gossip, "hear", make)
+    wrap(patch, Gossip, "receive", make)
 
 
 @mutant("a new incarnation counts its messages from 1 again", has(Kill, disk=("torn", "lost")))
@@ -212,7 +212,7 @@ def sequences_used_again(patch: Patch) -> None:
 
         return said
 
-    wrap(patch, Gossip, "say", make)
+    wrap(patch, Gossip, "compose", make)
 
 
 @mutant("a robot that has lost its supervisor talks to it for ever", supervised)
@@ -224,7 +224,7 @@ def supervisor_never_given_up(patch: Patch) -> None:
 
         return said
 
-    wrap(patch, Gossip, "say", make)
+    wrap(patch, Gossip, "compose", make)
 
 
 @mutant("a robot that has given its supervisor up never returns to it", supervised)
@@ -239,7 +239,7 @@ def supervisor_never_heard_again(patch: Patch) -> None:
 
         return said
 
-    wrap(patch, Gossip, "say", make)
+    wrap(patch, Gossip, "compose", make)
 
 
 # The reader of version vectors in `wire`.

@@ -114,7 +114,7 @@ def weight_that_rises(patch: Patch) -> None:
 
         return learnt
 
-    wrap(patch, Replica, "learn", make)
+    wrap(patch, Replica, "merge", make)
 
 
 @mutant("what is published misses an entry now and then", density)
