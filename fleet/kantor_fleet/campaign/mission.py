@@ -18,8 +18,8 @@ from kantor_fleet.execution.in_process_team import play
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.observers.checkers.checker import Checker
 from kantor_worldsim.observers.checkers.liveness import LivenessChecker
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.observers.recording import Recording
-from kantor_worldsim.record.columnar import ColumnarDecoder
 from kantor_worldsim.record.journal import Digest, Journal, read
 from kantor_worldsim.record.records import Record, decode_record, encode_record
 from kantor_worldsim.record.run_folder import JOURNAL
@@ -111,8 +111,7 @@ class Follower:
 
     def observe(self, record: Record) -> None:
         """Follow one record."""
-        self.recording.observe(record)
-        self.payloads.append(self.recording.payload)
+        self.payloads.append(self.recording.observe(record).payload)
         self.struck.observe(record)
         self.sightings.observe(record)
 
@@ -133,13 +132,10 @@ class Follower:
 
     def _judged(self) -> list[str]:
         """What referees find who have nothing but the bytes of the record."""
-        decoder, liveness = ColumnarDecoder(), LivenessChecker()
-        checker = Checker(decoder)
+        checker, liveness = Checker(), LivenessChecker()
+        pipeline = Pipeline(checker, liveness)
         for payload in self.payloads:
-            record = decode_record(payload)
-            decoder.read(record, payload)
-            checker.observe(record)
-            liveness.observe(record)
+            pipeline.observe(decode_record(payload), payload)
         self.judged = frozenset(liveness.judged)
         return checker.complaints or liveness.complaints
 
@@ -197,9 +193,8 @@ def _cut_open(seed: int, payloads: list[bytes]) -> Iterable[str]:
             found = list(read(path))
             if [payload for payload, _ in found] != payloads[: len(found)]:
                 yield "prefix: what is left of a journal that was cut is not what was written"
-            decoder = ColumnarDecoder()
-            checker = Checker(decoder)
+            checker = Checker()
+            pipeline = Pipeline(checker)
             for payload, record in found:
-                decoder.read(record, payload)
-                checker.observe(record)
+                pipeline.observe(record, payload)
             yield from checker.complaints

@@ -44,6 +44,7 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.transport.session import BusError
 from kantor_worldsim.engine.process_faults import schedule_of
 from kantor_worldsim.observers.checkers.liveness import LivenessChecker
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.journal import Digest, read
 from kantor_worldsim.record.records import Batch, ProcessEvent, Record, encode_record
 from kantor_worldsim.record.run_folder import JOURNAL, SCENARIO
@@ -223,9 +224,10 @@ def _judged(config: FleetConfig, failures: list[str]) -> ProcessMission:
     journal = list(read(folder / JOURNAL))
     records = [record for _, record in journal]
     struck, liveness = FaultCoverage(), LivenessChecker()
-    for record in records:
+    pipeline = Pipeline(liveness)
+    for payload, record in journal:
         struck.observe(record)
-        liveness.observe(record)
+        pipeline.observe(record, payload)
     complaints = [*failures, *result.complaints]
     if result.ended != "done" or result.record != "whole":
         complaints.append(f"end: {result.ended}; record {result.record}")

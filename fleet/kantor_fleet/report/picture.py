@@ -34,6 +34,7 @@ from kantor_protocol.base.random_walk import RandomWalk
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.scenario.faults.processes import Late
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.observers.recording import metrics_of
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
 
@@ -115,7 +116,8 @@ class RunHistory:
         self._left = np.full(self.site.samples_m.shape[0], self._units.sample, dtype=np.int64)
         self._finished_ns: dict[ParticipantId, int] = {}
         self._pairs = Pairs()
-        self.metrics.observe(opening)
+        self._pipeline = Pipeline(self.metrics)
+        self._pipeline.observe(opening)
 
     @classmethod
     def of(cls, records: Iterable[Record]) -> "RunHistory | None":
@@ -159,7 +161,7 @@ class RunHistory:
 
     def follow(self, record: Record) -> None:
         """Take in one record after the opening."""
-        self.metrics.observe(record)
+        self._pipeline.observe(record)
         if isinstance(record, ProcessEvent):
             self._befall(record)
         if not isinstance(record, Opening):
