@@ -127,7 +127,7 @@ def test_renewed_and_revoked(tmp_path: Path) -> None:
     assert router.objection(old["r3"], team) == ""
 
     issue(tmp_path, Wanted("demo", 3), NOW)
-    assert "r2" not in register(tmp_path).members
+    assert "r2" not in authority_in(tmp_path).members
     issue(tmp_path, Wanted("demo", renew=("r2",)), NOW)
     router = identity(tmp_path, "worldsim")
     assert router.objection(identity(tmp_path, "r2").name, team) == ""

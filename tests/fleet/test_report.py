@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from kantor_fleet.execution.in_process_team import team
-from kantor_fleet.report.picture import RunHistory, Trail
+from kantor_fleet.report.history import RunHistory, Trail
 from kantor_fleet.report.report import draw
 from kantor_fleet.report.style import team_colours
 from kantor_protocol.base.counter_rng import Purpose

@@ -10,7 +10,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
-from kantor_fleet.report.picture import RunHistory, draw_bumps, draw_known
+from kantor_fleet.report.history import RunHistory
+from kantor_fleet.report.map_drawing import draw_bumps, draw_known
 from kantor_fleet.report.report import draw
 from kantor_fleet.report.summary import summary
 from kantor_protocol.base.grid import Frame
