@@ -272,8 +272,11 @@ def test_plain_zenoh_is_not_taken_in_by_a_false_world_sim_either(folder: Path) -
 
 def test_a_certificate_counts_until_it_expires(folder: Path) -> None:
     """A robot that is on the bus when its certificate expires leaves it at that moment."""
-    soon = datetime.now(UTC) - timedelta(days=1) + timedelta(seconds=4)
-    make(folder, soon, renew=("r1",), days=1)
+    began = datetime.now(UTC)
+    with hosted(identity(folder, "worldsim"), endpoint := free_endpoint("tls"), []):
+        join(endpoint, identity(folder, "r1"))
+    until = timedelta(seconds=3) + 5 * (datetime.now(UTC) - began)  # time enough to join here
+    make(folder, datetime.now(UTC) - timedelta(days=1) + until, renew=("r1",), days=1)
     r1 = identity(folder, "r1")
     with (
         hosted(identity(folder, "worldsim"), endpoint := free_endpoint("tls"), []) as host,

@@ -17,6 +17,7 @@ from support.fleets import (
     await_act,
     await_incident,
     await_line,
+    await_text,
     children_named,
     incidents_of,
     records_of,
@@ -141,13 +142,13 @@ def test_whatever_befalls_processes_the_record_is_the_same_over_the_bus(doomed: 
 
 
 def test_whatever_befalls_processes_they_go_on_by_their_own_clocks(doomed: "Kantor") -> None:
-    """The same schedule on the wall: every rule holds, everybody is back within two seconds, and each
-    life replays from what it heard.
+    """The same schedule in real time: every rule holds, all that were started again step again, and each
+    incarnation replays from what it received.
     """
-    speed = 4
     finished = doomed(
-        "run", "fleet", "--exchange", "wall", "--speed", speed, "--chaos", "everything.toml", *SHORT
-    )
+        "run", "fleet", "--exchange", "wall", "--speed", 4, "--chaos", "everything.toml", *SHORT,
+        "limit_s=50",
+    )  # fmt: skip
     (folder,) = doomed.runs()
     assert "all rules held" in finished.out, finished.out + finished.err
     incidents = incidents_of(folder)
@@ -157,11 +158,11 @@ def test_whatever_befalls_processes_they_go_on_by_their_own_clocks(doomed: "Kant
         "kill", "start", "pause", "resume", "fill", "free", "slow", "quicken", "pretend",
     }  # fmt: skip
     assert not [i for i in incidents if i.fault < 0]
+    records = records_of(folder)
     ordered = {(2.0, "r4"), (8.0, "r2"), (9.0, "r1"), (8.5, "r3"), (13.0, "r2")}
     for due_s, who in ordered:
         back_ns = min(i.now_ns for i in starts if i.who == who and i.now_ns >= due_s * 1e9)
-        assert (back_ns * 1e-9 - due_s) / speed < 2.0
-    records = records_of(folder)
+        assert any(step_record.now_ns > back_ns for step_record in acts_of(records, who))
     assert nothing_happens_between(records, "kill", "start", "worldsim")
     assert nothing_happens_between(records, "pause", "resume", "worldsim")
     full = [i.now_ns for i in incidents if i.kind in {"fill", "free"}]
@@ -187,12 +188,17 @@ def test_robots_go_on_without_the_supervisor_and_with_it_again(kantor: "Kantor")
     (kantor.folder / "headless.toml").write_text(
         '[[faults]]\nkind = "kill"\nwho = ["supervisor"]\nfrom_s = 10.0\nuntil_s = 20.0\n'
     )
-    finished = kantor(
+    process = kantor.start(
         "run", "paper-timevarying", "--exchange", "wall", "--speed", 8, "--chaos", "headless.toml",
-        "--set", "limit_s=40",
+        "--set", "limit_s=100000", "energy.points=50000", "energy.steps=50000",
     )  # fmt: skip
+    await_line(process, "t=", "energy")
     (folder,) = kantor.runs()
-    assert "all rules held" in finished.out, finished.out + finished.err
+    before = await_incident(folder, "supervisor", "start").now_ns
+    await_act(folder, "supervisor", since_ns=before + 1)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=EVENT_LIMIT_S)
+    assert "all rules held" in out, out + err
     kill, start = incidents_of(folder)
     records = records_of(folder)
     meanwhile = [a for a in acts_of(records, "r1") if kill.now_ns < a.now_ns < start.now_ns]
@@ -206,16 +212,17 @@ def test_a_world_sim_that_somebody_kills_goes_on_from_its_record(
     kantor: "Kantor", exchange: str
 ) -> None:
     """SIGKILL from outside, twice: the mission goes on to its end. Turn by turn nobody can tell."""
-    mission = ("run", "fleet", "--seed", 3, *SHORT)
-    if exchange == "lockstep":  # it must not be over before it is killed
-        mission = (*mission, "limit_s=200")
+    # It must not be over before it is killed.
+    limit = "limit_s=200" if exchange == "lockstep" else "limit_s=60"
+    mission = ("run", "fleet", "--seed", 3, *SHORT, limit)
+    steps = 60 if exchange == "lockstep" else 20
     process = kantor.start(*mission, "--exchange", exchange, "--speed", 4)
     await_line(process, "t=", "energy")
     (folder,) = kantor.runs()
     for times in (1, 2):
-        await_act(folder, "r1", 60 * times)
+        await_act(folder, "r1", steps * times)
         os.kill(pid_of(folder / "logs" / "worldsim.log"), signal.SIGKILL)
-        await_resumed(folder / "logs" / "worldsim.log", times)
+        await_text(folder / "logs" / "worldsim.log", "resumed", times)
     out, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     assert "world-sim ended with signal 9; it goes on from its record" in out, err
@@ -235,12 +242,6 @@ def test_a_world_sim_that_somebody_kills_goes_on_from_its_record(
 def pid_of(log: Path) -> int:
     """The last process that wrote a log."""
     return int(log.read_text().splitlines()[-1].partition('"pid": ')[2].partition(",")[0])
-
-
-def await_resumed(log: Path, times: int) -> None:
-    """Wait until a log says so, so many times."""
-    while log.read_text().count("resumed") < times:
-        pass
 
 
 @pytest.fixture
@@ -373,12 +374,12 @@ def test_what_cannot_be_is_refused_with_a_line(kantor: "Kantor") -> None:
 def test_a_slow_reader_does_not_fill_world_sims_memory(kantor: "Kantor") -> None:
     """Two robots of three are frozen while the third speaks at length: world-sim's memory is flat."""
     (kantor.folder / "frozen.toml").write_text(
-        '[[faults]]\nkind = "pause"\nwho = ["r2", "r3"]\nfrom_s = 2.0\nuntil_s = 400.0\n'
+        '[[faults]]\nkind = "pause"\nwho = ["r2", "r3"]\nfrom_s = 2.0\nuntil_s = 90000.0\n'
     )
     process = kantor.start(
         "run", "fleet", "--exchange", "wall", "--speed", 40, "--chaos", "frozen.toml", "--set",
         "robots.count=3", "starts.random=true", "radio.range_m=inf", "radio.beacon='state'",
-        "limit_s=500",
+        "limit_s=100000",
     )  # fmt: skip
     await_line(process, "t=", "energy")
     (folder,) = kantor.runs()
