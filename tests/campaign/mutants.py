@@ -92,12 +92,12 @@ def mutant(
     return add
 
 
-def hunt(one: Mutant, limit: int = LIMIT) -> Catch | None:
-    """Run the missions of a campaign, from seed 0 on, until one catches the bug; None if none does."""
+def hunt(one: Mutant, first: int = 0, limit: int = LIMIT) -> Catch | None:
+    """Run missions of a campaign, from a seed on, until one catches the bug; None if none below the limit does."""
     started_s = time.monotonic()
     with pytest.MonkeyPatch.context() as patch:
         one.plant(patch)
-        for seed in range(limit):
+        for seed in range(first, limit):
             scenario = draw(seed)
             if not one.touches(scenario):
                 continue
@@ -776,6 +776,14 @@ def clock_skew_leaks_into_physics(patch: Patch) -> None:
 )
 def clock_stays_right(patch: Patch) -> None:
     patch.setattr(process_faults.ProcessFaults, "skew_ns", lambda *_: 0)
+
+
+def recorded_seed(name: str, path: Path = TABLE) -> int:
+    """The seed at which the table says that a bug is caught; 0 if it does not know."""
+    rows = (line.split(" | ") for line in path.read_text(encoding="utf-8").splitlines())
+    seeds = (row[2] for row in rows if row[0] == f"| {name}")
+    seed = next(seeds, "")
+    return int(seed) if seed.isdigit() else 0
 
 
 def write(hunted: list[tuple[Mutant, Catch | None]], path: Path = TABLE) -> None:

@@ -71,12 +71,12 @@ def test_registers_are_the_same_in_process_and_over_the_bus(kantor: "Kantor") ->
     assert "every byte the same" in kantor("verify", kantor.runs()[-1]).out
 
 
-def test_a_wall_run_finds_what_virtual_time_finds(kantor: "Kantor") -> None:
+def test_a_realtime_run_finds_what_virtual_time_finds(kantor: "Kantor") -> None:
     """Robots with different periods, drift and jitter, each on its own timer: detection within five
     points of virtual time (median of seven seeds), every rule held, and each robot replays from its
     recorded inbox.
     """
-    # With a budget of energy both end after the same number of steps, whoever met whom.
+    # With a budget of energy both end after the same number of steps, whichever robots met.
     name = "paper-centralized-concurrent"
     clocks = ("clock.spread=0.1", "clock.drift_ppm=1000", "clock.jitter_s=0.01")
     overrides = ("merge='ledger'", "claims=true", *clocks)
@@ -125,7 +125,7 @@ def test_ctrl_c_ends_every_process_and_leaves_a_valid_record(kantor: "Kantor") -
     assert kantor("verify", folder).code == 0
 
 
-def test_robots_start_by_hand_in_any_order(kantor: "Kantor") -> None:
+def test_standalone_robots_start_in_any_order(kantor: "Kantor") -> None:
     """r2 before world-sim, the supervisor and r1 after it; each needs an endpoint, an id and
     credentials, and gets the mission from world-sim.
     """

@@ -1,4 +1,4 @@
-"""Processes that are killed, frozen, doubled and starved on the real bus, and what they make of it."""
+"""Process faults on the real bus: processes are killed, frozen, doubled and starved, and go on."""
 
 import os
 import shutil
@@ -120,9 +120,9 @@ def doomed(kantor: "Kantor") -> "Kantor":
     return kantor
 
 
-def test_whatever_befalls_processes_the_record_is_the_same_over_the_bus(doomed: "Kantor") -> None:
-    """Real SIGKILLs, diaries that are torn and deleted, world-sim killed twice: the same bytes as in one
-    process, and verify executes them once more.
+def test_process_faults_over_the_bus_leave_the_record_of_one_process(doomed: "Kantor") -> None:
+    """Real SIGKILLs, write-ahead logs that are torn and deleted, world-sim killed twice: the same bytes as in
+    one process, and verify executes them once more.
     """
     for exchange in ("in-process", "lockstep"):
         finished = doomed(
@@ -141,7 +141,7 @@ def test_whatever_befalls_processes_the_record_is_the_same_over_the_bus(doomed: 
     assert doomed("verify", bus).code == 0
 
 
-def test_whatever_befalls_processes_they_go_on_by_their_own_clocks(doomed: "Kantor") -> None:
+def test_process_faults_in_real_time_break_no_rule(doomed: "Kantor") -> None:
     """The same schedule in real time: every rule holds, all that were started again step again, and each
     incarnation replays from what it received.
     """
@@ -184,7 +184,7 @@ def nothing_happens_between(records: list[object], first: str, last: str, who: s
 
 
 def test_robots_go_on_without_the_supervisor_and_with_it_again(kantor: "Kantor") -> None:
-    """Killed and started again with its diary; robots explore meanwhile."""
+    """It is killed and started again with its write-ahead log; robots explore meanwhile."""
     (kantor.folder / "headless.toml").write_text(
         '[[faults]]\nkind = "kill"\nwho = ["supervisor"]\nfrom_s = 10.0\nuntil_s = 20.0\n'
     )
@@ -208,10 +208,8 @@ def test_robots_go_on_without_the_supervisor_and_with_it_again(kantor: "Kantor")
 
 
 @pytest.mark.parametrize("exchange", ["lockstep", "wall"])
-def test_a_world_sim_that_somebody_kills_goes_on_from_its_record(
-    kantor: "Kantor", exchange: str
-) -> None:
-    """SIGKILL from outside, twice: the mission goes on to its end. Turn by turn nobody can tell."""
+def test_a_killed_world_sim_goes_on_from_its_record(kantor: "Kantor", exchange: str) -> None:
+    """SIGKILL from outside, twice: the mission goes on to its end; in lockstep with the same digest."""
     # It must not be over before it is killed.
     limit = "limit_s=200" if exchange == "lockstep" else "limit_s=60"
     mission = ("run", "fleet", "--seed", 3, *SHORT, limit)
@@ -246,12 +244,12 @@ def pid_of(log: Path) -> int:
 
 @pytest.fixture
 def by_hand(kantor: "Kantor") -> "ByHand":
-    """A world-sim and its robots, each started by hand."""
+    """A world-sim and its robots, each started on its own."""
     return ByHand(kantor)
 
 
 class ByHand:
-    """A fleet that somebody started process by process."""
+    """A fleet that is started process by process."""
 
     def __init__(self, kantor: "Kantor") -> None:
         self.kantor = kantor
@@ -269,7 +267,7 @@ class ByHand:
         return self.kantor.start("agent", name, "--connect", self.endpoint)
 
     def end(self) -> None:
-        """Interrupted, the record is sound, and everybody was told."""
+        """Interrupt world-sim: the record is sound, and all robots end."""
         self.world.send_signal(signal.SIGINT)
         out, err = self.world.communicate(timeout=EVENT_LIMIT_S)
         assert self.world.returncode == 130, err
@@ -280,7 +278,7 @@ class ByHand:
 
 
 def test_a_robot_that_is_killed_and_started_again_goes_on_where_it_was(by_hand: ByHand) -> None:
-    """With its diary as the same incarnation; without, as the next one; r1 goes on meanwhile."""
+    """With its write-ahead log as the same incarnation; without, as the next one; r1 goes on meanwhile."""
     for incarnation in (0, 1):
         by_hand.robots["r2"].kill()
         left = await_incident(by_hand.folder, "r2", "leave", incarnation + 1)
@@ -296,7 +294,7 @@ def test_a_robot_that_is_killed_and_started_again_goes_on_where_it_was(by_hand: 
     by_hand.end()
 
 
-def test_of_a_frozen_robot_and_its_successor_one_goes_on(by_hand: ByHand) -> None:
+def test_a_frozen_robot_goes_on_unless_it_has_a_successor(by_hand: ByHand) -> None:
     """Frozen for longer than a lease it is back by itself; with a successor it is sent away, and the two
     never share a diary.
     """
@@ -320,7 +318,7 @@ def test_of_a_frozen_robot_and_its_successor_one_goes_on(by_hand: ByHand) -> Non
     by_hand.end()
 
 
-def test_world_sim_by_hand_resumes_a_run_folder(by_hand: ByHand) -> None:
+def test_a_standalone_world_sim_resumes_a_run_folder(by_hand: ByHand) -> None:
     """Killed, then `--resume`: robots have held, and go on; r2, which died meanwhile, comes back too."""
     by_hand.world.kill()
     by_hand.world.wait()
@@ -339,8 +337,8 @@ def test_world_sim_by_hand_resumes_a_run_folder(by_hand: ByHand) -> None:
     assert len(by_hand.kantor.runs()) == 1
 
 
-def test_what_cannot_be_is_refused_with_a_line(kantor: "Kantor") -> None:
-    """Faults of processes without hands, nowhere for a diary, folders that no run can go on from."""
+def test_impossible_commands_are_refused_in_a_line(kantor: "Kantor") -> None:
+    """Process faults without a process controller, no place for a write-ahead log, folders to resume nothing from."""
     (kantor.folder / "kill.toml").write_text(
         '[[faults]]\nkind = "kill"\nwho = ["r1"]\nfrom_s = 1.0\n'
     )
