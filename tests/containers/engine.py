@@ -24,11 +24,11 @@ _PACKAGES = ("docker.io", "docker-compose", "debootstrap")
 
 
 class NoEngineError(RuntimeError):
-    """There is none and none can be had here; the message says why."""
+    """No engine runs, and none can be started here; the message says why."""
 
 
 def call(*command: object, folder: Path = ROOT, **environment: str) -> str:
-    """What a command prints; fails with its last words."""
+    """The output of a command; fails with the end of it."""
     done = subprocess.run(
         list(map(str, command)),
         cwd=folder,
@@ -55,7 +55,7 @@ def an_engine() -> Iterator[None]:
             while not _answers():
                 if engine.poll() is not None or time.monotonic() > give_up:
                     raise NoEngineError(f"dockerd does not come up; see {log.name}")
-                time.sleep(0.2)  # it tells nobody
+                time.sleep(0.2)  # it sends no event
             yield
         finally:
             engine.terminate()
@@ -137,13 +137,13 @@ class Fleet:
         )
 
     def remove(self) -> None:
-        """All that it made, whatever state it is in."""
+        """Remove all that it made, in any state."""
         for name in self.compose("ps", "--quiet").split():
             subprocess.run(["docker", "unpause", name], capture_output=True, check=False)
         self.compose("--profile", "centralized", "down", "--volumes", "--timeout", "1")
 
     def id(self, service: str) -> str:
-        """Of a service's container."""
+        """The id of a service's container."""
         return call(
             "docker", "ps", "--all", "--quiet", "--no-trunc",
             "--filter", f"label=com.docker.compose.project={self.project}",
@@ -151,18 +151,18 @@ class Fleet:
         )  # fmt: skip
 
     def inspect(self, service: str) -> dict[str, Any]:
-        """What the engine knows of a container."""
+        """The description of a container by the engine."""
         (tree,) = json.loads(call("docker", "inspect", self.id(service)))
         assert isinstance(tree, dict)
         return tree
 
     def run_folder(self) -> Path:
-        """Of the only run."""
+        """The folder of the only run."""
         (folder,) = (path.parent for path in (self.folder / "runs").glob("*/manifest.json"))
         return folder
 
     def log(self, service: str) -> str:
-        """What it has said, with the engine's times."""
+        """The log of a service, with the engine's times."""
         return call("docker", "logs", "--timestamps", self.id(service)) if self.id(service) else ""
 
     def await_log(self, service: str, pattern: str) -> str:
@@ -172,7 +172,7 @@ class Fleet:
             for line in self.log(service).splitlines():
                 if re.search(pattern, line):
                     return line
-            time.sleep(0.1)  # the engine tells nobody
+            time.sleep(0.1)  # the engine sends no event
         raise AssertionError(f"{service} never says {pattern!r}: {self.log(service)[-1000:]}")
 
     def await_state(self, service: str, state: str, key: str = "Status") -> None:
@@ -197,7 +197,7 @@ def _moment(text_: str) -> datetime:
 
 
 def keys(folder: Path, wanted: Wanted) -> None:
-    """Certificates, for the eyes of whoever runs the containers."""
+    """Certificates that the user of the containers can read."""
     issue(folder, wanted, today())
     if os.getuid() == 0:
         call("chown", "-R", "10001:10001", folder)

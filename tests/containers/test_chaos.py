@@ -12,7 +12,7 @@ def faults(*entries: dict[str, object]) -> tuple[Fault, ...]:
     return msgspec.convert({"faults": entries}, Chaos).faults
 
 
-def test_deeds_come_in_order_and_ends_before_beginnings() -> None:
+def test_commands_come_in_order_and_ends_before_beginnings() -> None:
     """A pause that follows a cut at the same moment."""
     deeds = commands_of(
         faults(
@@ -44,7 +44,7 @@ def test_deeds_come_in_order_and_ends_before_beginnings() -> None:
         {"kind": "partition", "shape": "halves"},
     ],
 )
-def test_what_no_engine_can_do_is_refused(
+def test_faults_that_no_engine_can_inject_are_refused(
     entry: dict[str, object], capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In one line that says what it can."""

@@ -34,7 +34,7 @@ def test_the_file_of_the_repository_is_what_the_command_writes(kantor: "Kantor")
 @pytest.mark.parametrize(
     "order", [ComposeConfig(5), ComposeConfig(8, isolated=True), ComposeConfig(3, supervisor=True)]
 )
-def test_everybody_gets_an_identity_and_nobody_a_privilege(order: ComposeConfig) -> None:
+def test_each_service_has_an_identity_and_no_privilege(order: ComposeConfig) -> None:
     """A secret of its own, a read-only root, no capability, limits."""
     tree = read(order)
     people = {f"r{i}" for i in range(1, order.robots + 1)} | (
@@ -82,7 +82,7 @@ def test_a_hub_elsewhere_leaves_the_robots_alone_in_the_file() -> None:
         (("--scenario", "nowhere"), "no packaged scenario"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_line(
+def test_impossible_options_are_refused_in_a_line(
     kantor: "Kantor", arguments: tuple[object, ...], line: str
 ) -> None:
     """With the remedy, before anything is written."""

@@ -1,4 +1,4 @@
-"""Who does not belong, from a container on the fleet's own network: gets no word in, and hears nothing."""
+"""Strangers in a container on the fleet's own network: none gets a message in or out."""
 
 import subprocess
 from collections.abc import Callable
@@ -63,8 +63,8 @@ def run(fleet: Fleet, folder: Path, *command: object) -> "subprocess.CompletedPr
     )  # fmt: skip
 
 
-def test_nobody_gets_in_who_does_not_belong(fleet_of: MakeFleet, tmp_path: Path) -> None:
-    """No certificate, a foreign authority's, another robot's: refused, with a line on both sides, or heard by nobody."""
+def test_strangers_on_the_network_are_refused(fleet_of: MakeFleet, tmp_path: Path) -> None:
+    """No certificate, a foreign authority's, another robot's: refused, with a line on both sides, or heard by no process."""
     fleet = fleet_of(ComposeConfig(2), set="starts.random=true radio.range_m=800")
     fleet.compose("up", "--detach")
     fleet.await_log("worldsim", "explored")

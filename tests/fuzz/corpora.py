@@ -355,7 +355,7 @@ def diary_files() -> Mutations:
 
 
 def diaries() -> Framed:
-    """What stands in the frames of a diary: its header, a page, another one, and a torn end."""
+    """The frames of a write-ahead log: its header, an entry, another one, and a torn end."""
     header = encode(("run", Body(Pose(1.0, 2.0))))
     pages = [bytes(8) + encode(inputs) for inputs in played("ledger").inputs[:GOODS]]
     goods = [(header, *pair, b"") for pair in pairwise(pages)]

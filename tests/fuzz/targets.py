@@ -410,7 +410,7 @@ class _Leaf:
 
 
 def _life(name: str, me: str) -> Callable[[Path], Decode]:
-    """A life goes on from a page that somebody has tampered with."""
+    """A node recovers from an entry that was tampered with."""
 
     def start(_folder: Path) -> Decode:
         played = corpora.played(name)
@@ -425,7 +425,7 @@ def _life(name: str, me: str) -> Callable[[Path], Decode]:
 
 
 def _diary(folder: Path, *, framed: bool) -> Decode:
-    """A diary on disk: what is sound from its beginning on is read, and every page can be lived.
+    """A write-ahead log on disk: its sound beginning is read, and every entry can be stepped through.
 
     framed: length and checksum of every frame are right, whatever is in it.
     """

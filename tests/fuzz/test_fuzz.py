@@ -65,7 +65,7 @@ def test_spans_are_whole_values() -> None:
     assert {content[low:high] for low, high in spans} >= {*map(encode, values), leb(300), leb(5)}
 
 
-def test_numbers_lie_side_by_side() -> None:
+def test_spans_of_numbers_are_adjacent() -> None:
     content = leb(1) + leb(2**40) + leb(128) + leb(0)
     spans = number_spans(content)
 
@@ -82,7 +82,7 @@ def test_tokens_differ() -> None:
 # The command.
 
 
-def test_a_decoder_that_breaks_the_rule_is_told(
+def test_a_decoder_that_breaks_the_rule_is_reported(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """The input as a file, the command that repeats it, exit code 1; also when the process dies."""
@@ -106,7 +106,7 @@ def test_a_decoder_that_breaks_the_rule_is_told(
     assert all(len(path.read_bytes()) > 300 for path in tmp_path.iterdir() if path.suffix != ".txt")
 
 
-def test_a_decoder_that_keeps_memory_is_told(
+def test_a_decoder_that_keeps_memory_is_reported(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """No single input is to blame: the command repeats them all."""
@@ -134,7 +134,7 @@ def grown_bytes(pipe: Connection) -> None:
     pipe.send(fuzz.held_bytes() - before)
 
 
-def test_what_is_freed_is_no_growth() -> None:
+def test_freed_memory_is_no_growth() -> None:
     """However large it was, and wherever malloc had it; in a process where nothing else is."""
     context = get_context("spawn")
     told, telling = context.Pipe(duplex=False)

@@ -1,4 +1,4 @@
-"""Every planner on every kind of map: it ends, and on the way nobody oscillates or stalls."""
+"""Every planner on every kind of map: it ends, and no robot oscillates or stalls."""
 
 import pytest
 
@@ -21,7 +21,7 @@ STALL_MAX = 30
 @pytest.mark.parametrize("layout", SIZES)
 @pytest.mark.parametrize("planner", sorted(MAP_PLANNERS))
 def test_missions_end_without_oscillation(planner: str, layout: str) -> None:
-    """Four robots from both kinds of starts, with every referee."""
+    """Four robots from both kinds of starts, with every checker."""
     for spread in ("separate", "together"):
         overrides = (
             *SIZES[layout],

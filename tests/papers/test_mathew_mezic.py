@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import pytest
 
 from kantor_agent.planners.spectral import mean_over_mixture
 from kantor_fleet.execution.in_process_team import play
@@ -22,6 +23,8 @@ from kantor_worldsim.observers.metrics.density import DensityMetrics
 from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.records import Batch, Record, StepRecord
 from kantor_worldsim.world.world import WorldSetup
+
+pytestmark = pytest.mark.xdist_group("mathew-mezic")  # they share runs
 
 SEEDS = 3
 B = ("starts.random=true", "metrics.every=0")
@@ -102,7 +105,7 @@ def test_vi_b_optimal_transport_detects_more() -> None:
     assert median_detected(*B) > median_detected(*SPECTRAL, "planner.modes=20") + 2.0
 
 
-def test_who_meets_and_knows_the_same_goes_on_together() -> None:
+def test_robots_that_meet_with_equal_sums_stay_together() -> None:
     """Robots close to each other with the same sums have the same gradient, and stay close.
 
     Within 100 m only such robots hear each other, so that hearing costs more than it gives: they find

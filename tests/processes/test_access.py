@@ -25,12 +25,12 @@ ROOT = "kantor/v1/kantor"
 
 
 def proof_of(folder: Path, user: str) -> zenoh_config.ZenohConfig:
-    """How a user shows who it is."""
+    """The credentials of a user, as a configuration of Zenoh."""
     return zenoh_config.client_config(credentials.find(folder / "credentials", user))
 
 
 def strangers(folder: Path) -> list[zenoh_config.ZenohConfig]:
-    """What does not get anybody onto the bus."""
+    """Credentials that no client gets onto the bus with."""
     r2 = credentials.find(folder / "credentials", "r2")
     if isinstance(r2, Password):
         guesses = [Password("kantor", "r1", "guess"), Password("kantor", "r7", r2.password)]
@@ -44,7 +44,7 @@ def strangers(folder: Path) -> list[zenoh_config.ZenohConfig]:
 
 
 def hear(session: zenoh.Session, *keys: str) -> "SimpleQueue[tuple[str, bytes]]":
-    """Everything that arrives on some keys."""
+    """A queue of all that arrives on some keys."""
     heard: SimpleQueue[tuple[str, bytes]] = SimpleQueue()
     for key in keys:
         session.declare_subscriber(
@@ -54,12 +54,12 @@ def hear(session: zenoh.Session, *keys: str) -> "SimpleQueue[tuple[str, bytes]]"
 
 
 def drained(heard: "SimpleQueue[tuple[str, bytes]]") -> list[tuple[str, bytes]]:
-    """What has arrived so far."""
+    """All that has arrived so far."""
     return [heard.get() for _ in range(heard.qsize())]
 
 
 def malformed() -> list[bytes]:
-    """What a hostile or broken robot may put on its own tx; every one must be counted and dropped."""
+    """Payloads of a hostile or broken robot on its own tx; every one must be counted and dropped."""
     nan_pose = [1, [float("nan"), 0.0, 0.0, 0.0], None, b"", b"", b"", [], 0, 0, 0]
     sound_pose = [1, [0.0, 0.0, 0.0, 0.0], None, b"", b"", b"", [], 0, 0, 0]
     return [
@@ -77,7 +77,7 @@ def malformed() -> list[bytes]:
 
 
 @pytest.mark.parametrize("kind", ["tcp", "tls"])
-def test_nobody_reads_or_writes_past_the_radio(kantor: "Kantor", kind: str) -> None:
+def test_no_client_reads_or_writes_past_the_radio(kantor: "Kantor", kind: str) -> None:
     """A stranger, and a robot that misbehaves, beside a legitimate run.
 
     Neither reads another robot's traffic, neither can publish as another, what is malformed is counted

@@ -1,4 +1,4 @@
-"""Campaigns on real processes: storms of signals over the bus, and what is told of them."""
+"""Campaigns on real processes: storms of signals over the bus, and their reports."""
 
 from collections import Counter
 from pathlib import Path
@@ -33,12 +33,12 @@ SHOWN = (
 
 
 def of_kind(faults: tuple[Fault, ...], kind: type[OnProcesses], who: str) -> int:
-    """How many faults of a kind somebody has; robots count together."""
+    """How many faults of a kind a participant has; robots ("r") count together."""
     names = [name for f in faults if isinstance(f, kind) for name in f.who]
     return sum(name == who or (who == "r" and name.startswith("r")) for name in names)
 
 
-def test_storms_have_enough_of_everything_wherever_they_begin() -> None:
+def test_any_fifteen_missions_in_a_row_have_every_signal_often_enough() -> None:
     """Any fifteen missions in a row have what a soak of a quarter of an hour must have seen."""
     storms = [process_scenario(seed) for seed in range(30)]
     walls = [s.faults for seed, s in enumerate(storms) if not is_lockstep(seed)]
@@ -50,8 +50,8 @@ def test_storms_have_enough_of_everything_wherever_they_begin() -> None:
 
 
 @pytest.mark.parametrize("storm_s", [10.0, STORM_S, 120.0])
-def test_storms_end_and_nobody_pretends_to_be_away(storm_s: float) -> None:
-    """After the storm all is calm, but for whoever is lost; impostors come when there is somebody to be."""
+def test_faults_end_and_impostors_come_only_beside_the_original(storm_s: float) -> None:
+    """After the storm no fault is left but one loss; an impostor comes only while its original runs."""
     for seed in range(20):
         scenario = process_scenario(seed, 4.0, storm_s)
         lost = [f for f in scenario.faults if f.until_s is None and not isinstance(f, Impostor)]
@@ -123,7 +123,7 @@ def test_the_first_violation_ends_a_soak_with_all_that_repeats_it(
 def test_a_soak_is_met_if_all_are_back_in_time_and_memory_is_flat(
     rejoined_s: float, grown_mb: float, *, met: bool
 ) -> None:
-    """The bounds are those that the totals tell."""
+    """The bounds are those that the totals print."""
     totals = Totals()
     grown = {"robot": Grown(1, 1000, grown_mb, grown_mb, 100.0)}
     totals.add(ProcessMission(0, "wall", "done", 40.0, (), Counter(), (rejoined_s,), grown=grown))
@@ -140,7 +140,7 @@ def test_a_soak_is_met_if_all_are_back_in_time_and_memory_is_flat(
         (("--rejoin", 0), "--rejoin 0: give a time above 0"),
     ],
 )
-def test_terms_that_cannot_be_are_refused(
+def test_options_out_of_range_are_refused(
     kantor: "Kantor", arguments: tuple[object, ...], complaint: str
 ) -> None:
     """One line with the remedy."""

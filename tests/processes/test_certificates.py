@@ -1,4 +1,4 @@
-"""Whoever does not belong is refused and told why, and so is world-sim; certificates on the real bus."""
+"""Certificates on the real bus: invalid ones are refused, and both sides log the reason."""
 
 import signal
 import socket
@@ -37,12 +37,12 @@ BLOCK = zenoh.CongestionControl.BLOCK
 
 
 def make(folder: Path, now: datetime = NOW, **wanted: object) -> None:
-    """What `kantor keys demo` does."""
+    """Issue identities as `kantor keys demo` does."""
     issue(folder, Wanted(FLEET, **wanted), now)  # type: ignore[arg-type]
 
 
 def identity(folder: Path, user: str) -> Certificate:
-    """Whose certificate is in a folder."""
+    """The certificate of a user in a folder."""
     found = credentials.find(folder, user)
     assert isinstance(found, Certificate)
     return found
@@ -50,19 +50,19 @@ def identity(folder: Path, user: str) -> Certificate:
 
 @contextmanager
 def hosted(who: Certificate, endpoint: str, said: list[str]) -> Iterator[HubRouter]:
-    """World-sim's end of the bus, or what passes itself off as it."""
+    """World-sim's end of the bus, or that of an impostor."""
     with HubRouter(who, endpoint, None, ROSTER, said.append) as host:
         yield host
 
 
 def join(endpoint: str, who: Identity) -> None:
-    """Come and go."""
+    """Join the bus and leave it."""
     with participant_session(endpoint, who, "nonce", EVENT_LIMIT_S):
         pass
 
 
 def refusal(endpoint: str, who: Certificate) -> str:
-    """Why somebody is not let in."""
+    """The reason for which an identity is refused."""
     with pytest.raises(BusError) as caught:
         join(endpoint, who)
     assert "\n" not in str(caught.value)
@@ -76,7 +76,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "keys"
 
 
-def test_world_sim_and_whoever_is_refused_both_say_why(kantor: "Kantor") -> None:
+def test_world_sim_and_a_refused_client_both_say_why(kantor: "Kantor") -> None:
     """No certificate, a foreign authority, an expired one, one that was replaced or revoked, an unknown one."""
     folder = kantor.folder / "keys"
     make(folder, robots=1)
@@ -151,7 +151,7 @@ def test_world_sim_and_whoever_is_refused_both_say_why(kantor: "Kantor") -> None
 
 
 def anonymous(ours: Certificate) -> zenoh_config.ZenohConfig:
-    """The settings of somebody who trusts the authority and has no certificate."""
+    """The settings of a client that trusts the authority and has no certificate."""
     own = zenoh_config.client_config(ours)
     authority = own["transport/link/tls"]["root_ca_certificate_base64"]
     return own | {
@@ -161,7 +161,7 @@ def anonymous(ours: Certificate) -> zenoh_config.ZenohConfig:
 
 
 @pytest.mark.parametrize("place", ["keys", "keys/worldsim.toml"])
-def test_the_command_that_world_sim_says_is_the_one_to_type(kantor: "Kantor", place: str) -> None:
+def test_the_command_that_world_sim_prints_starts_a_robot(kantor: "Kantor", place: str) -> None:
     """Whether it was given a folder or its own file, and whatever addresses it listens on."""
     make(kantor.folder / "keys", robots=1)
     port = free_endpoint("tls").rpartition(":")[2]
@@ -174,7 +174,7 @@ def test_the_command_that_world_sim_says_is_the_one_to_type(kantor: "Kantor", pl
     await_line(robot, "r1: mission paper-single")
 
 
-def test_a_revoked_robot_without_manners_is_not_heard(folder: Path) -> None:
+def test_a_revoked_robot_with_plain_zenoh_neither_sends_nor_receives(folder: Path) -> None:
     """Plain Zenoh with the key of a revoked robot: it may connect, and neither speaks, lives nor listens."""
     stolen = identity(folder, "r3")
     make(folder, revoke=("r3",))
@@ -207,7 +207,7 @@ def test_a_revoked_robot_without_manners_is_not_heard(folder: Path) -> None:
     ]
 
 
-def test_a_robot_that_is_revoked_meanwhile_is_told(folder: Path) -> None:
+def test_a_robot_that_is_revoked_during_a_run_is_told_why(folder: Path) -> None:
     """World-sim is started again with the newer register: r3 learns why it is out, r1 just goes on."""
     endpoint, said = free_endpoint("tls"), []
     with ExitStack() as robots:
@@ -234,7 +234,7 @@ def test_a_robot_that_is_revoked_meanwhile_is_told(folder: Path) -> None:
     ]
 
 
-def test_nobody_talks_to_a_false_world_sim(folder: Path, tmp_path: Path) -> None:
+def test_robots_refuse_a_false_world_sim(folder: Path, tmp_path: Path) -> None:
     """One with a foreign authority, with a robot's certificate, with an expired one, by another name."""
     make(tmp_path / "foreign", robots=3)
     r1, said = identity(folder, "r1"), []
@@ -259,8 +259,8 @@ def test_nobody_talks_to_a_false_world_sim(folder: Path, tmp_path: Path) -> None
     assert said == []
 
 
-def test_plain_zenoh_is_not_taken_in_by_a_false_world_sim_either(folder: Path) -> None:
-    """It is TLS that refuses: the bus itself, not only the look that comes before it."""
+def test_tls_itself_refuses_a_false_world_sim(folder: Path) -> None:
+    """TLS refuses: the bus itself, not only the look that comes before it."""
     own = zenoh_config.client_config(identity(folder, "r1")) | {"connect/timeout_ms": 500}
     with (
         hosted(identity(folder, "r2"), at := free_endpoint("tls"), []),
@@ -270,10 +270,13 @@ def test_plain_zenoh_is_not_taken_in_by_a_false_world_sim_either(folder: Path) -
         pass  # pragma: no cover
 
 
-def test_a_certificate_counts_until_it_expires(folder: Path) -> None:
+def test_a_certificate_is_valid_until_it_expires(folder: Path) -> None:
     """A robot that is on the bus when its certificate expires leaves it at that moment."""
-    soon = datetime.now(UTC) - timedelta(days=1) + timedelta(seconds=4)
-    make(folder, soon, renew=("r1",), days=1)
+    began = datetime.now(UTC)
+    with hosted(identity(folder, "worldsim"), endpoint := free_endpoint("tls"), []):
+        join(endpoint, identity(folder, "r1"))
+    until = timedelta(seconds=3) + 5 * (datetime.now(UTC) - began)  # time enough to join here
+    make(folder, datetime.now(UTC) - timedelta(days=1) + until, renew=("r1",), days=1)
     r1 = identity(folder, "r1")
     with (
         hosted(identity(folder, "worldsim"), endpoint := free_endpoint("tls"), []) as host,
@@ -285,7 +288,7 @@ def test_a_certificate_counts_until_it_expires(folder: Path) -> None:
         assert "its certificate has expired" in refusal(endpoint, r1)
 
 
-def test_who_hangs_up_without_a_reason_has_not_objected(
+def test_a_connection_that_is_reset_after_the_handshake_is_no_objection(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its handshake was sound, so it is a world-sim: the bus says what is wrong, if anything is."""
@@ -300,7 +303,7 @@ def test_who_hangs_up_without_a_reason_has_not_objected(
             accepted.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
 
     class Slow:
-        """Whose handshake is over when the other end has gone."""
+        """A context whose handshake is over when the other end has gone."""
 
         def wrap_socket(self, raw: socket.socket, server_hostname: str) -> ssl.SSLSocket:
             secured = ours.wrap_socket(raw, server_hostname=server_hostname)
@@ -313,7 +316,7 @@ def test_who_hangs_up_without_a_reason_has_not_objected(
         assert tls.handshake_failure(*listener.getsockname(), identity(folder, "r1")) == ""
 
 
-def test_both_ends_want_the_same_kind_of_proof(kantor: "Kantor") -> None:
+def test_both_ends_need_the_same_kind_of_credentials(kantor: "Kantor") -> None:
     """Passwords for tls, certificates for tcp, folders that are of another kind: one line, exit 2."""
     folder = kantor.folder
     make(folder / "keys", robots=1)
@@ -362,7 +365,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_who_is_not_of_the_kind_is_told_so(folder: Path) -> None:
+def test_a_certificate_is_refused_with_a_reason_where_passwords_are_used(folder: Path) -> None:
     """A robot with a certificate that meets world-sim without them, and something that does not answer at all."""
     r1 = identity(folder, "r1")
     passwords = credentials.issue(folder.parent / "passwords", FLEET, ROSTER)
@@ -374,8 +377,8 @@ def test_who_is_not_of_the_kind_is_told_so(folder: Path) -> None:
         )
 
 
-def test_world_sim_warns_of_what_expires(kantor: "Kantor") -> None:
-    """A week ahead, a line for each certificate of the team, its own too, and for whoever is revoked."""
+def test_world_sim_warns_of_certificates_that_expire(kantor: "Kantor") -> None:
+    """A week ahead, a line for each certificate of the team, its own too, and for each that is revoked."""
     folder = kantor.folder / "keys"
     make(folder, robots=3, days=30)
     make(folder, renew=("worldsim", "r1"), days=7)

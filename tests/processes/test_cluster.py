@@ -37,7 +37,7 @@ pytestmark = pytest.mark.xdist_group("cluster")
 
 
 class Cluster:
-    """A Dask scheduler and two workers, a process each, without nurses that start them again."""
+    """A Dask scheduler and two workers, a process each, without nannies that start them again."""
 
     def __init__(self, folder: Path, processes: ExitStack) -> None:
         self._folder, self._processes = folder, processes
@@ -78,7 +78,7 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the sweep leaves that processes of this machine ran."""
+    """The folder of a sweep that processes of this machine ran."""
     folder = tmp_path_factory.mktemp("reference")
     assert sweep(SweepConfig(small_plan(), folder), partial(pools.local, jobs=2)) is Exit.DONE
     return folder
@@ -122,7 +122,7 @@ def test_a_worker_dies_and_the_table_is_that_of_one_machine(
 def test_a_case_that_kills_workers_has_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Dask gives it up; the pool goes on with whoever is left."""
+    """Dask gives it up; the pool goes on with the workers that are left."""
     monkeypatch.setitem(ENVIRONMENT, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
     cases = [Case(mission(), seed) for seed in (workers.DEADLY_SEED, 4, 5)]
     with ExitStack() as processes:
@@ -166,7 +166,7 @@ def test_ctrl_c_gives_up_what_a_cluster_is_running(kantor: "Kantor", cluster: Cl
     assert [worker.poll() for worker in cluster.workers] == [None, None]
 
 
-def test_a_cluster_that_is_not_there(
+def test_an_unreachable_cluster_ends_with_exit_code_4(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Exit code 4 after a bounded time, in one line."""
@@ -181,7 +181,7 @@ def test_a_cluster_that_is_not_there(
     assert err.count("\n") == 1
 
 
-def test_slurm_jobs_are_asked_for_and_given_back(kantor: "Kantor", reference: Path) -> None:
+def test_slurm_jobs_are_requested_and_cancelled(kantor: "Kantor", reference: Path) -> None:
     """With the user's settings of dask-jobqueue; here sbatch starts the job on the spot."""
     commands = kantor.folder / "bin"
     commands.mkdir()
@@ -210,7 +210,7 @@ def test_slurm_jobs_are_asked_for_and_given_back(kantor: "Kantor", reference: Pa
     assert psutil.wait_procs(gone, timeout=EVENT_LIMIT_S)[1] == []
 
 
-def test_slurm_that_takes_no_jobs(kantor: "Kantor") -> None:
+def test_slurm_that_accepts_no_jobs_ends_with_exit_code_4(kantor: "Kantor") -> None:
     """One line tells what is missing."""
     arguments = sweep_command(kantor.folder / "out", "--cluster", "slurm", "--jobs", 1)
 
@@ -233,7 +233,7 @@ def test_slurm_that_takes_no_jobs(kantor: "Kantor") -> None:
     assert len(finished.err.splitlines()) == 1
 
 
-def test_json_is_left_of_the_plan(reference: Path) -> None:
+def test_the_plan_is_left_as_json(reference: Path) -> None:
     """Every scenario resolved, beside the runs."""
     told = json.loads((reference / "sweep.json").read_text())
 

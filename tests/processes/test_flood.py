@@ -1,4 +1,4 @@
-"""A robot with sound credentials that floods the bus, on a real one: what reaches world-sim, and who waits for it.
+"""A robot with sound credentials floods the real bus: what reaches world-sim, and whether others wait.
 
 `benchmarks/flood.py` measures what a flood costs the others' ticks; here is what must hold on any machine.
 """
@@ -75,7 +75,7 @@ def until(host: HubRouter, payload: bytes) -> tuple[list[Received], list[Flooded
     raise AssertionError(f"{payload!r} did not come")
 
 
-def test_nobody_waits_behind_a_flood(tmp_path: Path) -> None:
+def test_other_robots_do_not_wait_behind_a_flood(tmp_path: Path) -> None:
     """Of 5000 messages few get in, the robot is named once, and what another says is heard at once."""
     with hosted(tmp_path) as (host, honest, hostile, _):
         start_s = time.monotonic()
@@ -96,7 +96,7 @@ def test_nobody_waits_behind_a_flood(tmp_path: Path) -> None:
         assert host.excess["r2"].messages + len(before) == MESSAGES
 
 
-def test_long_messages_are_not_kept(tmp_path: Path) -> None:
+def test_long_messages_beyond_the_quota_are_dropped(tmp_path: Path) -> None:
     """Of 40 MiB no more waits for a reader than the quota has room for."""
     with hosted(tmp_path) as (host, honest, hostile, _):
         start_s = time.monotonic()
@@ -123,7 +123,6 @@ def test_what_observers_see_is_limited_by_the_router(tmp_path: Path) -> None:
                     b"pose",
                     congestion_control=zenoh.CongestionControl.BLOCK,
                 )
-            elapsed_s = time.monotonic() - start_s
             honest.publish_pose(bytes(POSE_BYTES_MAX))
             honest.send(b"end", blocking=True)
             hostile.send(b"end", blocking=True)
@@ -134,6 +133,7 @@ def test_what_observers_see_is_limited_by_the_router(tmp_path: Path) -> None:
                 assert message is not None
                 ends += message[1] == b"end"
                 counts[message] = counts.get(message, 0) + 1
+            elapsed_s = time.monotonic() - start_s
 
     shown = counts[keys.pose(FLEET, "r2"), b"pose"]
     assert 0 < shown <= SHOWN_PER_S * elapsed_s + 2
@@ -142,7 +142,7 @@ def test_what_observers_see_is_limited_by_the_router(tmp_path: Path) -> None:
 
 
 def test_a_mission_after_a_flood_is_the_mission_without_it(kantor: "Kantor") -> None:
-    """Turn by turn: same digest; the result and one line say who flooded, and the referees do not mind."""
+    """In lockstep: the same digest; the result and one line name the robot that flooded, and no checker complains."""
     alone = kantor("run", "paper-decentralized", "--seed", 3, "--exchange", "in-process")
     assert alone.code == 0
     endpoint = free_endpoint()

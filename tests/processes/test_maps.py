@@ -38,7 +38,7 @@ def test_same_seed_same_digest_in_process_and_over_the_bus(
     assert "every byte the same" in kantor("verify", kantor.runs()[-1]).out
 
 
-def test_robots_on_their_own_clocks_explore_it_all(kantor: "Kantor") -> None:
+def test_robots_in_real_time_explore_the_whole_map(kantor: "Kantor") -> None:
     """On the wall: every rule held, everything seen, and each robot replays from its recorded inbox."""
     finished = kantor("run", "office", "--exchange", "wall", "--speed", 10, *SMALL)
     assert finished.code == 0, finished.out + finished.err

@@ -78,7 +78,7 @@ class Place:
     def intruder(
         self, user: str, mode: str, connect: str, listen: str | None = None
     ) -> Iterator[zenoh.Session]:
-        """Whoever has somebody's file, and plain Zenoh without any rules of its own."""
+        """Plain Zenoh with the identity file of a user and without any rules of its own."""
         identity = read(self.kantor.folder / "keys" / f"{user}.toml", Certificate)
         assert identity is not None
         with plain_session(connect, zenoh_config.client_config(identity), mode, listen) as session:
@@ -112,7 +112,7 @@ def drained(heard: "queue.SimpleQueue[str]") -> list[str]:
 def test_a_mission_through_a_site_is_the_one_in_process(place: Place) -> None:
     """Two robots behind a site's router and one at the hub, in lockstep: the digest of one process.
 
-    Beside it, with the files of r1 and r3, somebody at the site who speaks as others and reads others' `rx`.
+    Beside it, with the files of r1 and r3, an intruder at the site sends as others and reads others' `rx`.
     """
     kantor = place.kantor
     assert kantor("run", *MISSION, "--exchange", "in-process").code == 0
@@ -122,7 +122,7 @@ def test_a_mission_through_a_site_is_the_one_in_process(place: Place) -> None:
     with (
         place.intruder("r1", "client", place.north) as liar,
         place.intruder("r1", "client", place.north) as ear,  # apart: a session hears its own puts
-        place.intruder("r3", "client", place.north) as guest,  # of the hub, and nobody here
+        place.intruder("r3", "client", place.north) as guest,  # of the hub, unknown at this site
     ):
         stolen, overheard = hear(ear, *others), hear(guest, f"{ROOT}/r3/rx")
         tokens = [
@@ -150,7 +150,7 @@ def test_a_mission_through_a_site_is_the_one_in_process(place: Place) -> None:
 
 
 def test_a_site_speaks_for_its_own_robots_only(place: Place) -> None:
-    """Whoever has taken a site over, with a router without rules: it is its robots, and nobody else."""
+    """A site that was taken over, with a router without rules, speaks for its own robots only."""
     kantor = place.kantor
     world = place.world_sim(*MISSION, "--exchange", "lockstep")
     with place.intruder("site-north", "router", place.hub, place.north) as rogue:
@@ -174,7 +174,7 @@ def test_a_site_speaks_for_its_own_robots_only(place: Place) -> None:
 
 
 def test_robots_hold_while_their_site_is_gone(place: Place) -> None:
-    """On the wall a site's router is killed: its robots leave, and hold. It is started again: they come
+    """In real time a site's router is killed: its robots leave, and hold. It is started again: they come
     back by themselves, and the mission is done without a violation.
     """
     kantor = place.kantor

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from conftest import Kantor
 
 
-def test_killed_it_goes_on_and_done_it_begins_anew(kantor: "Kantor") -> None:
+def test_a_killed_world_sim_resumes_its_run_and_a_done_one_starts_another(kantor: "Kantor") -> None:
     """The same command each time, as an engine gives it."""
     endpoint = free_endpoint()
     command = (

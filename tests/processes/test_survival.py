@@ -1,4 +1,4 @@
-"""Processes that are killed, frozen, doubled and starved on the real bus, and what they make of it."""
+"""Process faults on the real bus: processes are killed, frozen, doubled and starved, and go on."""
 
 import os
 import shutil
@@ -17,6 +17,7 @@ from support.fleets import (
     await_act,
     await_incident,
     await_line,
+    await_text,
     children_named,
     incidents_of,
     records_of,
@@ -119,9 +120,9 @@ def doomed(kantor: "Kantor") -> "Kantor":
     return kantor
 
 
-def test_whatever_befalls_processes_the_record_is_the_same_over_the_bus(doomed: "Kantor") -> None:
-    """Real SIGKILLs, diaries that are torn and deleted, world-sim killed twice: the same bytes as in one
-    process, and verify executes them once more.
+def test_process_faults_over_the_bus_leave_the_record_of_one_process(doomed: "Kantor") -> None:
+    """Real SIGKILLs, write-ahead logs that are torn and deleted, world-sim killed twice: the same bytes as in
+    one process, and verify executes them once more.
     """
     for exchange in ("in-process", "lockstep"):
         finished = doomed(
@@ -140,14 +141,14 @@ def test_whatever_befalls_processes_the_record_is_the_same_over_the_bus(doomed: 
     assert doomed("verify", bus).code == 0
 
 
-def test_whatever_befalls_processes_they_go_on_by_their_own_clocks(doomed: "Kantor") -> None:
-    """The same schedule on the wall: every rule holds, everybody is back within two seconds, and each
-    life replays from what it heard.
+def test_process_faults_in_real_time_break_no_rule(doomed: "Kantor") -> None:
+    """The same schedule in real time: every rule holds, all that were started again step again, and each
+    incarnation replays from what it received.
     """
-    speed = 4
     finished = doomed(
-        "run", "fleet", "--exchange", "wall", "--speed", speed, "--chaos", "everything.toml", *SHORT
-    )
+        "run", "fleet", "--exchange", "wall", "--speed", 4, "--chaos", "everything.toml", *SHORT,
+        "limit_s=50",
+    )  # fmt: skip
     (folder,) = doomed.runs()
     assert "all rules held" in finished.out, finished.out + finished.err
     incidents = incidents_of(folder)
@@ -157,11 +158,11 @@ def test_whatever_befalls_processes_they_go_on_by_their_own_clocks(doomed: "Kant
         "kill", "start", "pause", "resume", "fill", "free", "slow", "quicken", "pretend",
     }  # fmt: skip
     assert not [i for i in incidents if i.fault < 0]
+    records = records_of(folder)
     ordered = {(2.0, "r4"), (8.0, "r2"), (9.0, "r1"), (8.5, "r3"), (13.0, "r2")}
     for due_s, who in ordered:
         back_ns = min(i.now_ns for i in starts if i.who == who and i.now_ns >= due_s * 1e9)
-        assert (back_ns * 1e-9 - due_s) / speed < 2.0
-    records = records_of(folder)
+        assert any(step_record.now_ns > back_ns for step_record in acts_of(records, who))
     assert nothing_happens_between(records, "kill", "start", "worldsim")
     assert nothing_happens_between(records, "pause", "resume", "worldsim")
     full = [i.now_ns for i in incidents if i.kind in {"fill", "free"}]
@@ -183,16 +184,21 @@ def nothing_happens_between(records: list[object], first: str, last: str, who: s
 
 
 def test_robots_go_on_without_the_supervisor_and_with_it_again(kantor: "Kantor") -> None:
-    """Killed and started again with its diary; robots explore meanwhile."""
+    """It is killed and started again with its write-ahead log; robots explore meanwhile."""
     (kantor.folder / "headless.toml").write_text(
         '[[faults]]\nkind = "kill"\nwho = ["supervisor"]\nfrom_s = 10.0\nuntil_s = 20.0\n'
     )
-    finished = kantor(
+    process = kantor.start(
         "run", "paper-timevarying", "--exchange", "wall", "--speed", 8, "--chaos", "headless.toml",
-        "--set", "limit_s=40",
+        "--set", "limit_s=100000", "energy.points=50000", "energy.steps=50000",
     )  # fmt: skip
+    await_line(process, "t=", "energy")
     (folder,) = kantor.runs()
-    assert "all rules held" in finished.out, finished.out + finished.err
+    before = await_incident(folder, "supervisor", "start").now_ns
+    await_act(folder, "supervisor", since_ns=before + 1)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=EVENT_LIMIT_S)
+    assert "all rules held" in out, out + err
     kill, start = incidents_of(folder)
     records = records_of(folder)
     meanwhile = [a for a in acts_of(records, "r1") if kill.now_ns < a.now_ns < start.now_ns]
@@ -202,20 +208,19 @@ def test_robots_go_on_without_the_supervisor_and_with_it_again(kantor: "Kantor")
 
 
 @pytest.mark.parametrize("exchange", ["lockstep", "wall"])
-def test_a_world_sim_that_somebody_kills_goes_on_from_its_record(
-    kantor: "Kantor", exchange: str
-) -> None:
-    """SIGKILL from outside, twice: the mission goes on to its end. Turn by turn nobody can tell."""
-    mission = ("run", "fleet", "--seed", 3, *SHORT)
-    if exchange == "lockstep":  # it must not be over before it is killed
-        mission = (*mission, "limit_s=200")
+def test_a_killed_world_sim_goes_on_from_its_record(kantor: "Kantor", exchange: str) -> None:
+    """SIGKILL from outside, twice: the mission goes on to its end; in lockstep with the same digest."""
+    # It must not be over before it is killed.
+    limit = "limit_s=200" if exchange == "lockstep" else "limit_s=60"
+    mission = ("run", "fleet", "--seed", 3, *SHORT, limit)
+    steps = 60 if exchange == "lockstep" else 20
     process = kantor.start(*mission, "--exchange", exchange, "--speed", 4)
     await_line(process, "t=", "energy")
     (folder,) = kantor.runs()
     for times in (1, 2):
-        await_act(folder, "r1", 60 * times)
+        await_act(folder, "r1", steps * times)
         os.kill(pid_of(folder / "logs" / "worldsim.log"), signal.SIGKILL)
-        await_resumed(folder / "logs" / "worldsim.log", times)
+        await_text(folder / "logs" / "worldsim.log", "resumed", times)
     out, err = process.communicate(timeout=EVENT_LIMIT_S)
 
     assert "world-sim ended with signal 9; it goes on from its record" in out, err
@@ -237,20 +242,14 @@ def pid_of(log: Path) -> int:
     return int(log.read_text().splitlines()[-1].partition('"pid": ')[2].partition(",")[0])
 
 
-def await_resumed(log: Path, times: int) -> None:
-    """Wait until a log says so, so many times."""
-    while log.read_text().count("resumed") < times:
-        pass
-
-
 @pytest.fixture
 def by_hand(kantor: "Kantor") -> "ByHand":
-    """A world-sim and its robots, each started by hand."""
+    """A world-sim and its robots, each started on its own."""
     return ByHand(kantor)
 
 
 class ByHand:
-    """A fleet that somebody started process by process."""
+    """A fleet that is started process by process."""
 
     def __init__(self, kantor: "Kantor") -> None:
         self.kantor = kantor
@@ -268,7 +267,7 @@ class ByHand:
         return self.kantor.start("agent", name, "--connect", self.endpoint)
 
     def end(self) -> None:
-        """Interrupted, the record is sound, and everybody was told."""
+        """Interrupt world-sim: the record is sound, and all robots end."""
         self.world.send_signal(signal.SIGINT)
         out, err = self.world.communicate(timeout=EVENT_LIMIT_S)
         assert self.world.returncode == 130, err
@@ -279,7 +278,7 @@ class ByHand:
 
 
 def test_a_robot_that_is_killed_and_started_again_goes_on_where_it_was(by_hand: ByHand) -> None:
-    """With its diary as the same incarnation; without, as the next one; r1 goes on meanwhile."""
+    """With its write-ahead log as the same incarnation; without, as the next one; r1 goes on meanwhile."""
     for incarnation in (0, 1):
         by_hand.robots["r2"].kill()
         left = await_incident(by_hand.folder, "r2", "leave", incarnation + 1)
@@ -295,7 +294,7 @@ def test_a_robot_that_is_killed_and_started_again_goes_on_where_it_was(by_hand: 
     by_hand.end()
 
 
-def test_of_a_frozen_robot_and_its_successor_one_goes_on(by_hand: ByHand) -> None:
+def test_a_frozen_robot_goes_on_unless_it_has_a_successor(by_hand: ByHand) -> None:
     """Frozen for longer than a lease it is back by itself; with a successor it is sent away, and the two
     never share a diary.
     """
@@ -319,7 +318,7 @@ def test_of_a_frozen_robot_and_its_successor_one_goes_on(by_hand: ByHand) -> Non
     by_hand.end()
 
 
-def test_world_sim_by_hand_resumes_a_run_folder(by_hand: ByHand) -> None:
+def test_a_standalone_world_sim_resumes_a_run_folder(by_hand: ByHand) -> None:
     """Killed, then `--resume`: robots have held, and go on; r2, which died meanwhile, comes back too."""
     by_hand.world.kill()
     by_hand.world.wait()
@@ -338,8 +337,8 @@ def test_world_sim_by_hand_resumes_a_run_folder(by_hand: ByHand) -> None:
     assert len(by_hand.kantor.runs()) == 1
 
 
-def test_what_cannot_be_is_refused_with_a_line(kantor: "Kantor") -> None:
-    """Faults of processes without hands, nowhere for a diary, folders that no run can go on from."""
+def test_impossible_commands_are_refused_in_a_line(kantor: "Kantor") -> None:
+    """Process faults without a process controller, no place for a write-ahead log, folders to resume nothing from."""
     (kantor.folder / "kill.toml").write_text(
         '[[faults]]\nkind = "kill"\nwho = ["r1"]\nfrom_s = 1.0\n'
     )
@@ -373,12 +372,12 @@ def test_what_cannot_be_is_refused_with_a_line(kantor: "Kantor") -> None:
 def test_a_slow_reader_does_not_fill_world_sims_memory(kantor: "Kantor") -> None:
     """Two robots of three are frozen while the third speaks at length: world-sim's memory is flat."""
     (kantor.folder / "frozen.toml").write_text(
-        '[[faults]]\nkind = "pause"\nwho = ["r2", "r3"]\nfrom_s = 2.0\nuntil_s = 400.0\n'
+        '[[faults]]\nkind = "pause"\nwho = ["r2", "r3"]\nfrom_s = 2.0\nuntil_s = 90000.0\n'
     )
     process = kantor.start(
         "run", "fleet", "--exchange", "wall", "--speed", 40, "--chaos", "frozen.toml", "--set",
         "robots.count=3", "starts.random=true", "radio.range_m=inf", "radio.beacon='state'",
-        "limit_s=500",
+        "limit_s=100000",
     )  # fmt: skip
     await_line(process, "t=", "energy")
     (folder,) = kantor.runs()

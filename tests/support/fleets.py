@@ -1,10 +1,10 @@
-"""What tests ask of a fleet of processes."""
+"""Outputs, records and logs of a fleet of processes, read and waited for."""
 
 import json
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.records import Batch, ProcessEvent, Record, StepRecord
@@ -12,6 +12,8 @@ from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
     import subprocess
+
+T = TypeVar("T")
 
 
 def result_of(folder: Path) -> dict[str, object]:
@@ -31,22 +33,22 @@ def await_line(process: "subprocess.Popen[str]", start: str, part: str = "") -> 
 
 
 def children_named(process: "subprocess.Popen[str]", log: Path) -> int:
-    """The process id that a participant's log tells."""
+    """The process id of a participant, from its log."""
     return int(json.loads(log.read_text().splitlines()[0])["pid"])
 
 
 def records_of(folder: Path) -> list[Record]:
-    """What a run folder has on record so far."""
+    """The records of a run folder so far."""
     return [record for _, record in read(folder / "run.mcap")]
 
 
 def incidents_of(folder: Path) -> list[ProcessEvent]:
-    """What befell processes."""
+    """The process events of a run folder so far."""
     return [record for record in records_of(folder) if isinstance(record, ProcessEvent)]
 
 
 def acts_of(records: Iterable[Record], name: str) -> list[StepRecord]:
-    """What a participant did, in order."""
+    """The steps of a participant that were done, in order."""
     batches = (record for record in records if isinstance(record, Batch))
     return [
         step_record
@@ -56,23 +58,39 @@ def acts_of(records: Iterable[Record], name: str) -> list[StepRecord]:
     ]
 
 
-def await_incident(folder: Path, who: str, what: str, count: int = 1) -> ProcessEvent:
-    """The incident of this kind, once it is on record."""
-    give_up = time.monotonic() + EVENT_LIMIT_S
-    while time.monotonic() < give_up:
-        found = [i for i in incidents_of(folder) if (i.who, i.kind) == (who, what)]
-        if len(found) >= count:
-            return found[count - 1]
-        time.sleep(0.02)  # the record is a file, which tells nobody that it grows
-    raise AssertionError(f"nothing on record of {who}: {what}")
+def await_incident(folder: Path, who: str, kind: str, count: int = 1) -> ProcessEvent:
+    """The process event of this kind, once it is on record so often."""
+
+    def found(records: list[Record]) -> list[ProcessEvent]:
+        events = (record for record in records if isinstance(record, ProcessEvent))
+        return [event for event in events if (event.who, event.kind) == (who, kind)]
+
+    return _await(folder, found, count - 1, f"{who}: {kind}")
 
 
-def await_act(folder: Path, name: str, after: int = 0) -> StepRecord:
-    """The first step of a participant after a number of steps, once it is on record."""
+def await_act(folder: Path, name: str, after: int = 0, since_ns: int = 0) -> StepRecord:
+    """The first step of a participant after a number of steps and a moment, once it is on record."""
+
+    def found(records: list[Record]) -> list[StepRecord]:
+        return [step for step in acts_of(records, name) if step.now_ns >= since_ns]
+
+    return _await(folder, found, after, f"step {after + 1} of {name}")
+
+
+def await_text(log: Path, text: str, count: int = 1) -> None:
+    """Return once a log has a text so often."""
     give_up = time.monotonic() + EVENT_LIMIT_S
-    while time.monotonic() < give_up:
-        step_records = acts_of(records_of(folder), name)
-        if len(step_records) > after:
-            return step_records[after]
+    while log.read_text().count(text) < count:
+        assert time.monotonic() < give_up, f"{log} never has {text!r}"
         time.sleep(0.02)
-    raise AssertionError(f"{name} makes no step {after + 1}")
+
+
+def _await(folder: Path, find: Callable[[list[Record]], list[T]], index: int, name: str) -> T:
+    """One of the entries that `find` finds. A file sends no event when it grows, so it is read again."""
+    give_up = time.monotonic() + EVENT_LIMIT_S
+    while (now := time.monotonic()) < give_up:
+        found = find(records_of(folder))
+        if len(found) > index:
+            return found[index]
+        time.sleep(max(0.02, 3.0 * (time.monotonic() - now)))  # leave the processor to the fleet
+    raise AssertionError(f"never on record: {name}")

@@ -1,4 +1,4 @@
-"""Maps drawn by hand and at random, and missions on them."""
+"""Maps from drawings and at random, and missions on them."""
 
 import math
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""Those who come to the bus with Zenoh alone, and keep to no manners of ours."""
+"""Clients of plain Zenoh that keep to no rule of kantor."""
 
 import json
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from kantor_protocol.transport import zenoh_config
 def plain_session(
     endpoint: str, proof: zenoh_config.ZenohConfig, mode: str = "client", listen: str | None = None
 ) -> Iterator[zenoh.Session]:
-    """Plain Zenoh without rules, with some proof of who it is or with none. It asks nobody whether it may."""
+    """Open plain Zenoh, with some credentials or none, without asking for admission first."""
     config = zenoh.Config()
     known = zenoh_config.common_config(mode, endpoint, listen) | {"connect/timeout_ms": 1000}
     for key, value in (known | proof).items():

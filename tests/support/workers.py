@@ -1,4 +1,4 @@
-"""Work for pools that comes to an end of its own. Worker processes import it."""
+"""Work for pools that ends its worker. Worker processes import it."""
 
 import os
 import signal
@@ -9,14 +9,14 @@ DEADLY_SEED = 3
 
 
 def die_of_a_seed(case: Case) -> Outcome:
-    """One case kills whoever runs it."""
+    """One case kills the process that runs it."""
     if case.seed == DEADLY_SEED:
         os.kill(os.getpid(), signal.SIGKILL)
     return Outcome(worker=str(os.getpid()))
 
 
 def fail_of_a_seed(case: Case) -> Outcome:
-    """One case raises what it may not."""
+    """One case raises an exception that work must not raise."""
     if case.seed == DEADLY_SEED:
         raise SystemExit(7)
     return Outcome(worker=str(os.getpid()))
