@@ -21,7 +21,7 @@ from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.report.progress import printable
 from kantor_fleet.report.run_progress import RunProgressView, table_console
 from kantor_fleet.sweep.journal import RunsJournal
-from kantor_fleet.sweep.plan import parse_seeds
+from kantor_fleet.sweep.plan import RunKey, parse_seeds
 from kantor_protocol.scenario.dump import to_toml
 from kantor_protocol.scenario.schema import Scenario
 
