@@ -181,7 +181,7 @@ def _run(config: FleetConfig, stopped: Interrupts) -> tuple[list[str], dict[str,
                     break
         except BusError as error:
             failures.append(f"bus: {error}")
-        fleet.disband()
+        fleet.end()
         failures += _newly_failed(fleet)
         if fleet.world_sim.exitcode:
             failures.append(f"process: world-sim ended with {fleet.world_sim.exitcode}")
@@ -190,7 +190,7 @@ def _run(config: FleetConfig, stopped: Interrupts) -> tuple[list[str], dict[str,
 
 def _newly_failed(fleet: Fleet) -> list[str]:
     failed = [f"process: {name} ended with {failure}" for name, failure in fleet.newly_failed()]
-    if (ended := fleet.revive()) is not None:
+    if (ended := fleet.restart_killed()) is not None:
         failed.append(f"process: world-sim ended with {ended}")
     return failed
 

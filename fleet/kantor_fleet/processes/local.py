@@ -1,8 +1,8 @@
 """A fleet on this machine: world-sim and every participant as a process of its own.
 
 All children come from one fork server that has imported and compiled everything and opened nothing. This
-process is also the hands by which world-sim carries out a scenario's faults of processes, itself included: it
-kills, stops and starts them, and starts world-sim again from its journal whoever has killed it.
+process also carries out world-sim's commands for a scenario's faults of processes: it kills, stops and starts
+participants and world-sim itself, and restarts world-sim from its journal after any kill.
 """
 
 import contextlib
@@ -44,17 +44,17 @@ from kantor_worldsim.record.run_folder import RESULT
 
 FLEET = "kantor"
 _START_S = 60.0
-_GOODBYE_S = 5.0
+_END_S = 5.0
 _LISTEN_S = 5.0
-"""How long the endpoint of a world-sim that was killed may be taken yet."""
+"""Longest wait for the endpoint of a world-sim that was killed to become free."""
 _IMPOSTOR_S = 15.0
-"""Whoever has not been sent away by then has been let in."""
-_REVIVALS = 20
-"""How often world-sim is started again when nobody ordered its death."""
+"""An impostor that still runs after so long was admitted."""
+_RESTARTS_MAX = 20
+"""Restarts of world-sim, at most, when it was killed and no fault is the cause."""
 _SPARE_BYTES = 7
-"""A full disk has room for a part of a page."""
+"""Bytes that a full disk still takes: less than an entry of a write-ahead log."""
 STATE = "state"
-"""Where the diaries are in a run folder."""
+"""Folder of the write-ahead logs in a run folder."""
 # One worker serves all of Zenoh in a participant: fewer threads, fewer wake-ups.
 _LIGHT_RUNTIME = (
     "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), "
@@ -63,7 +63,7 @@ _LIGHT_RUNTIME = (
 
 
 class FleetConfig(NamedTuple):
-    """What a local fleet is to run."""
+    """The mission of a local fleet."""
 
     scenario: Scenario
     seed: int
@@ -87,14 +87,14 @@ class Fleet:
         self._logs, self._state = config.folder / "logs", config.folder / STATE
         self._logs.mkdir()
         self._lock = threading.RLock()
-        """Around every start, and every look at an exit code: that can be read only once."""
+        """Guards every start and every check of an exit code, which can be read only once."""
         self._stopping = threading.Event()
-        self._revivals = 0
+        self._restarts = 0
         self._down = False
-        """World-sim is not there, and will be."""
-        self._mourned: set[ParticipantId] = set()
+        """World-sim is down, and will be restarted by a fault's schedule."""
+        self._reported: set[ParticipantId] = set()
         self._excused: set[ParticipantId] = set()
-        """Whose end says nothing, since they were killed or stopped on order."""
+        """Participants that were killed or stopped by command: their end is no failure."""
         self._frozen: set[ParticipantId] = set()
         self._impostors: dict[ParticipantId, tuple[ForkServerProcess, float]] = {}
         self.world_sim = self._start_world_sim(resume=False)
@@ -140,15 +140,15 @@ class Fleet:
         )
 
     def newly_failed(self) -> list[tuple[ParticipantId, int]]:
-        """Participants that have ended badly of themselves since the last call, with their exit codes."""
+        """Participants that have failed without a command since the last call, with their exit codes."""
         with self._lock:
-            failed = [(name, code) for name, code in self._failed() if name not in self._mourned]
-        self._mourned |= {name for name, _ in failed}
+            failed = [(name, code) for name, code in self._failed() if name not in self._reported]
+        self._reported |= {name for name, _ in failed}
         return failed
 
     @property
     def any_failed(self) -> bool:
-        """Whether a participant has ended badly of itself."""
+        """Whether a participant has failed without a command."""
         with self._lock:
             return any(self._failed())
 
@@ -157,26 +157,26 @@ class Fleet:
             if process.exitcode and name not in self._excused:
                 yield name, process.exitcode
 
-    def revive(self) -> str | None:
-        """Start world-sim again if somebody has killed it; how it ended."""
+    def restart_killed(self) -> str | None:
+        """Restart world-sim if it was killed and no fault is the cause; the signal."""
         with self._lock:
             code = self.world_sim.exitcode
             dead = code is not None and code < 0 and not self._down
-            if not dead or self._stopping.is_set() or self._revivals == _REVIVALS:
+            if not dead or self._stopping.is_set() or self._restarts == _RESTARTS_MAX:
                 return None
-            self._revivals += 1
+            self._restarts += 1
             self.world_sim = self._start_world_sim(resume=True)
             return f"signal {-(code or 0)}"
 
     @property
     def runs(self) -> bool:
-        """Whether world-sim is there, or will be."""
+        """Whether world-sim runs, or will be restarted."""
         with self._lock:
             return self._down or self.world_sim.exitcode is None
 
     @property
     def deserted(self) -> bool:
-        """Whether nobody is left who could take part, before anything has happened."""
+        """Whether all participants' processes have ended."""
         with self._lock:
             return all(process.exitcode is not None for process in self.participants.values())
 
@@ -188,8 +188,8 @@ class Fleet:
                 os.kill(self.world_sim.pid or 0, signal.SIGCONT)
                 os.kill(self.world_sim.pid or 0, signal.SIGINT)
 
-    def disband(self) -> None:
-        """Wait for everybody to go, and make them."""
+    def end(self) -> None:
+        """Wait for all processes to end, then terminate, then kill those that are left."""
         with self._lock:
             for name in self._frozen:
                 self.participants[name].kill()
@@ -199,7 +199,7 @@ class Fleet:
                 for process in processes:
                     if act is not None and process.exitcode is None:
                         getattr(process, act)()
-                give_up = time.monotonic() + _GOODBYE_S
+                give_up = time.monotonic() + _END_S
                 for process in processes:
                     process.join(max(0.0, give_up - time.monotonic()))
         if (self._config.folder / RESULT).exists():
@@ -318,11 +318,11 @@ def local_fleet(config: FleetConfig) -> Iterator[Fleet]:
             yield fleet
         finally:
             fleet.stop()
-            fleet.disband()
+            fleet.end()
 
 
 def watch_progress(fleet: Fleet) -> Iterator[Progress | None]:
-    """What world-sim tells, as long as it runs; None when there was nothing for a while.
+    """Progress as world-sim reports it, as long as it runs; None when there was none for a while.
 
     Raises BusError if world-sim does not come up.
     """
@@ -366,7 +366,7 @@ def _be_world_sim(
     mission = MissionConfig(scenario, seed, setup, config.exchange, config.speed)
     identity = credentials.find(secrets, credentials.HOST)
     users = credentials.users_file(secrets)
-    # The terminal and the parent may both say so: one Ctrl-C must not count as two.
+    # The terminal and the parent may both send the signal: one Ctrl-C must not count as two.
     with Interrupts(patient=True) as interrupts:
         if stopping:
             interrupts.code = Exit.INTERRUPTED
@@ -426,7 +426,7 @@ def _be_participant(
     from kantor_agent.process import run as run_agent  # noqa: PLC0415  the fork server has it
     from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
 
-    # The terminal's Ctrl-C reaches everybody; a participant goes when world-sim says so.
+    # The terminal's Ctrl-C reaches every process; a participant ends when world-sim stops the mission.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
     say = log_to(log, name)

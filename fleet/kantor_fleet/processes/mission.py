@@ -75,7 +75,7 @@ def _run_processes(config: FleetConfig, interrupts: Interrupts) -> Exit:
                         view.show(message)
                     for name, failure in fleet.newly_failed():
                         view.note(f"{name} ended with {_cause(failure)}; the others go on")
-                    if (ended := fleet.revive()) is not None:
+                    if (ended := fleet.restart_killed()) is not None:
                         view.note(f"world-sim ended with {ended}; it goes on from its record")
                     waiting = message is not None and message.phase == "waiting"
                     if not stopping and (interrupts() or (waiting and fleet.deserted)):
@@ -84,7 +84,7 @@ def _run_processes(config: FleetConfig, interrupts: Interrupts) -> Exit:
                         fleet.stop()
             except BusError:
                 view.note(f"world-sim is not there; see {config.folder / 'logs' / 'worldsim.log'}")
-            fleet.disband()
+            fleet.end()
             code = fleet.world_sim.exitcode
             failed = fleet.any_failed
     result = read_result(config.folder)
