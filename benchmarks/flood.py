@@ -115,12 +115,12 @@ class Timed(ParticipantSession):
         type(self).ticks = []
         self._step, self._said_s = 0, 0.0
 
-    def send(self, payload: bytes, *, patiently: bool) -> None:
+    def send(self, payload: bytes, *, blocking: bool) -> None:
         """Note when a step is said for the first time."""
         message = _FROM.decode(payload)
         if isinstance(message, Report) and message.outputs.step > self._step:
             self._step, self._said_s = message.outputs.step, time.monotonic()
-        super().send(payload, patiently=patiently)
+        super().send(payload, blocking=blocking)
 
     def next(self, timeout_s: float | None) -> bytes | None:
         """Note when it is heard to be accepted."""
@@ -288,7 +288,7 @@ def _be_flooder(
     identity = credentials.find(secrets, FLOODER)
     with participant_session(connect, identity, "flood", START_S) as line:
         mission = _await_message(line, Mission)
-        line.send(encode(Ready(VERSION, "flood")), patiently=True)
+        line.send(encode(Ready(VERSION, "flood")), blocking=True)
         _await_message(line, StepRequest, Ready(VERSION, "flood"))
         time.sleep(2.0)
         assert isinstance(mission, Mission)

@@ -421,7 +421,7 @@ class _Robot:
 
         self._life = RecoverableNode(build, InMemoryLog(), mission.body or Body(pose))
         self._clock = step_clocks(scenario, mission.seed)[self._name]
-        self._line.send(encode(Ready(VERSION, self._line.nonce)), patiently=True)
+        self._line.send(encode(Ready(VERSION, self._line.nonce)), blocking=True)
 
     def _start(self, go: StartClock) -> None:
         assert go.observation is not None
@@ -464,4 +464,4 @@ class _Robot:
 
     def _say(self) -> None:
         self._again_s = time.monotonic()
-        self._line.send(self._report, patiently=False)
+        self._line.send(self._report, blocking=False)

@@ -112,7 +112,7 @@ def _word(scenario: Scenario) -> Word:
     def take_in() -> None:
         two.stamps[:] = 0
         for word in newer:
-            two.learn(0, word, 2)
+            two.merge(0, word, 2)
 
     def compose() -> None:
         for _ in range(CHUNK):
@@ -120,9 +120,9 @@ def _word(scenario: Scenario) -> Word:
 
     def check() -> None:
         for _ in range(CHUNK):
-            two.sound(said, 2)
+            two.is_well_formed(said, 2)
 
-    assert all(two.sound(word, 2) for word in newer)
+    assert all(two.is_well_formed(word, 2) for word in newer)
     return Word(_median_us(compose), _median_us(check), _median_us(take_in), len(said))
 
 

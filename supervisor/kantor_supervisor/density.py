@@ -28,14 +28,14 @@ class DensitySupervisor:
     def step(self, inputs: Inputs, /) -> Outputs:
         """Take in what the robots sent, send every robot what it lacks."""
         self._step += 1
-        self._gossip.hear(inputs.inbox, self._replica.learn)
+        self._gossip.receive(inputs.inbox, self._replica.merge)
         finished = self._replica.empty
         outputs = Outputs(
             step=self._step,
             pose=self._pose,
             lowered=self._replica.packed_lowered(),
             weights=self._publisher.step(self._replica.lowered(), last=finished),
-            outbox=(self._gossip.say(self._replica, self._step, self._pose),),
+            outbox=(self._gossip.compose(self._replica, self._step, self._pose),),
             state=State.FINISHED if finished else State.EXPLORING,
             refused=self._gossip.refused,
         )
@@ -44,4 +44,4 @@ class DensitySupervisor:
 
     def validate(self) -> None:
         """Assert what its parts say of themselves; true between two steps."""
-        assert self._replica.empty == (not self._replica.weights.any())
+        self._replica.validate()

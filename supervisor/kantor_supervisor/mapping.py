@@ -32,7 +32,7 @@ class MappingSupervisor:
         self._robots = scenario.robots.count
         self._replica = build_replica(me, scenario, None, entries(frame), body.incarnation)
         self._gossip = Gossip(me, scenario, body.incarnation)
-        self._fused_map = FusedMap(frame, self._replica.slots)
+        self._fused_map = FusedMap(frame, self._replica.origins)
         """Of `_replica`, as far as its logs have been folded."""
         self._cost_map = CostMap(scenario, self._fused_map)
         self._assignment = Assignment(scenario, self._cost_map, seed, None)
@@ -47,7 +47,7 @@ class MappingSupervisor:
     def step(self, inputs: Inputs, /) -> Outputs:
         """Take in what the robots sent, assign targets, send every robot what it lacks."""
         self._step += 1
-        self._gossip.hear(inputs.inbox, self._replica.learn)
+        self._gossip.receive(inputs.inbox, self._replica.merge)
         self._fused_map.fold(self._replica)
         tick = inputs.now_ns // self._period_ns
         for robot, task in self._assignment.decide(*self._visible_team(tick), tick).items():
@@ -56,7 +56,7 @@ class MappingSupervisor:
         outputs = Outputs(
             step=self._step,
             pose=self._pose,
-            outbox=(self._gossip.say(self._replica, self._step, self._pose),),
+            outbox=(self._gossip.compose(self._replica, self._step, self._pose),),
             state=State.EXPLORING,
             refused=self._gossip.refused,
         )
@@ -65,6 +65,7 @@ class MappingSupervisor:
 
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""
+        self._replica.validate()
         self._fused_map.validate(self._replica)
         self._cost_map.validate()
         registers = self._replica.registers

@@ -189,7 +189,7 @@ def _merging(
 
         return learnt
 
-    _wrap(patch, Replica, "learn", make)
+    _wrap(patch, Replica, "merge", make)
 
 
 # Merging.
@@ -294,7 +294,7 @@ def inventing_acknowledgements(patch: Patch) -> None:
     def make(compose: Any) -> Any:
         def composed(self: Replica, target: int = -1) -> tuple[bytes, bytes, bytes]:
             told: tuple[bytes, bytes, bytes] = compose(self, target)
-            slots = self.slots
+            slots = self.origins
             self.store.known[:, :slots] = np.maximum(self.store.known[:, :slots], self.store.length)
             return told
 
@@ -307,7 +307,7 @@ def inventing_acknowledgements(patch: Patch) -> None:
 def forgetting_to_forward(patch: Patch) -> None:
     def make(compose: Any) -> Any:
         def composed(self: Replica, target: int = -1) -> tuple[bytes, bytes, bytes]:
-            slots, me = self.slots, self.config.me
+            slots, me = self.origins, self.config.me
             foreign = np.arange(slots) != me
             known = self.store.known[:, :slots]
             known[:, foreign] = np.maximum(known[:, foreign], self.store.length[foreign])
@@ -446,7 +446,7 @@ def hostile_message_taken_in(patch: Patch) -> None:
 
         return heard
 
-    _wrap(patch, Gossip, "hear", make)
+    _wrap(patch, Gossip, "receive", make)
 
 
 @mutant("sound messages are refused now and then")
@@ -459,7 +459,7 @@ def sound_message_refused(patch: Patch) -> None:
 
         return heard
 
-    _wrap(patch, Gossip, "hear", make)
+    _wrap(patch, Gossip, "receive", make)
 
 
 @mutant("a new incarnation counts its messages from 1 again", _has(Kill, disk=("torn", "lost")))
@@ -472,7 +472,7 @@ def sequences_used_again(patch: Patch) -> None:
 
         return said
 
-    _wrap(patch, Gossip, "say", make)
+    _wrap(patch, Gossip, "compose", make)
 
 
 @mutant("a robot that has lost its supervisor talks to it for ever", _supervised)
@@ -484,7 +484,7 @@ def supervisor_never_given_up(patch: Patch) -> None:
 
         return said
 
-    _wrap(patch, Gossip, "say", make)
+    _wrap(patch, Gossip, "compose", make)
 
 
 @mutant("a robot that has given its supervisor up never returns to it", _supervised)
@@ -499,7 +499,7 @@ def supervisor_never_heard_again(patch: Patch) -> None:
 
         return said
 
-    _wrap(patch, Gossip, "say", make)
+    _wrap(patch, Gossip, "compose", make)
 
 
 # Energy, motion and goals.
@@ -596,7 +596,7 @@ def weight_that_rises(patch: Patch) -> None:
 
         return learnt
 
-    _wrap(patch, Replica, "learn", make)
+    _wrap(patch, Replica, "merge", make)
 
 
 @mutant("what is published misses an entry now and then", _density)
@@ -646,7 +646,7 @@ def register_off_by_one(patch: Patch) -> None:
 @mutant("a step is noted after it was told, and the diary is trusted", _has(Kill))
 def late_write(patch: Patch) -> None:
     def kill(self: KillableNode) -> None:
-        self._life = None
+        self._node = None
         del self._wal._inputs[-1:]
 
     patch.setattr(KillableNode, "kill", kill)
@@ -671,7 +671,7 @@ def amnesia(patch: Patch) -> None:
     def start(self: KillableNode, body: Body, disk: str) -> tuple[int, int]:
         self._wal = InMemoryLog()
         newborn = Body(body.pose, 0, 0, body.incarnation)
-        self._life = RecoverableNode(self._build, self._wal, newborn)
+        self._node = RecoverableNode(self._build, self._wal, newborn)
         return body.incarnation, body.step
 
     patch.setattr(KillableNode, "start", start)
@@ -682,7 +682,7 @@ def amnesia(patch: Patch) -> None:
     _has(Kill, disk=("torn", "lost")),
 )
 def old_incarnation_used_again(patch: Patch) -> None:
-    patch.setattr(recovery, "_reborn", lambda body: body)
+    patch.setattr(recovery, "_reincarnated", lambda body: body)
 
 
 @mutant("every start is a new incarnation, though the diary is whole", _has(Kill, disk=("kept",)))
@@ -695,11 +695,11 @@ def needless_incarnation(patch: Patch) -> None:
 
 @mutant("asked again, a robot does its step once more", _has(Kill, mid_step=(True,)))
 def answering_a_turn_twice(patch: Patch) -> None:
-    def take(self: RecoverableNode, entry: bytes) -> Any:
-        self._wal.note(entry)
-        return self._live(decode_inputs(entry))
+    def step_encoded(self: RecoverableNode, entry: bytes) -> Any:
+        self._wal.append(entry)
+        return self._advance(decode_inputs(entry))
 
-    patch.setattr(RecoverableNode, "take", take)
+    patch.setattr(RecoverableNode, "step_encoded", step_encoded)
 
 
 @mutant("a step is not counted now and then", _density)

@@ -130,7 +130,7 @@ def test_world_sim_killed_goes_on_by_itself(fleet_of: MakeFleet) -> None:
     fleet.await_log("worldsim", r"explored [2-9]\d %")
     call("docker", "kill", fleet.id("r1"))
     call("docker", "start", fleet.id("r1"))
-    fleet.await_log("r1", "goes on, epoch 0")
+    fleet.await_log("r1", "goes on as incarnation 0")
     assert fleet.readiness_s("r1") <= 3.0
     if os.getuid() == 0:
         os.kill(fleet.inspect("worldsim")["State"]["Pid"], signal.SIGKILL)

@@ -121,17 +121,17 @@ def test_renewed_and_revoked(tmp_path: Path) -> None:
 
     issue(tmp_path, Wanted("demo", renew=("r1",), revoke=("r2",)), NOW)
     router, team = identity(tmp_path, "worldsim"), ("r1", "r2", "r3")
-    assert router.objection(identity(tmp_path, "r1").name, team) == ""
-    assert "use the newest r1.toml" in router.objection(old["r1"], team)
-    assert "has been revoked" in router.objection(old["r2"], team)
-    assert router.objection(old["r3"], team) == ""
+    assert router.refusal_reason(identity(tmp_path, "r1").name, team) == ""
+    assert "use the newest r1.toml" in router.refusal_reason(old["r1"], team)
+    assert "has been revoked" in router.refusal_reason(old["r2"], team)
+    assert router.refusal_reason(old["r3"], team) == ""
 
     issue(tmp_path, Wanted("demo", 3), NOW)
     assert "r2" not in register(tmp_path).members
     issue(tmp_path, Wanted("demo", renew=("r2",)), NOW)
     router = identity(tmp_path, "worldsim")
-    assert router.objection(identity(tmp_path, "r2").name, team) == ""
-    assert "has been revoked" in router.objection(old["r2"], team)
+    assert router.refusal_reason(identity(tmp_path, "r2").name, team) == ""
+    assert "has been revoked" in router.refusal_reason(old["r2"], team)
 
 
 def test_sites_carry_a_register_of_their_own(tmp_path: Path) -> None:
@@ -158,7 +158,7 @@ def test_sites_carry_a_register_of_their_own(tmp_path: Path) -> None:
     (tmp_path / "site-south.toml").unlink()  # handed out
     lines = issue(tmp_path, Wanted("demo", revoke=("r2",)), NOW)
     assert set(identity(tmp_path, "site-north").members) == {"worldsim", "r1"}
-    assert identity(tmp_path, "worldsim").behind()["site-north"] == ("r1",)
+    assert identity(tmp_path, "worldsim").robots_by_site()["site-north"] == ("r1",)
     assert [line.partition(":")[0].rpartition("/")[2] for line in lines] == [
         "r2", "worldsim.toml", "site-north.toml",
     ]  # fmt: skip
@@ -321,7 +321,7 @@ def test_the_register_counts_one_certificate_for_each(
         assert all(
             identity(folder, user).name == member.name for user, member in own.members.items()
         )
-        counts = {name for name in ever if not router.objection(name, own.members)}
+        counts = {name for name in ever if not router.refusal_reason(name, own.members)}
         assert counts == {member.name for member in own.members.values()}
         placed = [name for there in own.sites.values() for name in there]
         assert len(set(placed)) == len(placed)

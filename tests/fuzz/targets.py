@@ -32,7 +32,7 @@ from kantor_protocol.node.wal import WalFile
 from kantor_protocol.replication.gossip import build_replica
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
 from kantor_protocol.replication.registers import NUMBER_MAX, read_register
-from kantor_protocol.replication.replica import Replica, read_version_vector
+from kantor_protocol.replication.replica import Replica
 from kantor_protocol.scenario.dump import to_toml, to_tree
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.load import from_tree, parse, with_chaos
@@ -51,6 +51,7 @@ from kantor_protocol.wire.messages import (
     encode,
     encode_gossip,
 )
+from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_protocol.wire.weights import Units, WeightsSubscriber
 from kantor_worldsim.record import columnar
 from kantor_worldsim.record.columnar import ACTS, ALL_HEARD, ALL_SENT, INJECTED, PAIRS, VERDICTS
@@ -212,7 +213,7 @@ def _learning(name: str, me: str = "r1", samples: int | None = None) -> Callable
             source, version_vector, logs, claims, written = unframe(content)
             place = source[0] % (3 * len(scenario.roster)) if source else 0
             before = _state(replica)
-            taken = replica.learn(place, version_vector, logs, claims, written)
+            taken = replica.merge(place, version_vector, logs, claims, written)
             if not taken:
                 assert _state(replica) == before, "a refused message has changed something"
                 return False
@@ -232,7 +233,7 @@ def _state(replica: Replica) -> list[bytes]:
         *(store.weights, store.length, store.known, store.sending, store.claims),
         *(store.lowered, store.mark, store.counters),
         *(registers.values, registers.total, registers.stamps),
-        *(registers._known, registers._heard, registers._learnt, registers._sent),
+        *(registers._known, registers._received, registers._updated, registers._sent),
     )
     return [array.tobytes() for array in arrays]
 
@@ -257,9 +258,9 @@ def _registers(_folder: Path) -> Decode:
 
     def take(content: bytes) -> bool:
         source, written = unframe(content)
-        sound = registers.sound(written, 3)
+        sound = registers.is_well_formed(written, 3)
         if sound:
-            registers.learn(source[0] % 3 if source else 0, written, 3)
+            registers.merge(source[0] % 3 if source else 0, written, 3)
             assert (registers.values.sum(axis=0) == registers.total).all()
             assert np.abs(registers.values).max() <= NUMBER_MAX
         for origin in range(3):
@@ -391,7 +392,7 @@ def _machine(name: str, me: str) -> Callable[[Path], Decode]:
 
 
 class _Leaf:
-    """A diary of one page."""
+    """A write-ahead log of one entry."""
 
     def __init__(self, page: bytes) -> None:
         self._page = page
@@ -400,11 +401,11 @@ class _Leaf:
         """What it holds."""
         return WalContents(Body(Pose(10.0, 10.0)), (self._page,))
 
-    def begin(self, birth: Body) -> None:
+    def reset(self, initial_state: Body) -> None:
         """Never."""
-        raise AssertionError("a diary that covers all is thrown away")
+        raise AssertionError("a log that covers all is thrown away")
 
-    def note(self, inputs: bytes) -> None:
+    def append(self, inputs: bytes) -> None:
         """Forget it."""
 
 

@@ -189,7 +189,7 @@ class Belief:
             store.weights,
             store.claims,
             store.counters,
-            np.zeros(self.replica.slots, dtype=np.int64),
+            np.zeros(self.replica.origins, dtype=np.int64),
             config.me if config.claims else NOBODY,
         )
         """Arguments of a planner's kernel (see `kernels.kernel`): the arrays of `grid`; weights, claims and
@@ -208,7 +208,7 @@ class Belief:
         assert all(map(operator.is_, self._to_drop, dropped))
         assert all(map(operator.is_, self._to_ship, (*grid, *store)))
         assert all(map(operator.is_, self.to_choose, chosen))
-        assert self.to_choose[len(chosen)].shape == (self.replica.slots,)
+        assert self.to_choose[len(chosen)].shape == (self.replica.origins,)
 
     @property
     def weights(self) -> Weights:

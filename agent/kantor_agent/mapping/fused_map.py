@@ -133,8 +133,8 @@ class FusedMap:
 
     def fold(self, replica: Replica) -> bool:
         """Take in the entries that the logs have gained; whether a cell may have changed."""
-        if replica.slots > self._folded.shape[0]:
-            self._widen(replica.slots)
+        if replica.origins > self._folded.shape[0]:
+            self._widen(replica.origins)
         lengths = replica.store.length
         before = self.revision
         for origin in np.flatnonzero(lengths > self._folded).tolist():

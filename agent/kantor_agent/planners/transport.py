@@ -14,7 +14,7 @@ from kantor_agent.belief.sample_index import SampleIndex, nearest
 from kantor_agent.planners.base import Goal
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.machine import Pose
-from kantor_protocol.replication.replica_kernels import NOBODY, claim, taken
+from kantor_protocol.replication.replica_kernels import NOBODY, claim, claimed_by_others
 
 
 @kernel
@@ -100,7 +100,7 @@ def _choose(
     held: scratch for the samples that others have claimed. me: NOBODY in a mission without claims.
     """
     grid = SampleIndex(xy_m, order, cell, first, alive, frame, levels)
-    skip = held[: taken(claims, counters, me, held) if me != NOBODY else 0]
+    skip = held[: claimed_by_others(claims, counters, me, held) if me != NOBODY else 0]
     sample = choose_sample(grid, weights, x, y, skip, best, near, cost_to_go)
     if sample == NOBODY and skip.shape[0] > 0:
         sample = choose_sample(grid, weights, x, y, skip[:0], best, near, cost_to_go)

@@ -64,7 +64,7 @@ class DensityRobot:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the class."""
-        self._gossip.hear(inputs.inbox, self._replica.learn)
+        self._gossip.receive(inputs.inbox, self._replica.merge)
         self._locate(inputs.observation)
         self._belief.advance(inputs.now_ns)
         elapsed_s = self._timer.elapsed_s(inputs.now_ns)
@@ -74,6 +74,7 @@ class DensityRobot:
 
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""
+        self._replica.validate()
         self._belief.validate()
         assert self._belief.replica is self._replica
         assert self._goal is None or self._state is State.EXPLORING
@@ -104,7 +105,7 @@ class DensityRobot:
             replica.claim(NOBODY, self._now_ns)
         lowered = replica.packed_lowered()
         weights = self._publisher.step(replica.lowered(), last=state is not State.EXPLORING)
-        envelope = self._gossip.say(replica, self._step, self._pose)
+        envelope = self._gossip.compose(replica, self._step, self._pose)
         replica.end_step()
         return Outputs(
             step=self._step,

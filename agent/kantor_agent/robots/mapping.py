@@ -60,7 +60,7 @@ class MappingRobot:
         self._robots = scenario.robots.count
         self._replica = build_replica(me, scenario, None, entries(frame), body.incarnation)
         self._gossip = Gossip(me, scenario, body.incarnation)
-        self._fused_map = FusedMap(frame, self._replica.slots)
+        self._fused_map = FusedMap(frame, self._replica.origins)
         """Of `_replica`, as far as its logs have been folded."""
         self._cost_map = CostMap(scenario, self._fused_map)
         self._occupancy = OccupancyLog(frame, scenario.sensor, ranges=scenario.learns_ranges)
@@ -92,7 +92,7 @@ class MappingRobot:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the module."""
-        self._gossip.hear(inputs.inbox, self._replica.learn)
+        self._gossip.receive(inputs.inbox, self._replica.merge)
         self._locate(inputs.observation)
         elapsed_s = self._timer.elapsed_s(inputs.now_ns)
         self._now_ns, self._step = inputs.now_ns, self._step + 1
@@ -107,6 +107,7 @@ class MappingRobot:
 
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""
+        self._replica.validate()
         self._fused_map.validate(self._replica)
         self._cost_map.validate()
         assert not (self._resting and self._task.target != NOWHERE)
@@ -232,7 +233,7 @@ class MappingRobot:
         if self._resting:
             self._task = Task()
         self._replica.registers.write(self._own_register())
-        envelope = self._gossip.say(self._replica, self._step, self._pose)
+        envelope = self._gossip.compose(self._replica, self._step, self._pose)
         self._replica.end_step()
         target = self._task.target
         return Outputs(

@@ -65,7 +65,7 @@ def _learned(scenario: Scenario, incarnation: int, said: Sequence[_Said]) -> Rep
     before = -1
     for _ in range(_PASSES):
         for slot, news in said:
-            replica.learn(slot, news.version_vector, news.logs, news.claims, news.registers)
+            replica.merge(slot, news.version_vector, news.logs, news.claims, news.registers)
         replica.end_step()
         held = int(replica.store.length.sum())
         if held == before:

@@ -17,12 +17,11 @@ from kantor_protocol.base.machine import (
     State,
 )
 from kantor_protocol.base.varint import Pairs
-from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.faults.links import OneWay, Partition
 from kantor_protocol.scenario.faults.processes import ClockFault, Kill, Late
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
-from kantor_protocol.wire.version_vector import slots_told
+from kantor_protocol.wire.version_vector import covered_ids, read_version_vector
 from kantor_worldsim.radio.channel import DROPPED
 from kantor_worldsim.radio.forgeries import FIRST_SEQUENCE
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
@@ -218,7 +217,7 @@ class _Memory(_RareEvent):
             version_vector = decode_gossip(body).version_vector
         except RefusedError:
             return []
-        slots = slots_told(version_vector, len(self._names), claims=self.scenario.claiming)
+        slots = covered_ids(version_vector, len(self._names), claims=self.scenario.claiming)
         return (slots and read_version_vector(version_vector, slots)) or []
 
 

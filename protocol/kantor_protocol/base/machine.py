@@ -24,6 +24,9 @@ SUPERVISOR: ParticipantId = "supervisor"
 WORLD_SIM: ParticipantId = "worldsim"
 """The process that plays the world. It is no participant, but it can fail like one."""
 
+NEVER_NS = 2**63 - 1
+"""A time in nanoseconds that no clock reaches: of what has no end, or does not happen."""
+
 
 class State(enum.IntEnum):
     """What a participant is doing. The last two are final."""

@@ -1,4 +1,4 @@
-"""Cosine modes on a rectangle, and what a visit adds to the sums over them.
+"""Cosine modes on a rectangle, and the amounts that a visit adds to the sums over them.
 
 The K x K modes cos(kx pi x / Lx) cos(ky pi y / Ly), kx and ky from 0 to K - 1, with x and y from the
 lower left corner of the domain, are the basis of Spectral Multiscale Coverage (Mathew & Mezic) without
@@ -14,7 +14,7 @@ from kantor_protocol.base.kernels import kernel
 from kantor_protocol.scenario.schema import Domain
 
 VISIT = 1 << 12
-"""What a visit adds where a mode is 1. After n visits a sum is wrong by some sqrt(n) / 14000 visits."""
+"""The amount that a visit adds where a mode is 1. After n visits a sum is wrong by some sqrt(n) / 14000 visits."""
 
 _INSET = 0.002
 """No place is taken nearer to a border than this share of the extent. On the border every mode is level
@@ -23,7 +23,7 @@ across it, so that a robot which slides along it would never turn away."""
 
 @kernel
 def phase(x: float, low: float, extent: float) -> float:
-    """The angle of mode 1 at a coordinate, within (0, pi); what lies outside counts at the border."""
+    """The angle of mode 1 at a coordinate, within (0, pi); what lies outside counts as the border."""
     return math.pi * min(max((x - low) / extent, _INSET), 1.0 - _INSET)
 
 
@@ -41,7 +41,7 @@ def harmonics(angle: float, cosines: np.ndarray, sines: np.ndarray) -> None:
 
 @kernel
 def visit(cos_x: np.ndarray, cos_y: np.ndarray, visited: np.ndarray) -> None:
-    """What a visit adds to the sum over each mode, rounded to integers: (K * K,)."""
+    """Write to `visited` (K * K,) the amount that a visit adds to the sum over each mode, rounded to integers."""
     modes = cos_x.shape[0]
     for kx in range(modes):
         for ky in range(modes):
@@ -56,7 +56,7 @@ def rectangle_of(domain: Domain) -> npt.NDArray[np.float64]:
 def visit_at(
     x_m: float, y_m: float, rectangle: npt.NDArray[np.float64], modes: int
 ) -> npt.NDArray[np.int64]:
-    """(K * K,) what a visit at one place adds."""
+    """(K * K,) the amounts that a visit at one place adds. Coordinates in the world frame."""
     visited = np.zeros(modes * modes, dtype=np.int64)
     _visit_at(x_m, y_m, rectangle, np.zeros((3, modes)), visited)
     return visited

@@ -1,4 +1,4 @@
-"""A participant's end of the radio: envelopes in and out, with the check at the door."""
+"""A participant's end of the radio: envelopes in and out, every received message checked before it is merged."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -19,57 +19,58 @@ from kantor_protocol.wire.messages import (
 from kantor_protocol.wire.weights import Units
 
 CONTACT_PERIODS = 8
-"""Whoever was not heard for more of the own steps is out of contact."""
+"""A participant from which no message came for more of the own steps is out of contact."""
 
-Learn = Callable[[int, bytes, bytes, bytes, bytes], bool]
-"""Takes in a message by the slot of its sender and the parts of its News; see `Replica.learn`."""
+Merge = Callable[[int, bytes, bytes, bytes, bytes], bool]
+"""Merges a message: the incarnation id of its sender and the parts of a GossipMessage; see `Replica.merge`."""
 
 
 class Gossip:
-    """Turns what a replica has to say into envelopes, and envelopes into what it learns.
+    """Makes envelopes of what a replica composes, and has it merge the envelopes that arrive.
 
-    A robot with a supervisor talks to it alone. When it has not heard it for a while it talks to everybody,
-    until it hears it again: what a supervisor missed meanwhile it gets as any neighbour does.
+    A robot with a supervisor sends to it alone. When it has received nothing from it for a while it sends to all in
+    range, until it receives from it again: what a supervisor missed meanwhile it gets as any neighbour does.
     """
 
     def __init__(self, me: ParticipantId, scenario: Scenario, incarnation: int = 0) -> None:
-        """epoch: which incarnation speaks."""
+        """incarnation: the one that sends."""
         self.refused = 0
-        """Messages that were malformed, too old or from nobody in the roster."""
+        """Messages that were malformed, too old or from no other participant of the roster."""
         roster = scenario.roster
-        self._me, self._incarnation, self._origins = me, incarnation, len(roster)
+        self._me, self._incarnation, self._roster = me, incarnation, len(roster)
         self._places = {name: i for i, name in enumerate(roster) if name != me}
-        self._supervisor = self._supervisor_slot = self._places.get(SUPERVISOR, NOBODY)
-        """Its place, and the slot of its newest incarnation; NOBODY without one."""
-        self._unheard_steps = -ack_timeout_steps(me, scenario)  # the first word takes its time
-        """Own steps since the supervisor was heard."""
+        self._supervisor = self._supervisor_id = self._places.get(SUPERVISOR, NOBODY)
+        """Its place, and the id of its newest incarnation; NOBODY without one."""
+        self._unheard_steps = -ack_timeout_steps(me, scenario)  # its first message takes its time
+        """Own steps since a message of the supervisor was received."""
 
-    def hear(self, inbox: Iterable[Envelope], learn: Learn) -> None:
-        """Have every sound message of a step learned; count the others."""
+    def receive(self, inbox: Iterable[Envelope], merge: Merge) -> None:
+        """Have every well-formed message of a step merged; count the others."""
         self._unheard_steps += 1
         for envelope in inbox:
             place = self._places.get(envelope.source)
             try:
-                news = decode_gossip(envelope.body)
+                message = decode_gossip(envelope.body)
             except RefusedError:
                 place = None
             if place is None:
                 self.refused += 1
                 continue
-            slot = place + news.incarnation * self._origins
-            if not learn(slot, news.version_vector, news.logs, news.claims, news.registers):
+            source = place + message.incarnation * self._roster
+            parts = (message.version_vector, message.logs, message.claims, message.registers)
+            if not merge(source, *parts):
                 self.refused += 1
             elif place == self._supervisor:
-                self._supervisor_slot = max(self._supervisor_slot, slot)
+                self._supervisor_id = max(self._supervisor_id, source)
                 self._unheard_steps = 0
 
-    def say(self, replica: Replica, step: int, pose: Pose) -> Envelope:
-        """What whoever it talks to lacks."""
-        alone = self._supervisor == NOBODY or self._unheard_steps > CONTACT_PERIODS
-        slot = NOBODY if alone else self._supervisor_slot
-        target = EVERYBODY if alone else SUPERVISOR
-        version_vector, logs, claims = replica.compose(slot)
-        news = GossipMessage(
+    def compose(self, replica: Replica, step: int, pose: Pose) -> Envelope:
+        """The envelope of one step, with what its receivers lack."""
+        to_all = self._supervisor == NOBODY or self._unheard_steps > CONTACT_PERIODS
+        receiver = NOBODY if to_all else self._supervisor_id
+        target = EVERYBODY if to_all else SUPERVISOR
+        version_vector, logs, claims = replica.compose(receiver)
+        message = GossipMessage(
             version=VERSION,
             step=step,
             x_m=pose.x_m,
@@ -77,44 +78,44 @@ class Gossip:
             version_vector=version_vector,
             logs=logs,
             claims=claims,
-            registers=replica.registers.compose(slot),
+            registers=replica.registers.compose(receiver),
             incarnation=self._incarnation,
         )
-        return Envelope(source=self._me, sequence=step, target=target, body=encode_gossip(news))
+        return Envelope(source=self._me, sequence=step, target=target, body=encode_gossip(message))
 
 
 def build_replica(
     me: ParticipantId, scenario: Scenario, units: Units | None, samples: int, incarnation: int = 0
 ) -> Replica:
     """An empty replica for an incarnation of a participant of a scenario; see Replica."""
-    origins = len(scenario.roster)
-    slot = incarnation * origins + scenario.roster.index(me)
+    roster = len(scenario.roster)
+    incarnation_id = incarnation * roster + scenario.roster.index(me)
     relay, beacon = me == SUPERVISOR, scenario.radio.beacon == "state"
-    patience = ack_timeout_steps(me, scenario)
+    timeout_steps = ack_timeout_steps(me, scenario)
     return Replica(
-        slot,
-        origins,
+        incarnation_id,
+        roster,
         samples,
         units,
         ledger=scenario.mapping or scenario.merge == "ledger",
         claims=scenario.claiming,
         relay=relay,
         beacon=beacon,
-        patience_steps=patience,
+        ack_timeout_steps=timeout_steps,
         registers=Registers(
-            slot,
-            origins,
+            incarnation_id,
+            roster,
             scenario.register_width,
             sums=not scenario.mapping,
             relay=relay,
             beacon=beacon,
-            patience_steps=patience,
+            ack_timeout_steps=timeout_steps,
         ),
     )
 
 
 def ack_timeout_steps(me: ParticipantId, scenario: Scenario) -> int:
-    """Own steps until an answer is due: the way there and back, and the other's next step."""
+    """Own steps until an acknowledgement is due: the way there and back, and the other's next step."""
     radio, clock = scenario.radio, scenario.clock
     way_s = radio.delay_s + radio.jitter_s
     slowest_s = clock.period_s * (1.0 + clock.spread + clock.drift_ppm * 1e-6) + clock.jitter_s

@@ -1,16 +1,15 @@
-"""What range scans say about the cells of a map (Burgard et al., eq. 1-3, in log odds), and how it travels.
+"""Occupancy evidence from range scans (Burgard et al., eq. 1-3, in log odds), and the log by which it is replicated.
 
-A scan gives every cell that a beam passes or ends in one piece of evidence: against or for a wall,
-whichever its beams say in sum. Sums are clamped, so that no cell is ever certain. What a robot tells
-others is the sign of its sum: an entry in its log whenever a cell becomes free or occupied to it. The
-log is append-only and its robot alone writes it, so that it is replicated as every other log
-(`replica.py`), and nobody merges merged maps.
+A scan gives every cell that a beam passes or ends in one piece of evidence: for or against an obstacle, whichever
+its beams say in sum. Sums are clamped, so that no cell is ever certain. A robot shares the sign of its sum: an entry
+in its log whenever a cell becomes free or occupied to it. The log is append-only and its robot alone writes it, so
+that it is replicated as every other log (`replica.py`). Logs are merged, maps never are.
 
 Entries of a log, for a map of n cells
     2 cell          the cell is free        2 cell + 1     the cell is occupied
-    2 n + cell      the robot stood at this frontier and saw nothing new: it is none
+    2 n + cell      a dead frontier: the robot stood at it and saw nothing new
     3 n + bin       one measured range, of RANGE_BINS bins from 0 to the sensor's range
-Beams that found nothing count in the last bin. A few beams of each scan are enough to learn by.
+Beams that met nothing count in the last bin. A few beams of each scan are enough to learn by.
 """
 
 import math
@@ -28,24 +27,25 @@ RANGE_BINS = 32
 NO_RETURN = 65535
 """In a scan: the beam met nothing within range."""
 CODES = 65534
-"""A range is told in so many parts of the sensor's range."""
+"""A range is encoded in so many parts of the sensor's range."""
 
 HIT, PASS, CERTAIN = 85, -40, 294
 """Evidence in 1/100 of log odds: +0.85, -0.40, and at most ln 19 in size (P within [0.05, 0.95])."""
 
-_LEARNT_BEAMS = 4
+_SHARED_BEAMS = 4
+"""Beams of one scan whose ranges become entries."""
 _NOISE_CELLS_MAX = 0.5
-"""A wall is looked for this far around where a noisy beam ended, at most: further, and there are always
+"""An obstacle is looked for this far around where a noisy beam ended, at most: further, and there are always
 several cells to choose from."""
 
 
 def entries(frame: Frame) -> int:
-    """Every entry of a log is below this."""
+    """The number of different entries; every entry of a log is below it."""
     return 3 * frame.cells + RANGE_BINS
 
 
 def dead_frontier(frame: Frame, cell: int) -> int:
-    """The entry that says a frontier is none."""
+    """The entry that declares a frontier dead."""
     return 2 * frame.cells + cell
 
 
@@ -57,7 +57,7 @@ def beam_rad(heading_rad: float, field_of_view_rad: float, beams: int, beam: int
 
 @kernel
 def _touch(cell: int, evidence: int, votes: np.ndarray, touched: np.ndarray, count: int) -> int:
-    """Note what one beam says of a cell."""
+    """Add the evidence of one beam to a cell; the number of cells in `touched`."""
     if votes[cell] == 0:
         touched[count] = cell
         count += 1
@@ -81,13 +81,13 @@ def _follow_beam(
 ) -> int:
     """Touch the cells of one beam. reach, tolerance: in cells; negative tolerance: nothing was met.
 
-    A wall's face is a border of cells, and the beam ended at it, give or take the tolerance. If it enters
-    just one cell there, this is the wall; if it enters several, as at a corner, it says nothing of
-    them. What it entered before is free.
+    A wall's face is a border of cells, and the beam ended at it, give or take the tolerance. If it enters just one
+    cell there, this one is occupied; if it enters several, as at a corner, it is no evidence for any of them. Cells
+    that it entered before are free.
     """
     column, row = int(u), int(v)
     du, dv = math.cos(angle_rad), math.sin(angle_rad)
-    count = _touch(row * columns + column, PASS, votes, touched, count)  # it stands here
+    count = _touch(row * columns + column, PASS, votes, touched, count)  # the robot stands here
     wall, entered = NOWHERE, 0
     while True:
         row, column, share = next_cell(row, column, u, v, du, dv)
@@ -148,13 +148,16 @@ def _integrate(
 
 
 class OccupancyLog:
-    """What one robot has seen itself: a layer of the map, and the entries that tell of it."""
+    """The evidence layer of one robot, from its own scans, and the log entries that share it."""
 
     def __init__(self, frame: Frame, sensor: SensorOptions, *, ranges: bool) -> None:
-        """ranges: measured ranges are entries as well, for planners that learn from them."""
+        """A layer without evidence.
+
+        ranges: measured ranges are entries as well, for planners that learn from them.
+        """
         cells = frame.cells
         self.odds = np.zeros(cells, dtype=np.int16)
-        """(cells,) in 1/100."""
+        """(cells,) evidence in 1/100 of log odds."""
         self.kinds = np.zeros(cells, dtype=np.uint8)
         """(cells,) UNKNOWN, FREE or OCCUPIED."""
         self._frame = frame
@@ -175,9 +178,9 @@ class OccupancyLog:
         self._changed = np.zeros(cells, dtype=np.int64)
 
     def observe(self, scan: bytes, pose: Pose, *, moved: bool) -> npt.NDArray[np.int64]:
-        """Add a scan made at a pose: (k,) entries for the log, rising. A scan of the wrong size is void.
+        """Add a scan made at a pose: (k,) entries for the log, rising. A scan of the wrong size is dropped.
 
-        moved: since the scan before; from a place that it knows a robot learns nothing of ranges.
+        moved: since the scan before; ranges from a place that it has measured at already are not shared again.
         """
         if len(scan) != 2 * self._beams:
             return np.zeros(0, dtype=np.int64)
@@ -194,13 +197,14 @@ class OccupancyLog:
             self._changed,
         )
         self._scans += 1
-        news = np.sort(self._changed[:count])
+        changes = np.sort(self._changed[:count])
         if self._ranges and moved:
-            news = np.concatenate((news, self._learnt(codes)))
-        return news
+            changes = np.concatenate((changes, self._ranges_in(codes)))
+        return changes
 
-    def _learnt(self, codes: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-        stride = max(1, self._beams // _LEARNT_BEAMS)
+    def _ranges_in(self, codes: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+        """(k,) entries of the measured ranges of a few beams, other ones in each scan."""
+        stride = max(1, self._beams // _SHARED_BEAMS)
         some = codes[self._scans % stride :: stride].astype(np.int64)
         bins = np.minimum(some * RANGE_BINS // CODES, RANGE_BINS - 1)
         return np.sort(bins) + 3 * self._frame.cells

@@ -1,22 +1,22 @@
-"""Registers: one vector of integers for every participant, held by everybody (design, part 4).
+"""Registers: one vector of integers for every participant, held by all (docs/decisions/010).
 
-An origin writes its own register, or adds to it, and nobody else does. Everywhere else the newest value
-wins, by the origin's stamp, which counts its writes. The sum over all origins is kept: integers make it
-exact, so that it is the same wherever the same registers are held, whatever came first. An origin is one
-incarnation of a participant (`slots.py`): what a dead one has added is not lost, and counts once.
+An origin writes its own register, or adds to it, and no other participant does. Everywhere else the newest value
+wins, by the origin's stamp, which counts its writes. The sum over all origins is kept: integers make it exact, so
+that it is the same wherever the same registers are held, in whatever order they came. An origin is one incarnation
+of a participant (`base/incarnations.py`): what an ended one has added is not lost, and counts once.
 
-Talking
+Sending
 -------
-1. Every message carries a stamp for every slot that its sender knows, as many as its version vector
-   has (`replica.py`), at once an acknowledgement. While nobody is heard that is all, or, with `beacon`,
+1. Every message carries a stamp for every incarnation id that its sender knows, as many as its version vector
+   covers (`replica.py`), at once an acknowledgement. While nothing is received that is all, or, with `beacon`,
    every register as well.
-2. A register goes to neighbours of which one lacks it: its stamp once, and again only when the
-   acknowledgement has not come within `patience` steps. Its origin and a relay send it at once. Others
-   forward it when a neighbour lacks several writes, or has lacked the last one for several steps: most
-   likely it hears the origin itself.
-3. What does not fit into one message waits for the next; the own register goes first, then the others
-   from a place that moves on with each step.
-4. Receiving is idempotent. Loss, duplication, delay and reordering cost time, never truth.
+2. A register goes to neighbours of which one lacks it: once for each stamp, and again only when the
+   acknowledgement has not come within `ack_timeout_steps`. Its origin and a relay send it at once. Others forward
+   it when a neighbour lacks several writes, or has lacked the last one for several steps: most likely it
+   receives the origin's messages itself.
+3. What does not fit into one message waits for the next; the own register goes first, then the others from a
+   place that moves on with each step.
+4. Merging is idempotent. Loss, duplication, delay and reordering cost time, never correctness.
 """
 
 from collections.abc import Sequence
@@ -24,9 +24,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.incarnations import known_to
+from kantor_protocol.base.incarnations import known_ids
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.varint import MALFORMED, put_int, put_uint, read_int, read_uint
+from kantor_protocol.wire.version_vector import raise_entries
 
 Register = npt.NDArray[np.int64]
 
@@ -39,7 +40,7 @@ _NUMBER_BYTES, _HEAD_BYTES, _STAMP_BYTES = 8, 15, 6
 _STALE_STEPS = 6
 """How many writes, or steps, behind a neighbour may be before a robot forwards another's register."""
 FRESH_STEPS = 4
-"""A participant heard within so many steps beyond `patience` counts as a neighbour."""
+"""A participant of which a message was received within so many steps beyond `ack_timeout_steps` is a neighbour."""
 
 
 @kernel
@@ -67,19 +68,19 @@ def _read_head(
 
 
 @kernel
-def _sound(content: bytes, told: int, width: int, sums: bool) -> bool:
-    """Whether content is stamps of as many origins as told, and then whole registers of theirs.
+def _is_well_formed(content: bytes, covered: int, width: int, sums: bool) -> bool:
+    """Whether content is the stamps of `covered` origins, and then whole registers of theirs.
 
     sums: the first number of a register bounds the others, as the number of visits bounds every sum over
     visits of something within [-1, 1].
     """
     at = 0
-    for _ in range(told):
+    for _ in range(covered):
         stamp, at = read_uint(content, at)
         if at < 0 or stamp > STAMP_MAX:
             return False
     while at < len(content):
-        _origin, _stamp, numbers, at = _read_head(content, at, told, width)
+        _origin, _stamp, numbers, at = _read_head(content, at, covered, width)
         bound = NUMBER_MAX
         for i in range(numbers):
             number, at = read_int(content, at)
@@ -92,66 +93,64 @@ def _sound(content: bytes, told: int, width: int, sums: bool) -> bool:
 
 
 @kernel
-def _learn(
+def _merge(
     values: np.ndarray,
     total: np.ndarray,
     stamps: np.ndarray,
     known: np.ndarray,
-    learnt: np.ndarray,
+    updated: np.ndarray,
     me: int,
     source: int,
     content: bytes,
-    told: int,
+    covered: int,
     step: int,
 ) -> None:
-    """Take in sound content of as many origins as told."""
+    """Merge well-formed content of `covered` origins."""
     width = values.shape[1]
-    at = 0
-    for origin in range(told):
-        stamp, at = read_uint(content, at)
-        known[source, origin] = max(known[source, origin], stamp)
+    at = raise_entries(content, 0, known[source, :covered], STAMP_MAX)
     while 0 <= at < len(content):
-        origin, stamp, numbers, at = _read_head(content, at, told, width)
-        news = at >= 0 and origin != me and stamp > stamps[origin]
+        origin, stamp, numbers, at = _read_head(content, at, covered, width)
+        newer = at >= 0 and origin != me and stamp > stamps[origin]
         for i in range(width if at >= 0 else 0):
             number = 0
             if i < numbers:
                 number, at = read_int(content, at)
-            if news:
+            if newer:
                 total[i] += number - values[origin, i]
                 values[origin, i] = number
-        if news:
-            stamps[origin], learnt[origin] = stamp, step
+        if newer:
+            stamps[origin], updated[origin] = stamp, step
 
 
 @kernel
 def _is_due(
     stamps: np.ndarray,
     known: np.ndarray,
-    heard: np.ndarray,
-    learnt: np.ndarray,
+    received: np.ndarray,
+    updated: np.ndarray,
     sent: np.ndarray,
     settings: np.ndarray,
     origin: int,
     target: int,
     step: int,
 ) -> bool:
-    """Whether a register belongs in a message to everybody (target < 0), or to one participant."""
-    me, relay, beacon, patience = settings[0], settings[1], settings[2], settings[3]
+    """Whether a register belongs in a message to all in range (target < 0), or to one origin."""
+    me, relay, beacon, ack_timeout_steps = settings[0], settings[1], settings[2], settings[3]
     stamp = stamps[origin]
     if stamp == 0:
         return False
     least = -1
     for other in range(stamps.shape[0]):
         wanted = other not in (me, origin) and target in (-1, other)
-        if wanted and heard[other] >= 0 and heard[other] + patience + FRESH_STEPS >= step:
+        fresh_until = received[other] + ack_timeout_steps + FRESH_STEPS
+        if wanted and received[other] >= 0 and fresh_until >= step:
             held = known[other, origin]
             least = held if least < 0 else min(least, held)
     if least < 0:
         return beacon != 0 and target < 0
-    if least >= stamp or (stamp <= sent[0, origin] and step - sent[1, origin] < patience):
+    if least >= stamp or (stamp <= sent[0, origin] and step - sent[1, origin] < ack_timeout_steps):
         return False
-    stale = least + _STALE_STEPS < stamp or step - learnt[origin] > _STALE_STEPS
+    stale = least + _STALE_STEPS < stamp or step - updated[origin] > _STALE_STEPS
     return origin == me or relay != 0 or stale
 
 
@@ -160,8 +159,8 @@ def _compose(
     values: np.ndarray,
     stamps: np.ndarray,
     known: np.ndarray,
-    heard: np.ndarray,
-    learnt: np.ndarray,
+    received: np.ndarray,
+    updated: np.ndarray,
     sent: np.ndarray,
     settings: np.ndarray,
     out: np.ndarray,
@@ -179,7 +178,7 @@ def _compose(
         origin = (step + turn) % origins if turn else me
         if (turn and origin == me) or at + longest > out.shape[0]:
             continue
-        if _is_due(stamps, known, heard, learnt, sent, settings, origin, target, step):
+        if _is_due(stamps, known, received, updated, sent, settings, origin, target, step):
             at = put_uint(out, at, origin)
             at = put_uint(out, at, stamps[origin])
             numbers = width  # zeros at the end are left out
@@ -194,61 +193,74 @@ def _compose(
 
 
 class Registers:
-    """The registers that one participant holds, and what it tells others of them."""
+    """The registers that one participant holds, and the messages by which they are kept equal."""
 
     def __init__(
         self,
         me: int,
-        origins: int,
+        roster: int,
         width: int,
         *,
         sums: bool = True,
         relay: bool = False,
         beacon: bool = False,
-        patience_steps: int = 2,
+        ack_timeout_steps: int = 2,
     ) -> None:
-        """width: integers in a register, or 0. origins: participants in the roster.
+        """Registers without a write.
 
-        me: its slot, which is its place in the roster unless it is a later incarnation. sums: registers
-        are sums, the first number of which is the largest in size.
+        me: its incarnation id. roster: participants in the roster. width: integers in a register, or 0. sums:
+        registers are sums, the first number of which is the largest in size.
         """
         self.me = me
-        self._roster = origins
+        """One of the origins."""
+        self._roster = roster
         self._sums = sums
-        self._settings = np.array([me, relay, beacon, max(1, patience_steps)], dtype=np.int64)
-        self._step = 0
+        self._settings = np.array([me, relay, beacon, max(1, ack_timeout_steps)], dtype=np.int64)
+        self.step = 0
+        """The current step."""
         self.total = np.zeros(width, dtype=np.int64)
-        """(width,) the sum over origins."""
+        """(width,) the sum of `values` over origins."""
         self.values: Register
-        """(slots, width) the newest known of each origin."""
+        """(n, width) the newest known register of each of n origins; 0 while its stamp is 0. With `sums` the first
+        number is not negative, and no other is larger in size."""
         self.stamps: Register
-        """(slots,) writes of each origin that `values` includes."""
-        self._make_room(known_to(me, origins))
+        """(n,) writes of each origin that `values` includes; of others at most STAMP_MAX."""
+        self._known: Register
+        """(n, n) the stamps that each origin is known to hold, at most STAMP_MAX; 0 in the own row, and in rows of
+        origins from which nothing was received."""
+        self._received: Register
+        """(n,) step at which content of each origin was last received, -1 for never and for the own id."""
+        self._updated: Register
+        """(n,) step at which `values` of an origin were last replaced; 0 for the own id, and while its stamp is 0."""
+        self._sent: Register
+        """(2, n) the stamp with which each register was last sent, at most the one in `stamps`, and the step. Steps
+        are at most the current one."""
+        self._make_room(known_ids(me, roster))
 
-    def _make_room(self, slots: int) -> None:
+    def _make_room(self, origins: int) -> None:
         """Begin with registers of this many origins, of which nothing is known."""
         width = self.total.shape[0]
-        self.values = np.zeros((slots, width), dtype=np.int64)
-        self.stamps = np.zeros(slots, dtype=np.int64)
-        self._known = np.zeros((slots, slots), dtype=np.int64)
-        self._heard = np.full(slots, -1, dtype=np.int64)
-        self._learnt = np.zeros(slots, dtype=np.int64)
-        self._sent = np.zeros((2, slots), dtype=np.int64)
+        self.values = np.zeros((origins, width), dtype=np.int64)
+        self.stamps = np.zeros(origins, dtype=np.int64)
+        self._known = np.zeros((origins, origins), dtype=np.int64)
+        self._received = np.full(origins, -1, dtype=np.int64)
+        self._updated = np.zeros(origins, dtype=np.int64)
+        self._sent = np.zeros((2, origins), dtype=np.int64)
         longest = _HEAD_BYTES + _NUMBER_BYTES * width
-        stamps = _STAMP_BYTES * slots
-        room = max(stamps + longest, min(_BYTES_MAX, stamps + slots * longest))
+        stamps = _STAMP_BYTES * origins
+        room = max(stamps + longest, min(_BYTES_MAX, stamps + origins * longest))
         self._out = np.zeros(room if width else 0, dtype=np.uint8)
 
-    def widen(self, slots: int) -> None:
-        """Make room for this many origins: another incarnation was heard of."""
+    def widen(self, origins: int) -> None:
+        """Make room for this many origins: a message came from a participant that knows another incarnation."""
         if not self._out.size:
             return
         before = self.stamps.shape[0]
-        old = (self.values, self.stamps, self._known, self._heard, self._learnt, self._sent)
-        self._make_room(slots)
+        old = (self.values, self.stamps, self._known, self._received, self._updated, self._sent)
+        self._make_room(origins)
         self.values[:before], self.stamps[:before] = old[0], old[1]
         self._known[:before, :before] = old[2]
-        self._heard[:before], self._learnt[:before] = old[3], old[4]
+        self._received[:before], self._updated[:before] = old[3], old[4]
         self._sent[:, :before] = old[5]
 
     def add(self, amounts: Register) -> None:
@@ -265,64 +277,89 @@ class Registers:
         self.stamps[self.me] += 1
 
     def age_steps(self, origin: int) -> int:
-        """Own steps since the register of an origin was last learnt anew; negative if never."""
-        return self._step - int(self._learnt[origin]) if self.stamps[origin] else -1
+        """Own steps since the register of an origin was last replaced; negative if never."""
+        return self.step - int(self._updated[origin]) if self.stamps[origin] else -1
 
     def newest(self, place: int) -> int:
-        """The slot of the last incarnation of a participant that has written, as far as is known."""
+        """The id of the last incarnation of a participant that has written, as far as is known."""
         roster = self._roster
         if self.stamps.shape[0] == roster:
             return place
         if place == self.me % roster:
             return self.me
-        written = range(self.stamps.shape[0] - roster + place, place, -roster)
-        return next((slot for slot in written if self.stamps[slot]), place)
+        ids = range(self.stamps.shape[0] - roster + place, place, -roster)
+        return next((origin for origin in ids if self.stamps[origin]), place)
 
-    def sound(self, content: bytes, told: int) -> bool:
+    def is_well_formed(self, content: bytes, covered: int) -> bool:
         """Whether content is well-formed, whole; without registers none is.
 
-        told: slots that its sender knows.
+        covered: incarnation ids that its sender knows.
         """
         width = self.total.shape[0]
-        return width > 0 and bool(_sound(content, told, width, self._sums))
+        return width > 0 and bool(_is_well_formed(content, covered, width, self._sums))
 
-    def learn(self, source: int, content: bytes, told: int) -> None:
-        """Take in sound content from an origin. There must be room for as many origins as told."""
-        self._heard[source] = self._step
-        _learn(
+    def merge(self, source: int, content: bytes, covered: int) -> None:
+        """Merge well-formed content of an origin. There must be room for `covered` origins."""
+        self._received[source] = self.step
+        _merge(
             self.values,
             self.total,
             self.stamps,
             self._known,
-            self._learnt,
+            self._updated,
             self.me,
             source,
             content,
-            told,
-            self._step,
+            covered,
+            self.step,
         )
 
     def compose(self, target: int = -1) -> bytes:
-        """What everybody in range, or one participant, lacks; empty without registers."""
+        """The part of a message to all in range, or to one origin; empty without registers."""
         if not self._out.size:
             return b""
         used = _compose(
             self.values,
             self.stamps,
             self._known,
-            self._heard,
-            self._learnt,
+            self._received,
+            self._updated,
             self._sent,
             self._settings,
             self._out,
             target,
-            self._step,
+            self.step,
         )
         return self._out[:used].tobytes()
 
     def end_step(self) -> None:
         """Begin the next step."""
-        self._step += 1
+        self.step += 1
+
+    def validate(self) -> None:
+        """Assert what the sentences at the attributes state. For tests: it takes long."""
+        origins, width, me = self.stamps.shape[0], self.total.shape[0], self.me
+        assert origins % self._roster == 0
+        assert 0 <= me < origins
+        assert self.values.shape == (origins, width)
+        assert self._known.shape == (origins, origins)
+        assert self._sent.shape == (2, origins)
+        assert (self.total == self.values.sum(axis=0)).all()
+        unwritten, others = self.stamps == 0, np.arange(origins) != me
+        assert (self.stamps >= 0).all()
+        assert (self.stamps[others] <= STAMP_MAX).all()
+        assert not self.values[unwritten].any()
+        if self._sums and width:
+            assert (self.values[:, 0] >= 0).all()
+            assert (np.abs(self.values) <= self.values[:, :1]).all()
+        assert ((self._known >= 0) & (self._known <= STAMP_MAX)).all()
+        assert not self._known[self._received < 0].any()
+        assert ((self._received >= -1) & (self._received <= self.step)).all()
+        assert self._received[me] == -1
+        assert ((self._updated >= 0) & (self._updated <= self.step)).all()
+        assert not self._updated[unwritten | ~others].any()
+        assert ((self._sent[0] >= 0) & (self._sent[0] <= self.stamps)).all()
+        assert ((self._sent[1] >= 0) & (self._sent[1] <= self.step)).all()
 
 
 @kernel
@@ -346,7 +383,10 @@ def _find(content: bytes, origins: int, wanted: int, register: np.ndarray) -> in
 def read_register(
     content: bytes, origins: int, width: int, origin: int
 ) -> tuple[int, Register] | None:
-    """Stamp and numbers of an origin's register in a message; stamp 0 if absent, None if malformed."""
+    """Stamp and numbers of an origin's register in a message; stamp 0 if absent, None if malformed.
+
+    origins: incarnation ids that the sender knows. width: integers in a register.
+    """
     register = np.zeros(width, dtype=np.int64)
     stamp = _find(content, origins, origin, register)
     return None if stamp < 0 else (stamp, register)

@@ -1,80 +1,85 @@
-"""Replication by anti-entropy: everybody's single-writer state, held by everybody (design, part 4).
+"""Replication by anti-entropy: every participant holds the single-writer state of all others.
 
 Theory of operation
 -------------------
-1. Every participant (origin) writes one *log* (append-only entries) and one *register* (its claim,
-   the newest value wins by the origin's stamp). Nobody else writes them.
-2. A version vector says how much of every log, and which stamp of every register, somebody holds.
-   Everybody sends its own with every message, which is at once its acknowledgement.
-3. A sender puts in the suffixes that somebody it hears lacks. A few unacknowledged entries ride along
-   with every message; a longer suffix goes out once, and again only when the acknowledgement has not
-   come within `patience` steps.
-4. Entries of others are forwarded, so news travels over several hops. A robot holds foreign entries
-   back for `patience` steps, since a neighbour most likely heard them itself; a relay does not.
-5. What a planner shares beside weights and claims stands in `registers.py` and comes with the same message.
-6. Receiving is idempotent: a suffix that starts beyond what is held is left (it will come again), what
-   is held already is skipped. Loss, duplication, delay and reordering cost time, never truth.
+1. Every origin writes one *log* (append-only entries) and one *register* (its claim; the newest value wins, by the
+   origin's stamp). No other participant writes them. An origin is one incarnation of a participant; what is known
+   of it is stored at its incarnation id.
+2. A version vector names how much of every log, and which stamp of every register, its sender holds. Each message
+   carries that of its sender, which is at once its acknowledgement.
+3. A message carries the suffixes that a neighbour of its sender lacks. A few unacknowledged entries are repeated in
+   every message; a longer suffix is sent once, and again only when the acknowledgement has not come within
+   `ack_timeout_steps`.
+4. Entries of other origins are forwarded, so that they travel over several hops. A robot holds them back for
+   `ack_timeout_steps`, since its neighbours most likely received them themselves; a relay does not.
+5. What a planner shares beside weights and claims is in `registers.py` and travels in the same message.
+6. Merging is idempotent: a suffix that starts beyond what is held is dropped (it will come again), what is held
+   already is skipped. Loss, duplication, delay and reordering cost time, never correctness.
 
 Two meanings of the log of a mission that explores a density, by `merge`:
 
 ledger
-    An entry is (sample, units spent by the origin). The weight of a sample is its first weight minus
-    everybody's spending, never below 0. Nothing is lost and nothing is counted twice.
+    An entry is (sample, units spent by the origin). The weight of a sample is its initial weight minus the spending
+    of all origins, never below 0. Nothing is lost and nothing is counted twice.
 min
-    An entry is (sample, units left in the origin's vector) and is merged by the minimum (Kabir & Lee,
-    eq. 8-10). An origin's log holds all that ever fell in its vector, what it learned included, so
-    that nothing needs forwarding. Spending of two origins on one sample is counted once: the paper's
-    rule, with the paper's weakness.
+    An entry is (sample, units left in the origin's vector) and is merged by the minimum (Kabir & Lee, eq. 8-10). An
+    origin's log holds all that ever fell in its vector, what it merged included, so that nothing needs forwarding.
+    Spending of two origins on one sample is counted once: the paper's rule, with the paper's weakness.
 
-In a mission with a map there is no weight: an entry is a number alone (`evidence.py` says what it
-means), logs are replicated as with a ledger, and whoever holds them makes of them what it wants.
+In a mission with a map there are no weights: an entry is a number alone (`occupancy_log.py` defines its meaning),
+and logs are replicated as with a ledger. The fused map is computed from them.
 
 Incarnations
 ------------
-An origin is one incarnation of a participant (`slots.py`). A version vector is for the slots that its
-sender knows. Of slots beyond it the sender holds nothing; whoever hears of more slots than it knows makes
-room for them. The log of a dead incarnation counts on, and travels as any other; its claim expires.
+Incarnation ids are defined in `base/incarnations.py`. A version vector is for the ids that its sender knows, and a
+sender holds nothing of ids beyond it. A participant that receives a longer version vector makes room for as many
+ids. The log of an ended incarnation stays valid, and travels as any other; its claim expires.
 """
 
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.incarnations import known_to
-from kantor_protocol.base.kernels import kernel
-from kantor_protocol.base.varint import Pairs, read_uint
+from kantor_protocol.base.incarnations import INCARNATIONS_MAX, known_ids
+from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.registers import Registers
 from kantor_protocol.replication.replica_kernels import (
     ENTRIES_MAX,
+    HISTORY,
     HOLDING,
-    LEARNT,
+    KNOWN_MAX,
+    LENGTH_MAX,
     LOWERED,
     MALFORMED,
+    MERGED,
     NO_ROOM_TO_PACK,
     NOBODY,
+    RECEIVED_STEP,
+    REPEATED_STEP,
     SAMPLE,
+    SENT,
+    SINCE_NS,
+    STAMP,
+    STAMP_STEP,
+    STEP,
     ReplicaArrays,
     ReplicaConfig,
     claim,
     compose,
     end_step,
-    learn,
+    merge,
     pack_lowered,
 )
-from kantor_protocol.wire.version_vector import count_slots
+from kantor_protocol.wire.version_vector import count_ids
 from kantor_protocol.wire.weights import Units, Weights
 
 
 class Replica:
-    """What one participant holds of everybody's state, and what it tells others.
-
-    `weights` never rises; `weights[j]` is the first weight minus spending (ledger), or the least
-    value seen (min).
-    """
+    """The state of all participants as one participant holds it, and the messages by which it is kept equal."""
 
     def __init__(
         self,
         me: int,
-        origins: int,
+        roster: int,
         samples: int,
         units: Units | None,
         *,
@@ -82,60 +87,64 @@ class Replica:
         claims: bool,
         relay: bool = False,
         beacon: bool = False,
-        patience_steps: int = 2,
+        ack_timeout_steps: int = 2,
         registers: Registers | None = None,
     ) -> None:
-        """origins: participants in the roster. The rest: Manner. Raises ValueError for an incarnation too many.
+        """An empty replica. Raises ValueError for an incarnation too many.
 
-        me: its slot, which is its place in the roster unless it is a later incarnation. units: None for logs of
-        bare indices below `samples`, with a ledger. registers: what the planner shares beside the logs, by
-        default nothing.
+        me: its incarnation id. roster: participants in the roster. units: None for logs of bare indices below
+        `samples`, with a ledger. registers: what the planner shares beside the logs, by default nothing. The rest:
+        see ReplicaConfig.
         """
-        slots = known_to(me, origins)
+        origins = known_ids(me, roster)
         weighed = samples if units else 0
         units = units or Units(whole=0, sample=0, point=0)
-        self.registers = Registers(me, origins, 0) if registers is None else registers
+        self.registers = Registers(me, roster, 0) if registers is None else registers
+        """As many origins as here, unless their width is 0; its step is one less than `store.counters[STEP]`."""
         self.config = ReplicaConfig(
             me=me,
             ledger=ledger,
             claims=claims,
             relay=relay,
             beacon=beacon,
-            patience=max(1, patience_steps),
+            ack_timeout_steps=max(1, ack_timeout_steps),
             value_max=units.point if ledger else units.sample,
             bound=samples,
-            roster=origins,
+            roster=roster,
         )
-        rows = slots if ledger else 1
+        """`me` is one of the origins."""
+        self._initial_weight = units.sample
+        rows = origins if ledger else 1
         self.store = ReplicaArrays(
             weights=np.full(weighed, units.sample, dtype=np.int32),
             logs=np.zeros((rows, 256, 2), dtype=np.int32),
-            length=np.zeros(slots, dtype=np.int64),
-            known=np.zeros((slots, 2 * slots), dtype=np.int32),
-            sending=_unsent(slots, self.config.patience),
-            claims=_unclaimed(slots),
+            length=np.zeros(origins, dtype=np.int64),
+            known=np.zeros((origins, 2 * origins), dtype=np.int32),
+            sending=_nothing_sent(origins, self.config.ack_timeout_steps),
+            claims=_no_claims(origins),
             lowered=np.zeros(weighed, dtype=np.int32),
             mark=np.zeros(weighed, dtype=np.int32),
             counters=np.array([0, 1, weighed], dtype=np.int64),
         )
+        """The arrays that kernels work on. ReplicaArrays states which of them agree with which."""
         self._settings = np.array(self.config, dtype=np.int64)
-        self._fit_rooms()
+        self._make_scratch()
 
-    def _fit_rooms(self) -> None:
-        """Have kernels work on the store as it is, with scratch for as many slots."""
-        slots = self.slots
-        self._out = np.zeros(20 * ENTRIES_MAX + 120 * slots + 64, dtype=np.uint8)
-        self._least = np.zeros(2 * slots, dtype=np.int32)
+    def _make_scratch(self) -> None:
+        """Have kernels work on the store as it is, with scratch arrays for as many origins."""
+        origins = self.origins
+        self._out = np.zeros(20 * ENTRIES_MAX + 120 * origins + 64, dtype=np.uint8)
+        self._least = np.zeros(2 * origins, dtype=np.int32)
         self._fields = (*self.store, self._settings)
 
     @property
-    def slots(self) -> int:
-        """Origins that it knows of: the roster once for each incarnation heard of."""
+    def origins(self) -> int:
+        """Incarnation ids that it knows: the roster, once for each incarnation up to the latest it received."""
         return self.store.length.shape[0]
 
     @property
     def weights(self) -> Weights:
-        """(N,) units left in this participant's view."""
+        """(N,) units left in this participant's view; they never rise."""
         return self.store.weights
 
     @property
@@ -143,34 +152,35 @@ class Replica:
         """Whether no sample has weight left in this participant's view."""
         return self.store.counters.item(HOLDING) == 0
 
-    def learn(
+    def merge(
         self, source: int, version_vector: bytes, logs: bytes, claims: bytes, registers: bytes = b""
     ) -> bool:
-        """Take in a message; False, and nothing changed, when it is malformed."""
-        told = 0
+        """Merge a message of an origin; False, and nothing changed, when it is malformed."""
+        covered = 0
         if registers:
-            told = count_slots(version_vector, self.config.roster, 2 if self.config.claims else 1)
-            if not self.registers.sound(registers, told):
+            parts = 2 if self.config.claims else 1
+            covered = count_ids(version_vector, self.config.roster, parts)
+            if not self.registers.is_well_formed(registers, covered):
                 return False
-        outcome = learn(*self._fields, version_vector, logs, claims, source)
-        while outcome != LEARNT:
+        outcome = merge(*self._fields, version_vector, logs, claims, source)
+        while outcome != MERGED:
             if outcome == MALFORMED:
                 return False
             self._make_room(outcome)
-            outcome = learn(*self._fields, version_vector, logs, claims, source)
+            outcome = merge(*self._fields, version_vector, logs, claims, source)
         if registers:
-            self.registers.learn(source, registers, told)
+            self.registers.merge(source, registers, covered)
         return True
 
     def _make_room(self, outcome: int) -> None:
-        """What `_learn` asks for."""
+        """Make the room that the kernel `merge` asks for."""
         if outcome > 0:
             self._lengthen(outcome)
         else:
             self._widen(-outcome)
 
     def append(self, indices: npt.NDArray[np.int64]) -> None:
-        """Put (k,) bare indices, each below the bound, behind the own log."""
+        """Append (k,) bare indices, each below the bound, to the own log."""
         self.reserve(indices.shape[0])
         me, length = self.config.me, int(self.store.length[self.config.me])
         self.store.logs[me, length : length + indices.shape[0], 0] = indices
@@ -193,35 +203,36 @@ class Replica:
         self.store = self.store._replace(logs=logs)
         self._fields = (*self.store, self._settings)
 
-    def _widen(self, slots: int) -> None:
-        """Make room for this many origins: another incarnation was heard of."""
-        old, before = self.store, self.slots
-        known = np.zeros((slots, 2 * slots), dtype=np.int32)
+    def _widen(self, origins: int) -> None:
+        """Make room for this many origins: a message came from a participant that knows another incarnation."""
+        old, before = self.store, self.origins
+        known = np.zeros((origins, 2 * origins), dtype=np.int32)
         known[:before, :before] = old.known[:, :before]
-        known[:before, slots : slots + before] = old.known[:, before:]
-        length = np.zeros(slots, dtype=np.int64)
+        known[:before, origins : origins + before] = old.known[:, before:]
+        length = np.zeros(origins, dtype=np.int64)
         length[:before] = old.length
-        sending, claims = _unsent(slots, self.config.patience), _unclaimed(slots)
+        sending = _nothing_sent(origins, self.config.ack_timeout_steps)
+        claims = _no_claims(origins)
         sending[:, :before], claims[:, :before] = old.sending, old.claims
         logs = old.logs
         if self.config.ledger:
-            logs = np.zeros((slots, *old.logs.shape[1:]), dtype=np.int32)
+            logs = np.zeros((origins, *old.logs.shape[1:]), dtype=np.int32)
             logs[:before] = old.logs
         self.store = old._replace(
             logs=logs, length=length, known=known, sending=sending, claims=claims
         )
-        self._fit_rooms()
-        self.registers.widen(slots)
+        self._make_scratch()
+        self.registers.widen(origins)
 
     def claim(self, sample: int, now_ns: int) -> None:
         """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
         claim(self.store.claims, self.store.counters, self.config.me, sample, now_ns)
 
     def compose(self, target: int = NOBODY) -> tuple[bytes, bytes, bytes]:
-        """(have, logs, claims) for one message to everybody, or to one participant."""
-        end_of_have, end_of_logs, end = compose(*self._fields, self._out, self._least, target)
-        told = self._out[:end].tobytes()
-        return told[:end_of_have], told[end_of_have:end_of_logs], told[end_of_logs:]
+        """(version vector, logs, claims) of one message to all in range, or to one origin."""
+        end_of_vector, end_of_logs, end = compose(*self._fields, self._out, self._least, target)
+        message = self._out[:end].tobytes()
+        return message[:end_of_vector], message[end_of_vector:end_of_logs], message[end_of_logs:]
 
     @property
     def fell(self) -> bool:
@@ -246,31 +257,119 @@ class Replica:
         end_step(self.store.counters)
         self.registers.end_step()
 
+    # Invariants.
 
-def _unsent(slots: int, patience: int) -> npt.NDArray[np.int64]:
-    """`Store.sending` of who has heard and sent nothing."""
-    sending = np.zeros((3 + patience, slots), dtype=np.int64)
-    sending[1:3] = -1 - patience
+    def validate(self) -> None:
+        """Assert what the sentences at the attributes here and in ReplicaArrays state. For tests: it takes long."""
+        store, config = self.store, self.config
+        origins, samples = self.origins, store.weights.shape[0]
+        incarnations, rest = divmod(origins, config.roster)
+        assert rest == 0
+        assert 1 <= incarnations <= INCARNATIONS_MAX + 1
+        assert 0 <= config.me < origins
+        assert store.logs.shape[0] == (origins if config.ledger else 1)
+        assert store.known.shape == (origins, 2 * origins)
+        assert store.sending.shape == (HISTORY + config.ack_timeout_steps, origins)
+        assert store.claims.shape == (4, origins)
+        assert store.lowered.shape == store.mark.shape == (samples,)
+        assert samples in {0, config.bound}
+        self._validate_logs()
+        self._validate_weights()
+        self._validate_lowered()
+        self._validate_sending()
+        self._validate_claims()
+        self.registers.validate()
+        if self.registers.total.size:
+            assert self.registers.stamps.shape[0] == origins
+        assert self.registers.step == store.counters[STEP] - 1
+
+    def _held_logs(self) -> list[npt.NDArray[np.int32]]:
+        """(length, 2) the entries of each log that is held: with min the own one only."""
+        store, me = self.store, self.config.me
+        if not self.config.ledger:
+            return [store.logs[0, : store.length[me]]]
+        return [log[:length] for log, length in zip(store.logs, store.length, strict=True)]
+
+    def _validate_logs(self) -> None:
+        store, config = self.store, self.config
+        assert (store.length >= 0).all()
+        if config.ledger:
+            assert (store.length <= store.logs.shape[1]).all()
+        else:
+            assert store.length[config.me] <= store.logs.shape[1]
+            assert (store.length <= 2 * LENGTH_MAX).all()
+        for log in self._held_logs():
+            assert (log >= 0).all()
+            assert (log[:, 0] < config.bound).all()
+            assert (log[:, 1] <= config.value_max).all()
+
+    def _validate_weights(self) -> None:
+        store, initial = self.store, self._initial_weight
+        assert (store.weights >= 0).all()
+        assert (store.weights <= initial).all()
+        assert store.counters[HOLDING] == np.count_nonzero(store.weights)
+        if not store.weights.size:
+            return
+        expected = np.full(store.weights.shape[0], initial, dtype=np.int64)
+        for log in self._held_logs():
+            if self.config.ledger:
+                np.subtract.at(expected, log[:, 0], log[:, 1])
+            else:
+                np.minimum.at(expected, log[:, 0], log[:, 1])
+        assert (store.weights == np.maximum(expected, 0)).all()
+
+    def _validate_lowered(self) -> None:
+        store = self.store
+        lowered, step = self.lowered(), store.counters[STEP]
+        assert 0 <= store.counters[LOWERED] <= store.weights.shape[0]
+        assert np.unique(lowered).size == lowered.size
+        assert (store.weights[lowered] < self._initial_weight).all()
+        assert (np.flatnonzero(store.mark == step) == np.sort(lowered)).all()
+        assert (store.mark <= step).all()
+
+    def _validate_sending(self) -> None:
+        store, me, origins = self.store, self.config.me, self.origins
+        step, never = store.counters[STEP], -1 - self.config.ack_timeout_steps
+        assert (store.known >= 0).all()
+        assert (store.known <= KNOWN_MAX).all()
+        assert not store.known[me].any()
+        assert self.config.claims or not store.known[:, origins:].any()
+        for lengths in (store.sending[SENT], *store.sending[HISTORY:]):
+            assert (lengths >= 0).all()
+            assert (lengths <= store.length).all()
+        for steps in store.sending[[REPEATED_STEP, RECEIVED_STEP]]:
+            assert ((steps == never) | ((steps >= 1) & (steps <= step))).all()
+        assert store.sending[RECEIVED_STEP, me] == never
+        # What another is known to hold, it has said in a message.
+        silent = store.sending[RECEIVED_STEP] == never
+        assert not store.known[silent].any()
+
+    def _validate_claims(self) -> None:
+        store, me, step = self.store, self.config.me, self.store.counters[STEP]
+        sample, since_ns, stamp, stamp_step = store.claims[[SAMPLE, SINCE_NS, STAMP, STAMP_STEP]]
+        assert ((sample >= NOBODY) & (sample < store.weights.shape[0])).all()
+        assert (since_ns >= 0).all()
+        assert (stamp >= 0).all()
+        assert ((stamp_step >= 0) & (stamp_step <= step)).all()
+        unclaimed = stamp == 0
+        assert (sample[unclaimed] == NOBODY).all()
+        assert not since_ns[unclaimed].any()
+        assert not stamp_step[unclaimed].any()
+        assert stamp[me] <= step
+        assert stamp_step[me] == 0
+        others = np.arange(self.origins) != me
+        assert self.config.claims or not stamp[others].any()
+
+
+def _nothing_sent(origins: int, ack_timeout_steps: int) -> npt.NDArray[np.int64]:
+    """`ReplicaArrays.sending` of a participant that has received and sent nothing."""
+    sending = np.zeros((HISTORY + ack_timeout_steps, origins), dtype=np.int64)
+    sending[[REPEATED_STEP, RECEIVED_STEP]] = -1 - ack_timeout_steps
     return sending
 
 
-def _unclaimed(slots: int) -> npt.NDArray[np.int64]:
-    """`Store.claims` while nobody has a claim."""
-    claims = np.zeros((4, slots), dtype=np.int64)
+def _no_claims(origins: int) -> npt.NDArray[np.int64]:
+    """`ReplicaArrays.claims` before any participant has claimed a sample."""
+    claims = np.zeros((4, origins), dtype=np.int64)
     claims[SAMPLE] = NOBODY
     return claims
-
-
-@kernel
-def _read_version_vector(version_vector: np.ndarray, lengths: np.ndarray) -> int:
-    at = 0
-    for origin in range(lengths.shape[0]):
-        lengths[origin], at = read_uint(version_vector, at)
-    return at
-
-
-def read_version_vector(version_vector: bytes, origins: int) -> list[int] | None:
-    """The log lengths in a version vector, by slot; origins: see `slots.slots_told`. None if malformed."""
-    lengths = np.zeros(origins, dtype=np.int64)
-    at = _read_version_vector(np.frombuffer(version_vector, dtype=np.uint8), lengths)
-    return None if at < 0 else lengths.tolist()

@@ -8,105 +8,109 @@ import numpy.typing as npt
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.varint import put_int, put_uint, read_int, read_uint, skip_numbers
 from kantor_protocol.replication.registers import FRESH_STEPS
-from kantor_protocol.wire.version_vector import count_slots
+from kantor_protocol.wire.version_vector import count_ids, raise_entries
 
 NOBODY = -1
+"""Instead of a sample: none. Instead of an origin: none; as the target of a message: all participants in range."""
 
-
-LEARNT, MALFORMED = 0, -1
-
+MERGED, MALFORMED = 0, -1
 
 NO_ROOM_TO_PACK = -1
-
 
 ENTRIES_MAX = 4096
 """Log entries in one message; the rest follows with the next."""
 
-
 _CLAIM_LEASE_STEPS = 12
 """A claim that has not been renewed for so many of the holder's steps is void."""
-
 
 _CLAIM_RENEWAL_STEPS = 6
 """How stale a neighbour's knowledge of a foreign claim may be before a robot forwards it."""
 
-
-_REPEATED = 32
-"""So many unacknowledged entries are repeated with every message, so that one loss costs nothing.
-Evidence waits for `patience` instead: there are dozens of entries a step, and a late cell does no harm."""
-
+_REPEATED_ENTRIES = 32
+"""So many unacknowledged entries are repeated with every message, so that one loss costs nothing. Bare entries wait
+for the acknowledgement instead: there are dozens of them a step, and a late cell does no harm."""
 
 LENGTH_MAX = 1 << 40
 """No log is longer; it keeps sums of positions within 64 bits."""
 
-
 KNOWN_MAX = (1 << 31) - 2
-"""More is not remembered of what another holds: it fits into 32 bits, and nothing gets so long."""
+"""More is not remembered of what another holds: it fits into 32 bits, and no log gets so long."""
 
+# Rows of ReplicaArrays.claims.
+SAMPLE, SINCE_NS, STAMP, STAMP_STEP = 0, 1, 2, 3
 
-# Rows of Store.claims.
-SAMPLE, _SINCE, _STAMP, _HEARD = 0, 1, 2, 3
+# Rows of ReplicaArrays.sending; from HISTORY on, one for each step of the acknowledgement timeout.
+SENT, REPEATED_STEP, RECEIVED_STEP, HISTORY = 0, 1, 2, 3
 
-
-# Slots of Store.counters.
-LOWERED, _STEP, HOLDING = 0, 1, 2
+# Entries of ReplicaArrays.counters.
+LOWERED, STEP, HOLDING = 0, 1, 2
 
 
 class ReplicaArrays(NamedTuple):
-    """All that a participant holds, for the kernels. n origins (slots), N samples.
+    """All that a participant holds, for the kernels. n origins, N samples. `Replica.validate` asserts every sentence.
 
-    A crowd does not fit into a cache: what is touched here and there is kept small, and side by side.
+    Hot fields are int32 and contiguous, for runs of many robots.
     """
 
     weights: npt.NDArray[np.int32]
-    """(N,) units left in this participant's view; never rises."""
+    """(N,) units left in this participant's view. Between 0 and the initial weight. ledger: the initial weight minus
+    the values of all entries held in `logs`, or 0. min: the least value in the own log, or the initial weight."""
     logs: npt.NDArray[np.int32]
-    """(n, capacity, 2) entries: sample, value. min: (1, capacity, 2), the own log only."""
+    """(n, capacity, 2) entries: sample, value. min: (1, capacity, 2), the own log only. Of row i, `length[i]`
+    entries count. Samples are below `ReplicaConfig.bound`, values between 0 and `ReplicaConfig.value_max`."""
     length: npt.NDArray[np.int64]
-    """(n,) entries held of each log; min: of the others, how much has been merged."""
+    """(n,) entries held of each log, at most its capacity. min: of other origins, how much has been merged, at most
+    twice LENGTH_MAX."""
     known: npt.NDArray[np.int32]
-    """(n, 2n) what each participant is known to hold: log lengths, then claim stamps; it says no
-    more than KNOWN_MAX of any."""
+    """(n, 2n) what each origin is known to hold: log lengths, then claim stamps; each between 0 and KNOWN_MAX. 0 in
+    the own row, in rows of origins from which nothing was received, and for stamps in missions without claims."""
     sending: npt.NDArray[np.int64]
-    """(3 + patience, n): entries sent; step of the last repetition; step last heard; then a ring of
-    the lengths at the last `patience` steps."""
+    """(HISTORY + ack_timeout_steps, n), for each origin. SENT: entries of its log that were sent. REPEATED_STEP: step
+    at which they were last repeated. RECEIVED_STEP: step at which a message of it was last received; never for the
+    own id. From HISTORY on: the log lengths at each of the last `ack_timeout_steps` steps. Numbers of entries are at
+    most `length`; steps are at most the current one, or -1 - ack_timeout_steps for never."""
     claims: npt.NDArray[np.int64]
-    """(4, n): sample or NOBODY; since_ns; stamp; own step at which the stamp was heard."""
+    """(4, n): sample or NOBODY; since_ns, never negative; stamp; own step at which the stamp was received, at most
+    the current one, 0 for the own claim. An origin without a stamp has no sample and 0 in the other rows. The own
+    stamp is the step of the last claim. Without claims no other origin has a stamp."""
     lowered: npt.NDArray[np.int32]
-    """(N,) indices of the weights that fell since the last `take_lowered`, each once."""
+    """(N,) indices of the weights that fell since the last `end_step`, each once: as many as `counters[LOWERED]`,
+    each with a weight below the initial one."""
     mark: npt.NDArray[np.int32]
-    """(N,) the step at which an index was put into `lowered`."""
+    """(N,) the step at which an index was put into `lowered`: the current one for those in it, an earlier one for all
+    others."""
     counters: npt.NDArray[np.int64]
-    """(3,): how many in `lowered`; step; how many weights are above 0."""
+    """(3,): LOWERED, how many indices are in `lowered`; STEP, the current step; HOLDING, how many weights are
+    above 0."""
 
 
 class ReplicaConfig(NamedTuple):
-    """How a participant merges and talks; it never changes."""
+    """How a participant merges and sends; it never changes."""
 
     me: int
-    """Its slot."""
+    """Its incarnation id."""
     ledger: bool
     claims: bool
     relay: bool
     """It forwards at once."""
     beacon: bool
-    """It sends all that it knows while it hears nobody."""
-    patience: int
+    """It sends all that it holds while it receives nothing."""
+    ack_timeout_steps: int
     """Own steps within which an acknowledgement is due."""
     value_max: int
     """The largest value of a log entry; 0: entries have no value and weigh nothing."""
     bound: int
     """Every index in a log is below it."""
     roster: int
-    """Participants; slots come in blocks of so many."""
+    """Participants in the roster; incarnation ids come in blocks of so many."""
 
 
 @kernel
 def _lower(store: ReplicaArrays, index: int, value: int) -> None:
     store.counters[HOLDING] -= value <= 0 < store.weights[index]
     store.weights[index] = value
-    if store.mark[index] != store.counters[_STEP]:
-        store.mark[index] = np.int32(store.counters[_STEP])
+    if store.mark[index] != store.counters[STEP]:
+        store.mark[index] = np.int32(store.counters[STEP])
         store.lowered[store.counters[LOWERED]] = index
         store.counters[LOWERED] += 1
 
@@ -147,10 +151,10 @@ def _walk_suffixes(
     config: ReplicaConfig,
     suffixes: bytes,
     source: int,
-    told: int,
+    covered: int,
     apply: bool,
 ) -> int:
-    """Read all suffixes, of `told` origins; apply what is new, or only check.
+    """Read all suffixes, of the first `covered` origins; apply what is new, or only check.
 
     Returns how many entries some log may then hold, or a negative number when malformed.
     """
@@ -164,7 +168,7 @@ def _walk_suffixes(
         start, at = read_uint(suffixes, at)
         span, at = read_uint(suffixes, at)
         count, at = read_uint(suffixes, at)
-        if at < 0 or origin >= told or count > span or count > len(suffixes):
+        if at < 0 or origin >= covered or count > span or count > len(suffixes):
             return -1
         if start > LENGTH_MAX or span > LENGTH_MAX:
             return -1
@@ -198,7 +202,7 @@ def _walk_suffixes(
 
 @kernel
 def _walk_claims(
-    store: ReplicaArrays, config: ReplicaConfig, claims: bytes, told: int, apply: bool
+    store: ReplicaArrays, config: ReplicaConfig, claims: bytes, covered: int, apply: bool
 ) -> int:
     at = 0
     while at < len(claims):
@@ -206,33 +210,32 @@ def _walk_claims(
         stamp, at = read_uint(claims, at)
         sample, at = read_uint(claims, at)
         since, at = read_uint(claims, at)
-        if at < 0 or origin >= told or sample > store.weights.shape[0]:
+        if at < 0 or origin >= covered or sample > store.weights.shape[0]:
             return -1
-        if apply and origin != config.me and stamp > store.claims[_STAMP, origin]:
+        if apply and origin != config.me and stamp > store.claims[STAMP, origin]:
             store.claims[SAMPLE, origin] = sample - 1
-            store.claims[_SINCE, origin] = since
-            store.claims[_STAMP, origin] = stamp
-            store.claims[_HEARD, origin] = store.counters[_STEP]
+            store.claims[SINCE_NS, origin] = since
+            store.claims[STAMP, origin] = stamp
+            store.claims[STAMP_STEP, origin] = store.counters[STEP]
     return at
 
 
 @kernel
 def _apply_version_vector(
-    store: ReplicaArrays, config: ReplicaConfig, version_vector: bytes, source: int, told: int
+    store: ReplicaArrays, config: ReplicaConfig, version_vector: bytes, source: int, covered: int
 ) -> None:
     known = store.known[source]
     origins = store.length.shape[0]
     parts = 2 if config.claims else 1
-    if told == origins and len(version_vector) == parts * told:
-        # A byte for each: the processor takes many at once.
-        for slot in range(parts * told):
-            known[slot] = max(known[slot], np.int32(version_vector[slot]))
+    if covered == origins and len(version_vector) == parts * covered:
+        # One byte for each entry: the processor takes many at once.
+        for i in range(parts * covered):
+            known[i] = max(known[i], np.int32(version_vector[i]))
         return
     at = 0
     for part in range(parts):
-        for slot in range(part * origins, part * origins + told):
-            held, at = read_uint(version_vector, at)
-            known[slot] = max(known[slot], min(held, KNOWN_MAX))
+        entries = known[part * origins : part * origins + covered]
+        at = raise_entries(version_vector, at, entries, KNOWN_MAX)
 
 
 @kernel
@@ -252,7 +255,7 @@ def config_of(settings: np.ndarray) -> ReplicaConfig:
 
 
 @kernel
-def learn(
+def merge(
     weights: np.ndarray,
     logs: np.ndarray,
     length: np.ndarray,
@@ -265,14 +268,14 @@ def learn(
     settings: np.ndarray,
     version_vector: bytes,
     suffixes: bytes,
-    registers: bytes,
+    claimed: bytes,
     source: int,
 ) -> int:
     """Check a message whole, then apply it whole.
 
-    Returns _LEARNT; or, and nothing changed, _MALFORMED, the length that logs must have room for, or
-    the negative of the slots that there must be room for. Store and Manner come field by field, see
-    `kernels`.
+    Returns MERGED; or, and nothing changed, MALFORMED, the length that logs must have room for, or the
+    negative of the number of origins that there must be room for. ReplicaArrays come field by field, see
+    `base/kernels.py`, and the ReplicaConfig as a row of integers.
     """
     store = ReplicaArrays(
         weights,
@@ -286,45 +289,46 @@ def learn(
         counters,
     )
     config = config_of(settings)
-    told = count_slots(version_vector, config.roster, 2 if config.claims else 1)
-    if not 0 <= source < told or source == config.me:
+    covered = count_ids(version_vector, config.roster, 2 if config.claims else 1)
+    if not 0 <= source < covered or source == config.me:
         return MALFORMED
-    longest = _walk_suffixes(store, config, suffixes, source, told, False)
-    if longest < 0 or _walk_claims(store, config, registers, told, False) < 0:
+    longest = _walk_suffixes(store, config, suffixes, source, covered, False)
+    if longest < 0 or _walk_claims(store, config, claimed, covered, False) < 0:
         return MALFORMED
-    if told > length.shape[0]:
-        return -told
+    if covered > length.shape[0]:
+        return -covered
     if longest > logs.shape[1]:
         return longest
-    _apply_version_vector(store, config, version_vector, source, told)
-    _walk_suffixes(store, config, suffixes, source, told, True)
+    _apply_version_vector(store, config, version_vector, source, covered)
+    _walk_suffixes(store, config, suffixes, source, covered, True)
     if config.claims:
-        _walk_claims(store, config, registers, told, True)
-    store.sending[2, source] = store.counters[_STEP]
-    return LEARNT
+        _walk_claims(store, config, claimed, covered, True)
+    store.sending[RECEIVED_STEP, source] = store.counters[STEP]
+    return MERGED
 
 
 @kernel
 def _find_least(
     store: ReplicaArrays, config: ReplicaConfig, target: int, least: np.ndarray
 ) -> None:
-    """The least that any neighbour, or the target alone, is known to hold in each slot of `known`.
+    """The least that any neighbour, or the target alone, is known to hold, for each column of `known`.
 
-    Whoever was heard lately is a neighbour. The origin of a slot does not count there: it holds its
-    own state. NOBODY where nobody else counts.
+    A neighbour is an origin from which a message was received lately. The origin of a column does not count there:
+    it holds its own state. NOBODY where no other counts.
     """
     origins = store.length.shape[0]
     least[:] = KNOWN_MAX + 1
     for other in range(origins):
-        heard = store.sending[2, other]
-        lately = heard >= 0 and heard + config.patience + FRESH_STEPS >= store.counters[_STEP]
+        received = store.sending[RECEIVED_STEP, other]
+        fresh_until = received + config.ack_timeout_steps + FRESH_STEPS
+        lately = received >= 0 and fresh_until >= store.counters[STEP]
         if lately and other != config.me and target in (NOBODY, other):
             log, claim = least[other], least[origins + other]
-            for slot in range(least.shape[0]):  # row by row: so the processor takes many at once
-                least[slot] = min(least[slot], store.known[other, slot])
+            for i in range(least.shape[0]):  # row by row: so the processor takes many at once
+                least[i] = min(least[i], store.known[other, i])
             least[other], least[origins + other] = log, claim
-    for slot in range(least.shape[0]):
-        least[slot] = NOBODY if least[slot] > KNOWN_MAX else least[slot]
+    for i in range(least.shape[0]):
+        least[i] = NOBODY if least[i] > KNOWN_MAX else least[i]
 
 
 @kernel
@@ -335,20 +339,22 @@ def _start_of_suffix(
 
     least: how much of it all neighbours hold.
     """
-    me, relay, patience = config.me, config.relay, config.patience
+    me, relay = config.me, config.relay
     length = store.length[origin]
     if least < 0 and target < 0 and config.beacon:
         return 0
     if least < 0:
-        return store.sending[0, origin] if target >= 0 and origin == me else length
-    step = store.counters[_STEP]
-    if (origin == me or relay) and length - least <= (_REPEATED if config.value_max > 0 else 0):
+        return store.sending[SENT, origin] if target >= 0 and origin == me else length
+    step = store.counters[STEP]
+    if (origin == me or relay) and length - least <= (
+        _REPEATED_ENTRIES if config.value_max > 0 else 0
+    ):
         return least
-    if least < aged and step - store.sending[1, origin] >= patience:
-        store.sending[1, origin] = step
+    if least < aged and step - store.sending[REPEATED_STEP, origin] >= config.ack_timeout_steps:
+        store.sending[REPEATED_STEP, origin] = step
         return least
     if origin == me or relay:
-        return min(length, max(least, store.sending[0, origin]))
+        return min(length, max(least, store.sending[SENT, origin]))
     return length
 
 
@@ -384,7 +390,7 @@ def _put_suffix(
             if valued:
                 at = put_uint(out, at, value)
             before = index
-    store.sending[0, origin] = max(store.sending[0, origin], end)
+    store.sending[SENT, origin] = max(store.sending[SENT, origin], end)
     return at, count
 
 
@@ -394,11 +400,11 @@ def _put_claims(
 ) -> int:
     me, relay = config.me, config.relay
     origins = store.length.shape[0]
-    step = store.counters[_STEP]
+    step = store.counters[STEP]
     for origin in range(origins):
-        stamp = store.claims[_STAMP, origin]
+        stamp = store.claims[STAMP, origin]
         if stamp <= 0 or (
-            origin != me and step - store.claims[_HEARD, origin] > _CLAIM_LEASE_STEPS
+            origin != me and step - store.claims[STAMP_STEP, origin] > _CLAIM_LEASE_STEPS
         ):
             continue
         if origin != me:
@@ -409,7 +415,7 @@ def _put_claims(
         at = put_uint(out, at, origin)
         at = put_uint(out, at, stamp)
         at = put_uint(out, at, store.claims[SAMPLE, origin] + 1)
-        at = put_uint(out, at, store.claims[_SINCE, origin])
+        at = put_uint(out, at, store.claims[SINCE_NS, origin])
     return at
 
 
@@ -429,9 +435,9 @@ def compose(
     least: np.ndarray,
     target: int,
 ) -> tuple[int, int, int]:
-    """Write have, logs and claims one after the other; the position at the end of each.
+    """Write version vector, logs and claims one after the other; the position at the end of each.
 
-    least: (2n,) room, see `_find_least`.
+    least: (2n,) scratch, see `_find_least`. Everything else: see `merge`.
     """
     store = ReplicaArrays(
         weights,
@@ -453,38 +459,38 @@ def compose(
         at = put_uint(out, at, store.length[origin])
     if config.claims:
         for origin in range(origins):
-            at = put_uint(out, at, store.claims[_STAMP, origin])
-    end_of_have = at
-    slot = 3 + store.counters[_STEP] % config.patience
+            at = put_uint(out, at, store.claims[STAMP, origin])
+    end_of_vector = at
+    now = HISTORY + store.counters[STEP] % config.ack_timeout_steps
     entries_left = ENTRIES_MAX
     for turn in range(origins):
         origin = (me + turn) % origins
         if ledger or origin == me:
-            aged = store.sending[slot, origin]
+            aged = store.sending[now, origin]
             start = _start_of_suffix(store, config, target, least[origin], origin, aged)
             if start < store.length[origin] and entries_left > 0:
                 at, written = _put_suffix(store, config, out, at, origin, start, entries_left)
                 entries_left -= written
     for origin in range(origins):
-        store.sending[slot, origin] = store.length[origin]
+        store.sending[now, origin] = store.length[origin]
     end_of_logs = at
     if config.claims:
         at = _put_claims(store, config, out, at, least)
-    return end_of_have, end_of_logs, at
+    return end_of_vector, end_of_logs, at
 
 
 @kernel
-def taken(claims: np.ndarray, counters: np.ndarray, me: int, out: np.ndarray) -> int:
-    """Samples claimed by others that outrank this participant's claim; their number."""
+def claimed_by_others(claims: np.ndarray, counters: np.ndarray, me: int, out: np.ndarray) -> int:
+    """Write to `out` the samples of other origins' live claims that outrank the own claim; their number."""
     count = 0
     for origin in range(claims.shape[1]):
         sample = claims[SAMPLE, origin]
-        age = counters[_STEP] - claims[_HEARD, origin]
+        age = counters[STEP] - claims[STAMP_STEP, origin]
         if origin == me or sample < 0 or age > _CLAIM_LEASE_STEPS:
             continue
         if sample == claims[SAMPLE, me]:
-            mine = claims[_SINCE, me]
-            theirs = claims[_SINCE, origin]
+            mine = claims[SINCE_NS, me]
+            theirs = claims[SINCE_NS, origin]
             if mine < theirs or (mine == theirs and me < origin):
                 continue
         out[count] = sample
@@ -497,17 +503,16 @@ def claim(claims: np.ndarray, counters: np.ndarray, me: int, sample: int, now_ns
     """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
     if claims[SAMPLE, me] != sample:
         claims[SAMPLE, me] = sample
-        claims[_SINCE, me] = max(
-            0, now_ns
-        )  # a clock may run wrong; a message holds no time before 0
-    claims[_STAMP, me] = counters[_STEP]
+        # A clock may run wrong; a message holds no time before 0.
+        claims[SINCE_NS, me] = max(0, now_ns)
+    claims[STAMP, me] = counters[STEP]
 
 
 @kernel
 def pack_lowered(
     weights: np.ndarray, lowered: np.ndarray, counters: np.ndarray, out: np.ndarray
 ) -> int:
-    """Pairs (sample, units left) in the order in which they fell; the bytes used, or that they are too many."""
+    """Pairs (sample, units left) in the order in which they fell; the bytes used, or NO_ROOM_TO_PACK."""
     count = counters[LOWERED]
     if 20 * count > out.shape[0]:
         return NO_ROOM_TO_PACK
@@ -525,4 +530,4 @@ def pack_lowered(
 def end_step(counters: np.ndarray) -> None:
     """Forget the weights that were lowered in this step, and count the step."""
     counters[LOWERED] = 0
-    counters[_STEP] += 1
+    counters[STEP] += 1

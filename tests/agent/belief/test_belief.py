@@ -165,7 +165,7 @@ def test_last_point_ships_what_is_left() -> None:
     for _ in range(4):
         spend(other, 0.0, 0.0)
     version_vector, logs, claims = other.replica.compose(0)
-    one.replica.learn(1, version_vector, logs, claims)
+    one.replica.merge(1, version_vector, logs, claims)
     one.advance(0)
 
     assert one.weights.tolist() == [1]
@@ -186,7 +186,7 @@ def test_belief_stays_exact_when_logs_outgrow_their_arrays(*, ledger: bool) -> N
             belief.advance(0)
             belief.replica.end_step()
     version_vector, logs, claims = other.replica.compose(0)
-    assert one.replica.learn(1, version_vector, logs, claims)
+    assert one.replica.merge(1, version_vector, logs, claims)
     one.advance(0)
     left = [min(a, b) for a, b in zip(one.weights.tolist(), other.weights.tolist(), strict=True)]
     if ledger:
@@ -229,7 +229,7 @@ def test_exactly_the_samples_with_weight_can_be_found(
             other.spend(x_m, y_m)
         elif action == "message":
             version_vector, logs, claims = other.replica.compose(0)
-            belief.replica.learn(1, version_vector, logs, claims)
+            belief.replica.merge(1, version_vector, logs, claims)
         belief.advance(now_ns)
         alive = {j for j, weight in enumerate(belief.weights.tolist()) if weight > 0}
 

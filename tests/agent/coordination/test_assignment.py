@@ -231,7 +231,7 @@ def test_a_silent_robot_leaves_the_team_and_later_its_target_is_free() -> None:
     other = Registers(1, 2, 12, sums=False, beacon=True)
     held.write(robot_register(robot(0, 3), resting=False))
     other.write(robot_register(robot(1, 5), resting=False))
-    held.learn(1, other.compose(), 2)
+    held.merge(1, other.compose(), 2)
     limits = ContactLimits(contact_timeout_steps=2, remember_steps=5)
     seen = []
     for _ in range(8):

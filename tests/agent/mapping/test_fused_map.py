@@ -28,7 +28,7 @@ def map_of(*logs: list[int]) -> FusedMap:
         other = replica(origin)
         other.append(np.array(log, dtype=np.int64))
         other.registers.end_step()
-        assert held.learn(origin, *_message(other))
+        assert held.merge(origin, *_message(other))
     fused_map = FusedMap(FRAME, ORIGINS)
     fused_map.fold(held)
     fused_map.validate(held)

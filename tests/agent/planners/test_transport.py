@@ -99,7 +99,7 @@ def claimed_by_another(belief: Belief, origin: int, sample: int, since_ns: int =
     numbers = bytes([origin, 1, sample + 1, since_ns])
     origins = belief.replica.store.length.shape[0]
 
-    assert belief.replica.learn(origin, bytes(2 * origins), b"", numbers)
+    assert belief.replica.merge(origin, bytes(2 * origins), b"", numbers)
 
 
 @examples(120)
@@ -222,8 +222,8 @@ def test_goal_is_claimed_and_a_claim_of_equals_is_settled_by_id() -> None:
     second = belief_over(samples_m, [5, 5], me=1, origins=2, claims=True)
     alone = [choose(belief, 1, 0.0, 0.0, now_ns=100) for belief in (first, second)]
     words = [belief.replica.compose() for belief in (first, second)]
-    first.replica.learn(1, *words[1])
-    second.replica.learn(0, *words[0])
+    first.replica.merge(1, *words[1])
+    second.replica.merge(0, *words[0])
     together = [choose(belief, 1, 0.0, 0.0, now_ns=200) for belief in (first, second)]
 
     assert (alone, together) == ([0, 0], [0, 1])

@@ -22,10 +22,10 @@ from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Ou
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.cosine_basis import VISIT
 from kantor_protocol.replication.registers import read_register
-from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import GossipMessage, decode_gossip
+from kantor_protocol.wire.version_vector import read_version_vector
 from support.replicas import read_logs
 
 FOLDER = Path(__file__).parent / "transcripts"

@@ -22,7 +22,7 @@ def replica(me: int, origins: int = 3, *, relay: bool = False, patience: int = 2
         ledger=True,
         claims=False,
         relay=relay,
-        patience_steps=patience,
+        ack_timeout_steps=patience,
     )
 
 
@@ -46,7 +46,7 @@ def test_an_entry_is_one_number_on_the_air() -> None:
 def test_nothing_is_repeated_before_an_answer_is_due() -> None:
     """There are dozens of entries a step: they go out once, and again only when nobody confirmed."""
     one, two = replica(0, 2), replica(1, 2)
-    assert one.learn(1, *two.compose())
+    assert one.merge(1, *two.compose())
     one.append(np.array([3, 4]))
     sizes = []
     for _ in range(4):
@@ -73,7 +73,7 @@ def test_what_is_malformed_changes_nothing(logs: bytes) -> None:
     """A message is taken in whole or not at all."""
     held = replica(0)
 
-    assert not held.learn(1, bytes(3), logs, b"")
+    assert not held.merge(1, bytes(3), logs, b"")
     assert log(held, 1) == []
 
 
@@ -100,7 +100,7 @@ def test_everybody_ends_with_all_logs(written: list[tuple[int, list[int]]], lost
             for target in (source - 1, source + 1):
                 message += 1
                 if 0 <= target < 3 and message not in lost:
-                    assert made[target].learn(source, *word)
+                    assert made[target].merge(source, *word)
 
     for held in made:
         assert [log(held, origin) for origin in range(3)] == truth

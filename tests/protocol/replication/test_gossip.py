@@ -23,7 +23,7 @@ def heard(*envelopes: Envelope, taken: bool = True) -> tuple[list[int], int]:
         places.append(source)
         return taken
 
-    radio.hear(envelopes, learn)
+    radio.receive(envelopes, learn)
     return places, radio.refused
 
 
@@ -61,7 +61,7 @@ def test_word_carries_what_the_replica_composes(coordination: str) -> None:
     scenario = mission(f"coordination={coordination}")
     target = SUPERVISOR if scenario.centralized else ""
     units = Units.of(30, 12)
-    envelope = Gossip("r2", scenario).say(
+    envelope = Gossip("r2", scenario).compose(
         build_replica("r2", scenario, units, 12), 7, Pose(1.0, 2.0)
     )
     version_vector, logs, claims = build_replica("r2", scenario, units, 12).compose()
@@ -79,7 +79,7 @@ def test_word_carries_registers_where_the_planner_has_them() -> None:
         units = Units.of(30, 12)
         for name in scenario.roster:
             held = build_replica(name, scenario, units, 12)
-            word = Gossip(name, scenario).say(held, 1, Pose(1.0, 2.0))
+            word = Gossip(name, scenario).compose(held, 1, Pose(1.0, 2.0))
 
             assert held.registers.values.shape == (4, width)
             assert decode_gossip(word.body).registers == bytes(4 if width else 0)
@@ -92,10 +92,10 @@ def test_unsound_registers_are_refused_with_all_that_came_with_them() -> None:
     logs = bytes([1, 0, 1, 1, 2 * 3, 2])
     register = bytes([0, 1, 0, 1, 1, 1, 2 * 9])
 
-    assert not held.learn(1, bytes(3), logs, b"", register + b"\x80")
-    assert not held.learn(1, bytes(3), b"\x80", b"", register)
+    assert not held.merge(1, bytes(3), logs, b"", register + b"\x80")
+    assert not held.merge(1, bytes(3), b"\x80", b"", register)
     assert (held.weights.tolist(), held.registers.total.tolist()) == ([5] * 12, [0])
-    assert held.learn(1, bytes(3), logs, b"", register)
+    assert held.merge(1, bytes(3), logs, b"", register)
     assert (held.weights[3], held.registers.total.tolist()) == (3, [9])
 
 

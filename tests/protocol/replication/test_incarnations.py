@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import replicas
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.base.incarnations import INCARNATIONS_MAX, known_to
+from kantor_protocol.base.incarnations import INCARNATIONS_MAX, known_ids
 from kantor_protocol.replication.registers import Registers, read_register
-from kantor_protocol.replication.replica import Replica, read_version_vector
+from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import NOBODY, spend
-from kantor_protocol.wire.version_vector import slots_told
+from kantor_protocol.wire.version_vector import covered_ids, read_version_vector
 from kantor_protocol.wire.weights import Units
+from support import replicas
 from support.strategies import examples
 
 N = 6
@@ -53,7 +53,7 @@ def tell(held: Replica, *others: Replica, target: int = NOBODY) -> None:
     word = (*held.compose(target), held.registers.compose(target))
     held.end_step()
     for other in others:
-        assert other.learn(held.config.me, *word)
+        assert other.merge(held.config.me, *word)
 
 
 def whole_log(held: Replica) -> bytes:
@@ -75,10 +75,10 @@ def snapshot(held: Replica) -> list[Any]:
 
 def test_slots_come_in_blocks_of_the_roster() -> None:
     """One for each incarnation, up to the last that there may be."""
-    assert [known_to(slot, 3) for slot in (0, 2, 3, 8, 47)] == [3, 3, 6, 9, 48]
+    assert [known_ids(slot, 3) for slot in (0, 2, 3, 8, 47)] == [3, 3, 6, 9, 48]
     for slot in (-1, 3 * (INCARNATIONS_MAX + 1)):
         with pytest.raises(ValueError, match="incarnation"):
-            known_to(slot, 3)
+            known_ids(slot, 3)
     with pytest.raises(ValueError, match="incarnation 16"):
         replica(ROSTER * 16)
 
@@ -89,9 +89,9 @@ def test_a_vector_tells_for_how_many_slots_it_is(*, claims: bool) -> None:
     parts = 2 if claims else 1
     for blocks in range(1, INCARNATIONS_MAX + 2):
         numbers = b"\x85\x01" + bytes(parts * 3 * blocks - 1)
-        assert slots_told(numbers, 3, claims=claims) == 3 * blocks
+        assert covered_ids(numbers, 3, claims=claims) == 3 * blocks
     for content in (b"", bytes(parts * 3 - 1), bytes(parts * 3 * 17), b"\x80" * 3, b"\xff" * 12):
-        assert slots_told(content, 3, claims=claims) is None
+        assert covered_ids(content, 3, claims=claims) is None
 
 
 def test_a_new_incarnation_speaks_of_twice_as_many_slots() -> None:
@@ -114,12 +114,12 @@ def test_shorter_vectors_are_of_who_holds_nothing_beyond(*, ledger: bool, claims
     young.claim(4, 5)
     old.claim(0, 7)
     tell(old, young, other)
-    assert (young.slots, old.slots) == (6, 3)
+    assert (young.origins, old.origins) == (6, 3)
     known = young.store.known[0].reshape(2, 6)
     assert known[:, 3:].tolist() == [[0] * 3] * 2
     tell(young, old)
 
-    assert (young.slots, old.slots, other.slots) == (6, 6, 3)
+    assert (young.origins, old.origins, other.origins) == (6, 6, 3)
     assert (old.weights[4], old.store.length[4]) == (3, 1)
     # What was known of others is where it belongs in the wider table.
     tell(old, other, young)
@@ -141,8 +141,8 @@ def test_vectors_of_odd_lengths_change_nothing(*, ledger: bool, claims: bool) ->
     for numbers in range(parts * ROSTER * (INCARNATIONS_MAX + 2) + 2):
         sound = numbers > 0 and numbers % (parts * ROSTER) == 0 and numbers <= parts * ROSTER * 16
         if not sound:
-            assert not held.learn(1, bytes(numbers), b"", b"", bytes(numbers))
-            assert not held.learn(1, bytes(numbers), b"", b"")
+            assert not held.merge(1, bytes(numbers), b"", b"", bytes(numbers))
+            assert not held.merge(1, bytes(numbers), b"", b"")
     assert snapshot(held) == before
 
 
@@ -168,7 +168,7 @@ def test_hostile_words_make_no_room(*, ledger: bool, name: str) -> None:
     buy(held, 1, 2)
     before = snapshot(held)
 
-    assert not held.learn(*HOSTILE[name])
+    assert not held.merge(*HOSTILE[name])
     assert snapshot(held) == before
 
 
@@ -183,15 +183,15 @@ def test_any_bytes_are_survived_and_refused_whole(*, ledger: bool, data: st.Data
     sizes = [st.binary(max_size=30), st.sampled_from([6, 12, 18]).map(bytes), st.just(b"")]
     parts = [data.draw(st.one_of(st.just(part), *sizes)) for part in sound]
     before, weights = snapshot(held), held.weights.tolist()
-    if not held.learn(data.draw(st.integers(-1, 50)), *parts):
+    if not held.merge(data.draw(st.integers(-1, 50)), *parts):
         assert snapshot(held) == before
 
     assert all(x <= y for x, y in zip(held.weights.tolist(), weights, strict=True))
     registers = held.registers
     assert registers.total.tolist() == registers.values.sum(axis=0).tolist()
-    assert registers.stamps.shape[0] == held.slots
+    assert registers.stamps.shape[0] == held.origins
     said = (*held.compose(), registers.compose())
-    assert replica(1, ledger=ledger, width=WIDTH).learn(0, *said)
+    assert replica(1, ledger=ledger, width=WIDTH).merge(0, *said)
 
 
 def test_boast_about_the_own_log_is_left() -> None:
@@ -200,7 +200,7 @@ def test_boast_about_the_own_log_is_left() -> None:
     buy(held, 1, 2)
     before = replicas.entries(held, 0)
 
-    assert held.learn(1, bytes([9, 0, 0, 9, 0, 0]), bytes([0, 0, 2, 2, 0, 1, 0, 1]), b"")
+    assert held.merge(1, bytes([9, 0, 0, 9, 0, 0]), bytes([0, 0, 2, 2, 0, 1, 0, 1]), b"")
     assert (replicas.entries(held, 0), held.compose()[1]) == (before, b"")
     assert held.weights.tolist() == [4, 2, 4, 4, 4, 4]
 
@@ -213,7 +213,7 @@ def test_old_words_of_the_dead_are_data() -> None:
     buy(young, 2, 1)
     tell(young, reader, target=0)
     for _ in range(2):
-        assert reader.learn(1, *words)
+        assert reader.merge(1, *words)
 
     assert (replicas.entries(reader, 1), replicas.entries(reader, 4)) == ([(2, 3)], [(2, 1)])
     assert reader.weights[2] == 0
@@ -241,7 +241,9 @@ def test_claim_of_the_dead_expires() -> None:
     tell(dead, reader)
     taken = []
     for _ in range(40):
-        taken.append((3 in replicas.taken(reader), 3 in replicas.taken(young)))
+        taken.append(
+            (3 in replicas.claimed_by_others(reader), 3 in replicas.claimed_by_others(young))
+        )
         tell(young, reader)
         tell(reader, young)
 
@@ -256,7 +258,7 @@ def test_claim_before_time_began_is_told_as_of_its_beginning() -> None:
     one.claim(3, -(10**13))
     tell(one, two)
 
-    assert replicas.taken(two) == [3]
+    assert replicas.claimed_by_others(two) == [3]
     assert two.store.claims[1, 0] == 0
 
 
@@ -285,7 +287,7 @@ def test_register_of_the_newest_incarnation_that_has_written() -> None:
     assert young.registers.newest(1) == 7
     assert held.registers.total.tolist() == [6, -5]
     word = held.registers.compose()
-    assert read_register(word, held.slots, WIDTH, 9) == (0, pytest.approx([0, 0]))
+    assert read_register(word, held.origins, WIDTH, 9) == (0, pytest.approx([0, 0]))
 
 
 @examples(60)
@@ -317,9 +319,10 @@ def test_all_end_with_all_that_the_living_know(
             assert registers.total.tolist() == registers.values.sum(axis=0).tolist()
     known = [
         max(
-            (held.registers.values[slot].tolist() for held in made if slot < held.slots), default=[]
+            (held.registers.values[slot].tolist() for held in made if slot < held.origins),
+            default=[],
         )
-        for slot in range(max(held.slots for held in made))
+        for slot in range(max(held.origins for held in made))
     ]
     for _ in range(30):
         for held in made:
@@ -351,9 +354,9 @@ def test_whole_state_is_the_join_of_its_deltas(
     for _ in range(len(words) + 1):
         luck.shuffle(words)
         for slot, word in words:
-            assert bit_by_bit.learn(slot, *word)
+            assert bit_by_bit.merge(slot, *word)
     told = b"".join(whole_log(writer) for writer in writers)
-    assert at_once.learn(0, bytes(2 * 3 * ROSTER), told, b"")
+    assert at_once.merge(0, bytes(2 * 3 * ROSTER), told, b"")
 
     for slot in range(3 * ROSTER):
         assert (

@@ -27,7 +27,7 @@ def team(
 ) -> list[Registers]:
     """Empty registers of a team; one of them may relay."""
     return [
-        Registers(me, origins, WIDTH, relay=me == relay, beacon=beacon, patience_steps=patience)
+        Registers(me, origins, WIDTH, relay=me == relay, beacon=beacon, ack_timeout_steps=patience)
         for me in range(origins)
     ]
 
@@ -40,8 +40,8 @@ def add(held: Registers, *amounts: int) -> None:
 def hear(held: Registers, source: int, said: bytes) -> None:
     """Take in what must be sound."""
     told = held.stamps.shape[0]
-    assert held.sound(said, told)
-    held.learn(source, said, told)
+    assert held.is_well_formed(said, told)
+    held.merge(source, said, told)
 
 
 def leb128(value: int) -> bytes:
@@ -71,8 +71,8 @@ def snapshot(held: Registers) -> list[object]:
         held.total,
         held.stamps,
         held._known,
-        held._heard,
-        held._learnt,
+        held._received,
+        held._updated,
         held._sent,
     )
     return [array.tolist() for array in arrays]
@@ -216,7 +216,7 @@ def test_what_does_not_fit_follows_with_the_next_message() -> None:
         said = one.compose()
         one.end_step()
         assert len(said) <= 48 * 1024
-        assert one.sound(said, origins)
+        assert one.is_well_formed(said, origins)
         seen |= {o for o in range(origins) if read_register(said, origins, width, o)[0]}  # type: ignore[index]
 
     assert seen == set(range(1, origins))
@@ -227,7 +227,7 @@ def test_without_registers_nothing_is_said_and_nothing_heard() -> None:
     held = Registers(0, 3, 0)
 
     assert held.compose() == b""
-    assert not held.sound(content([0, 0, 0]), 3)
+    assert not held.is_well_formed(content([0, 0, 0]), 3)
 
 
 @examples(80)
@@ -310,7 +310,7 @@ def test_malformed_content_is_unsound(name: str) -> None:
     """The whole is refused, also what was sound in it."""
     one, _ = team(2)
 
-    assert not one.sound(MALFORMED[name], 2)
+    assert not one.is_well_formed(MALFORMED[name], 2)
 
 
 @examples(300)
@@ -321,11 +321,11 @@ def test_any_bytes_are_sound_or_refused(*, noise: bytes, whole: bool) -> None:
     add(one, 1, 0, 0)
     said = content([0, 3], noise) if whole else noise
     before = snapshot(one)
-    sound = one.sound(said, 2)
+    sound = one.is_well_formed(said, 2)
 
     assert snapshot(one) == before
     if sound:
-        one.learn(1, said, 2)
+        one.merge(1, said, 2)
         assert one.total.tolist() == one.values.sum(axis=0).tolist()
         assert one.values[0].tolist() == [1, 0, 0]
     assert read_register(noise, 2, WIDTH, 1) is None or len(noise) >= 2
@@ -393,5 +393,5 @@ def test_more_numbers_than_a_register_has_are_refused() -> None:
     """Whoever writes too much is not understood."""
     held = Registers(0, 2, WIDTH, sums=False)
 
-    assert not held.sound(content([0, 1], register(1, 1, 1, 2, 3, 4)), 2)
-    assert held.sound(content([0, 1], register(1, 1, 1, -2, 3)), 2)
+    assert not held.is_well_formed(content([0, 1], register(1, 1, 1, 2, 3, 4)), 2)
+    assert held.is_well_formed(content([0, 1], register(1, 1, 1, -2, 3)), 2)

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import replicas
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import KNOWN_MAX, NOBODY, spend
 from kantor_protocol.wire.weights import Units
+from support import replicas
 from support.strategies import examples
 
 N = 6
@@ -56,7 +56,7 @@ def replica(
         claims=claims,
         relay=relay,
         beacon=beacon,
-        patience_steps=patience,
+        ack_timeout_steps=patience,
     )
 
 
@@ -119,7 +119,7 @@ def whole(held: Replica) -> Message:
 def join(held: Replica, *others: Replica) -> Replica:
     """Let a replica learn all that others hold, one after the other."""
     for other in others:
-        assert held.learn(other.config.me, *whole(other))
+        assert held.merge(other.config.me, *whole(other))
     return held
 
 
@@ -166,7 +166,7 @@ class Air:
         """Everybody listens, then everybody speaks."""
         for i, held in enumerate(self._made):
             for source, message in self._inboxes[i]:
-                assert held.learn(source, *message)
+                assert held.merge(source, *message)
             self._inboxes[i] = []
         for i, held in enumerate(self._made):
             message = held.compose()
@@ -280,7 +280,7 @@ def test_largest_units_are_exact(*, ledger: bool) -> None:
     entries = [(0, value), (0, value)]
 
     assert vector(writer) == [units.sample] * N
-    assert held.learn(0, version_vector(2), suffix(0, 0, entries), b"")
+    assert held.merge(0, version_vector(2), suffix(0, 0, entries), b"")
     assert vector(held)[0] == units.sample - (2 * units.point if ledger else 1)
 
 
@@ -290,7 +290,7 @@ def test_acknowledgement_beyond_any_log_is_taken_for_all_of_it() -> None:
     buy(held, [(3, 1)])
     boast = b"".join(leb128(number) for number in (1 << 62, 1 << 31, (1 << 31) - 1, 0))
 
-    assert held.learn(1, boast, b"", b"")
+    assert held.merge(1, boast, b"", b"")
     assert held.store.known[1].tolist() == [KNOWN_MAX, KNOWN_MAX, KNOWN_MAX, 0]
     assert held.compose()[1] == b""
 
@@ -304,7 +304,7 @@ def test_suffix_that_leaves_a_gap_waits(*, ledger: bool) -> None:
     held = replica(0, 2, ledger=ledger)
     message = (version_vector(2), suffix(1, 2, [(0, 1)]), b"")
 
-    assert held.learn(1, *message)
+    assert held.merge(1, *message)
     assert int(held.store.length[1]) == 0
     assert vector(held) == ([4] * N if ledger else [1, 4, 4, 4, 4, 4])
 
@@ -312,8 +312,8 @@ def test_suffix_that_leaves_a_gap_waits(*, ledger: bool) -> None:
 def test_suffix_that_overlaps_adds_what_is_new() -> None:
     """Entries that are held already are skipped."""
     held = replica(0, 2, ledger=True)
-    held.learn(1, version_vector(2), suffix(1, 0, [(0, 1), (1, 2)]), b"")
-    held.learn(1, version_vector(2), suffix(1, 1, [(1, 2), (2, 3)]), b"")
+    held.merge(1, version_vector(2), suffix(1, 0, [(0, 1), (1, 2)]), b"")
+    held.merge(1, version_vector(2), suffix(1, 1, [(1, 2), (2, 3)]), b"")
 
     assert replicas.entries(held, 1) == [(0, 1), (1, 2), (2, 3)]
     assert vector(held) == [3, 2, 1, 4, 4, 4]
@@ -325,7 +325,7 @@ def test_nobody_else_writes_a_log() -> None:
     buy(held, [(0, 1)])
     before = knowledge(held)
 
-    assert held.learn(1, version_vector(2), suffix(0, 0, [(0, 1), (1, 3)]), b"")
+    assert held.merge(1, version_vector(2), suffix(0, 0, [(0, 1), (1, 3)]), b"")
     assert knowledge(held) == before
 
 
@@ -333,7 +333,7 @@ def test_minimum_is_not_forwarded_for_others() -> None:
     """min: a suffix comes from its origin alone, whose log holds what it learned as well."""
     held = replica(0, 3, ledger=False)
 
-    assert not held.learn(1, version_vector(3), suffix(2, 0, [(0, 1)]), b"")
+    assert not held.merge(1, version_vector(3), suffix(2, 0, [(0, 1)]), b"")
     assert vector(held) == [4] * N
 
 
@@ -342,7 +342,7 @@ def test_message_to_one_participant_needs_no_answer_first(*, ledger: bool) -> No
     """A robot that reports to the supervisor sends new entries before it has ever heard it."""
     robot, supervisor = (replica(i, 2, ledger=ledger, relay=i == 1) for i in range(2))
     buy(robot, [(0, 1), (1, 2)])
-    supervisor.learn(0, *robot.compose(1))
+    supervisor.merge(0, *robot.compose(1))
 
     assert vector(supervisor) == [3, 2, 4, 4, 4, 4]
 
@@ -361,7 +361,7 @@ def test_beacon_of_state_informs_with_one_message(
         buy(lonely, [(1, 1)])
         lonely.compose()
         lonely.end_step()
-    passing.learn(0, *lonely.compose())
+    passing.merge(0, *lonely.compose())
 
     assert (vector(passing) == vector(lonely)) == informed
     assert vector(lonely) == [0, 0, 4, 4, 4, 4]
@@ -372,17 +372,17 @@ def test_relay_forwards_at_once_and_a_robot_after_its_patience(*, relay: bool, w
     """A robot's neighbours most likely heard the news themselves; a supervisor's never do."""
     middle = replica(1, 3, ledger=True, relay=relay, patience=2)
     author, reader = replica(0, 3, ledger=True), replica(2, 3, ledger=True)
-    middle.learn(2, *reader.compose())
-    middle.learn(0, *author.compose())
+    middle.merge(2, *reader.compose())
+    middle.merge(0, *author.compose())
     for _ in range(5):
         middle.compose()
         middle.end_step()
-        middle.learn(2, *reader.compose())
+        middle.merge(2, *reader.compose())
     buy(author, [(0, 3)])
-    middle.learn(0, version_vector(3), suffix(0, 0, replicas.entries(author, 0)), b"")
+    middle.merge(0, version_vector(3), suffix(0, 0, replicas.entries(author, 0)), b"")
     steps = 0
     while vector(reader) == [4] * N:
-        reader.learn(1, *middle.compose())
+        reader.merge(1, *middle.compose())
         middle.end_step()
         steps += 1
 
@@ -469,7 +469,7 @@ def test_log_outgrows_its_first_room() -> None:
     reader = replica(1, 2, ledger=True, units=units)
     bought = [(i % N, 1) for i in range(3000)]
     buy(writer, bought)
-    reader.learn(0, *whole(writer))
+    reader.merge(0, *whole(writer))
 
     assert replicas.entries(writer, 0) == replicas.entries(reader, 0) == bought
     assert vector(writer) == vector(reader) == [500] * N
@@ -499,8 +499,8 @@ def meeting(*, ledger: bool, claims: bool) -> tuple[Replica, Message]:
     buy(b, [(3, 1), (4, 2), (5, 3)])
     b.claim(5, 100)
     a.claim(2, 90)
-    b.learn(0, *a.compose())
-    a.learn(1, *b.compose())
+    b.merge(0, *a.compose())
+    a.merge(1, *b.compose())
     buy(b, [(0, 2), (1, 3)])
     b.end_step()
     b.claim(1, 200)
@@ -518,7 +518,7 @@ def test_malformed_message_changes_nothing_at_all(
     held, sound = meeting(ledger=ledger, claims=claims)
     parts = [data.draw(st.just(part) | st.binary(max_size=40)) for part in sound]
     before, weights = snapshot(held), vector(held)
-    taken = held.learn(1, *parts)
+    taken = held.merge(1, *parts)
 
     if not taken:
         assert snapshot(held) == before
@@ -540,7 +540,7 @@ def test_damaged_message_is_taken_whole_or_not_at_all(
     if parts[part]:
         parts[part][at % len(parts[part])] = byte
     before = snapshot(held)
-    if not held.learn(1, *map(bytes, parts)):
+    if not held.merge(1, *map(bytes, parts)):
         assert snapshot(held) == before
 
 
@@ -552,9 +552,9 @@ def test_cut_message_changes_nothing_at_all(*, ledger: bool, part: int) -> None:
     parts = [content[:-1] if i == part else content for i, content in enumerate(sound)]
     before = snapshot(held)
 
-    assert not held.learn(1, *parts)
+    assert not held.merge(1, *parts)
     assert snapshot(held) == before
-    assert held.learn(1, *sound)
+    assert held.merge(1, *sound)
 
 
 MALFORMED_LOGS = {
@@ -576,7 +576,7 @@ def test_malformed_suffix_is_refused(*, ledger: bool, name: str) -> None:
     held = replica(0, 3, ledger=ledger)
     before = snapshot(held)
 
-    assert not held.learn(1, version_vector(3), MALFORMED_LOGS[name], b"")
+    assert not held.merge(1, version_vector(3), MALFORMED_LOGS[name], b"")
     assert snapshot(held) == before
 
 
@@ -584,8 +584,8 @@ def test_ledger_entry_is_at_most_a_point() -> None:
     """Nobody ships more than a point to one sample at once."""
     held = replica(0, 2, ledger=True)
 
-    assert not held.learn(1, version_vector(2), suffix(1, 0, [(0, UNITS.point + 1)]), b"")
-    assert held.learn(1, version_vector(2), suffix(1, 0, [(0, UNITS.point)]), b"")
+    assert not held.merge(1, version_vector(2), suffix(1, 0, [(0, UNITS.point + 1)]), b"")
+    assert held.merge(1, version_vector(2), suffix(1, 0, [(0, UNITS.point)]), b"")
 
 
 @pytest.mark.parametrize(
@@ -596,7 +596,7 @@ def test_malformed_claim_is_refused(content: bytes) -> None:
     held = replica(0, 3, ledger=True)
     before = snapshot(held)
 
-    assert not held.learn(1, version_vector(3), suffix(1, 0, [(0, 1)]), content)
+    assert not held.merge(1, version_vector(3), suffix(1, 0, [(0, 1)]), content)
     assert snapshot(held) == before
 
 
@@ -605,8 +605,8 @@ def test_version_vector_of_another_length_is_refused(content: bytes) -> None:
     """One number for each log and, with claims, one for each register."""
     held = replica(0, 3, ledger=True)
 
-    assert not held.learn(1, content, b"", b"")
-    assert held.learn(1, version_vector(3), b"", b"")
+    assert not held.merge(1, content, b"", b"")
+    assert held.merge(1, version_vector(3), b"", b"")
 
 
 @MODES
@@ -615,7 +615,7 @@ def test_malformed_message_takes_no_room(*, ledger: bool) -> None:
     held = replica(0, 3, ledger=ledger)
     before = snapshot(held)
 
-    assert not held.learn(1, version_vector(3), b"\xff" * 20_000, b"")
+    assert not held.merge(1, version_vector(3), b"\xff" * 20_000, b"")
     assert snapshot(held) == before
 
 
@@ -628,9 +628,9 @@ def rivals(first_ns: int, second_ns: int) -> tuple[list[int], list[int]]:
     a.claim(3, first_ns)
     b.claim(3, second_ns)
     words = a.compose(), b.compose()
-    a.learn(1, *words[1])
-    b.learn(0, *words[0])
-    return replicas.taken(a), replicas.taken(b)
+    a.merge(1, *words[1])
+    b.merge(0, *words[0])
+    return replicas.claimed_by_others(a), replicas.claimed_by_others(b)
 
 
 def test_of_equal_claims_the_lower_id_keeps_the_sample() -> None:
@@ -660,13 +660,13 @@ def test_claimed_sample_is_left_by_who_has_none() -> None:
     """Whoever is not there yet leaves it; when it is given up it is free again."""
     a, b = (replica(i, 2, ledger=True) for i in range(2))
     b.claim(3, 100)
-    a.learn(1, *b.compose())
+    a.merge(1, *b.compose())
     b.end_step()
     b.claim(NOBODY, 200)
-    left = replicas.taken(a)
-    a.learn(1, *b.compose())
+    left = replicas.claimed_by_others(a)
+    a.merge(1, *b.compose())
 
-    assert (left, replicas.taken(a)) == ([3], [])
+    assert (left, replicas.claimed_by_others(a)) == ([3], [])
 
 
 def test_older_word_on_a_claim_changes_nothing() -> None:
@@ -676,20 +676,20 @@ def test_older_word_on_a_claim_changes_nothing() -> None:
     late = b.compose()
     b.end_step()
     b.claim(4, 200)
-    a.learn(1, *b.compose())
-    a.learn(1, *late)
+    a.merge(1, *b.compose())
+    a.merge(1, *late)
 
-    assert replicas.taken(a) == [4]
+    assert replicas.claimed_by_others(a) == [4]
 
 
 def test_claim_that_is_not_renewed_expires() -> None:
     """A silent robot's last target ages out after twelve steps (papers, 7.6)."""
     a, b = (replica(i, 2, ledger=True) for i in range(2))
     b.claim(3, 100)
-    a.learn(1, *b.compose())
+    a.merge(1, *b.compose())
     held = []
     for _ in range(15):
-        held.append(replicas.taken(a) == [3])
+        held.append(replicas.claimed_by_others(a) == [3])
         a.end_step()
 
     assert held == [True] * 13 + [False] * 2
@@ -705,16 +705,16 @@ def test_claim_reaches_the_neighbour_s_neighbour() -> None:
         made[2].claim(2, 100 + step)
         air.round()
 
-    assert sorted(replicas.taken(made[2])) == [1, 3]
+    assert sorted(replicas.claimed_by_others(made[2])) == [1, 3]
 
 
 def test_without_claims_nothing_is_taken() -> None:
     """Without claims: the paper's robots do not tell where they head."""
     a, b = (replica(i, 2, ledger=True, claims=False) for i in range(2))
     b.claim(3, 100)
-    a.learn(1, *b.compose())
+    a.merge(1, *b.compose())
 
-    assert replicas.taken(a) == []
+    assert replicas.claimed_by_others(a) == []
     assert b.compose()[2] == b""
 
 

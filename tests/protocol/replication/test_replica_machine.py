@@ -9,7 +9,6 @@ but for what nobody alive has heard of.
 from collections import Counter
 from typing import Any
 
-from support import replicas
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -17,6 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import NOBODY, spend
 from kantor_protocol.wire.weights import Units
+from support import replicas
 from support.strategies import examples
 
 N = 6
@@ -71,7 +71,7 @@ class Replicas(RuleBasedStateMachine):
                 claims=claims,
                 relay=relay and slot % count == count - 1,
                 beacon=beacon,
-                patience_steps=patience,
+                ack_timeout_steps=patience,
             )
             self.authors[slot], self.bought[slot] = held, []
             return held
@@ -123,7 +123,7 @@ class Replicas(RuleBasedStateMachine):
         who, whom = who % len(self.made), whom % len(self.made)
         if who != whom:
             held, theirs = self.made[who], self.made[whom].config.me
-            slot = theirs if theirs < held.slots else whom  # it may not have heard of it yet
+            slot = theirs if theirs < held.origins else whom  # it may not have heard of it yet
             self.air.append((held.config.me, whom, held.compose(slot)))
             held.end_step()
 
@@ -135,7 +135,7 @@ class Replicas(RuleBasedStateMachine):
         if not again:
             del self.air[which % len(self.air)]
 
-        assert self.made[target].learn(source, *message)
+        assert self.made[target].merge(source, *message)
 
     @precondition(lambda self: self.air)
     @rule(which=st.integers(0, 1000))
@@ -151,7 +151,7 @@ class Replicas(RuleBasedStateMachine):
         parts = [content[:-1] if i == part else content for i, content in enumerate(message)]
         before = self._snapshot(target)
 
-        assert self.made[target].learn(source, *parts) == (not message[part])
+        assert self.made[target].merge(source, *parts) == (not message[part])
         if message[part]:
             assert self._snapshot(target) == before
 
@@ -160,12 +160,12 @@ class Replicas(RuleBasedStateMachine):
         """The radio is good for a while: everybody comes to the same weights, the true ones."""
         self.air = []
         made, expected = self.made, self._truth()
-        for _ in range(2 * made[0].config.patience + 6):
+        for _ in range(2 * made[0].config.ack_timeout_steps + 6):
             words = [held.compose() for held in made]
             for i, held in enumerate(made):
                 held.end_step()
                 for j, word in enumerate(words):
-                    assert i == j or held.learn(made[j].config.me, *word)
+                    assert i == j or held.merge(made[j].config.me, *word)
 
         assert [held.weights.tolist() for held in made] == [expected] * len(made)
 
@@ -175,6 +175,12 @@ class Replicas(RuleBasedStateMachine):
             self.clear_up()
 
     # What always holds.
+
+    @invariant()
+    def replicas_are_valid(self) -> None:
+        """Every sentence at an attribute of a replica holds, also of replicas that were lost."""
+        for held in self.authors.values():
+            held.validate()
 
     @invariant()
     def weights_never_rise(self) -> None:
@@ -198,7 +204,7 @@ class Replicas(RuleBasedStateMachine):
         """ledger: whoever holds anything of a log holds its beginning, and weighs exactly that."""
         for held in self.made if self.made and self.made[0].config.ledger else []:
             spent: Counter[int] = Counter()
-            for origin in range(held.slots):
+            for origin in range(held.origins):
                 entries, bought = replicas.entries(held, origin), self.bought.get(origin, [])
                 assert entries == bought[: len(entries)]
                 assert origin != held.config.me or len(entries) == len(bought)
@@ -212,7 +218,7 @@ class Replicas(RuleBasedStateMachine):
         """min: who says that it holds a log up to some length weighs no more than it says there."""
         for held in self.made if self.made and not self.made[0].config.ledger else []:
             for slot, author in self.authors.items():
-                length = int(held.store.length[slot]) if slot < held.slots else 0
+                length = int(held.store.length[slot]) if slot < held.origins else 0
                 assert length <= len(replicas.entries(author, slot))
                 for sample, value in replicas.entries(author, slot)[:length]:
                     assert held.weights[sample] <= value
@@ -222,19 +228,19 @@ class Replicas(RuleBasedStateMachine):
         """An acknowledgement is never ahead of the truth, so nothing is ever held back for good."""
         for held in self.made:
             for slot, other in self.authors.items():
-                if other is held or slot >= held.slots:
+                if other is held or slot >= held.origins:
                     continue
                 for part, truly in enumerate((other.store.length, other.store.claims[2])):
-                    known = held.store.known[slot, part * held.slots : (part + 1) * held.slots]
-                    holds = [*truly.tolist(), *[0] * held.slots]
+                    known = held.store.known[slot, part * held.origins : (part + 1) * held.origins]
+                    holds = [*truly.tolist(), *[0] * held.origins]
                     assert all(x <= y for x, y in zip(known.tolist(), holds, strict=False))
 
     @invariant()
     def room_is_for_whole_rosters(self) -> None:
         """Slots come in blocks, one for each incarnation of somebody that was heard of."""
         for held in self.made:
-            assert held.slots % len(self.made) == 0
-            assert held.config.me < held.slots <= max(self.authors) + len(self.made)
+            assert held.origins % len(self.made) == 0
+            assert held.config.me < held.origins <= max(self.authors) + len(self.made)
 
     @invariant()
     def fallen_samples_are_named_once(self) -> None:
@@ -250,7 +256,7 @@ class Replicas(RuleBasedStateMachine):
             return [min(int(held.weights[sample]) for held in self.made) for sample in range(N)]
         spent = Counter[int]()
         for slot, bought in self.bought.items():
-            heard = max(int(h.store.length[slot]) if slot < h.slots else 0 for h in self.made)
+            heard = max(int(h.store.length[slot]) if slot < h.origins else 0 for h in self.made)
             for sample, units in bought[:heard]:
                 spent[sample] += units
         return [max(0, UNITS.sample - spent[sample]) for sample in range(N)]

@@ -16,11 +16,11 @@ from kantor_protocol.base.machine import SUPERVISOR, Envelope, ParticipantId, Po
 from kantor_protocol.base.varint import Pairs, put_uint
 from kantor_protocol.replication.cosine_basis import VISIT
 from kantor_protocol.replication.registers import read_register
-from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.faults.links import Partition, Range
 from kantor_protocol.scenario.faults.processes import Kill
 from kantor_protocol.scenario.faults.schedule import AnyFault
 from kantor_protocol.wire.messages import GossipMessage, decode_gossip, encode
+from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_protocol.wire.weights import WeightsMessage, WeightsSubscriber
 from kantor_worldsim.observers.checkers.checker import Checker, check
 from kantor_worldsim.radio.channel import DROPPED, DeliveryDecision

@@ -9,9 +9,9 @@ import pytest
 from kantor_fleet.execution.in_process_team import team
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR
 from kantor_protocol.base.varint import put_uint
-from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import decode_gossip, encode_gossip
+from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.in_process import in_process

@@ -18,8 +18,9 @@ from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN
 from kantor_protocol.base.machine import Inputs, Outputs
 from kantor_protocol.node.recovery import KillableNode
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
-from kantor_protocol.replication.replica import Replica, read_version_vector
+from kantor_protocol.replication.replica import Replica
 from kantor_protocol.wire.messages import decode_gossip
+from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.in_process import in_process

@@ -13,7 +13,6 @@ from kantor_protocol.base.grid import FREE, OCCUPIED
 from kantor_protocol.base.machine import Envelope, Pose, State
 from kantor_protocol.base.varint import put_int, put_uint
 from kantor_protocol.replication.occupancy_log import dead_frontier
-from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.wire.messages import (
     Array,
     GossipMessage,
@@ -21,6 +20,7 @@ from kantor_protocol.wire.messages import (
     decode_gossip,
     encode_gossip,
 )
+from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_worldsim.observers.checkers.checker import Checker, check
 from kantor_worldsim.observers.checkers.mapping import MapChecker
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import msgspec
 
 from kantor_protocol.base.machine import WORLD_SIM, Body, ParticipantId
-from kantor_protocol.transport.events import Flooded, Heard, Joined, Left
+from kantor_protocol.transport.events import Flooded, Joined, Left, Received
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import LEASE_MS, BusError
 from kantor_protocol.wire.messages import (
@@ -155,7 +155,7 @@ class Lobby:
             self._join(event)
         elif isinstance(event, Left):
             self._leave(event)
-        elif isinstance(event, Heard):
+        elif isinstance(event, Received):
             return self._hear(event)
         elif isinstance(event, Flooded):
             self._say(f"{event.name} floods the bus; what is beyond its quota is not taken in")
@@ -169,7 +169,7 @@ class Lobby:
         waiting = set(self._plan.scenario.roster)
         while waiting:
             for name in sorted(filter(self.is_there, waiting)):
-                self.host.send(name, encode(Stop(VERSION, reason)), patiently=True)
+                self.host.send(name, encode(Stop(VERSION, reason)), blocking=True)
                 waiting.discard(name)
             waiting -= self.excused
             if time.monotonic() >= give_up:
@@ -210,7 +210,7 @@ class Lobby:
 
     def _refuse(self, event: Joined, reason: str) -> None:
         refusal = Refusal(VERSION, event.nonce, reason)
-        self.host.send(event.name, encode(refusal), patiently=True)
+        self.host.send(event.name, encode(refusal), blocking=True)
 
     def _brief_again(self) -> None:
         """Tell those that are there and not ready what may not have reached them."""
@@ -238,7 +238,7 @@ class Lobby:
             self._run,
             self.simulation.body(event.name),
         )
-        self.host.send(event.name, encode(mission), patiently=True)
+        self.host.send(event.name, encode(mission), blocking=True)
 
     def _leave(self, event: Left) -> None:
         name = event.name
@@ -256,7 +256,7 @@ class Lobby:
         self.simulation.gone = self.simulation.gone | {name}
         self._note(name, "leave")
 
-    def _hear(self, event: Heard) -> tuple[ParticipantId, Report] | None:
+    def _hear(self, event: Received) -> tuple[ParticipantId, Report] | None:
         try:
             message = decode_from_participant(event.payload)
         except RefusedError:
@@ -308,7 +308,7 @@ class Lobby:
         """Wall: start a participant's clock, or set the one that its machine reads."""
         look = self.simulation.look(name)
         message = StartClock(VERSION, self.ready[name], now_ns, speed, look, skew_ns)
-        self.host.send(name, encode(message), patiently=True)
+        self.host.send(name, encode(message), blocking=True)
 
     def tell(self, _record: object) -> None:
         """Publish progress now and then, once the mission has begun."""

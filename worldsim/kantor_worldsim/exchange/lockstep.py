@@ -35,9 +35,7 @@ class LockstepExchange:
                 due = before != visit or now_s - asked_s > AGAIN_S
                 if name in lobby.ready and name not in outputs and due:
                     asked[name] = visit, now_s
-                    lobby.host.send(
-                        name, encode(StepRequest(VERSION, inputs[name])), patiently=True
-                    )
+                    lobby.host.send(name, encode(StepRequest(VERSION, inputs[name])), blocking=True)
             if all(name in outputs or not lobby.is_expected(name) for name in inputs):
                 break
             report = lobby.next(0.05)

@@ -156,7 +156,7 @@ class RealtimeExchange:
         if self._deeds.skew_ns(name, now_ns) != self._skews[name]:
             self._set_clock(name, now_ns)
         turn = StepRequest(VERSION, msgspec.structs.replace(given, inbox=mail.hand()))
-        self._lobby.host.send(name, encode(turn), patiently=False)
+        self._lobby.host.send(name, encode(turn), blocking=False)
 
 
 class Mail:

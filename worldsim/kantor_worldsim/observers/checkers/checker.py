@@ -21,7 +21,7 @@ from kantor_protocol.scenario.faults.base import Fault
 from kantor_protocol.scenario.faults.links import Hostile
 from kantor_protocol.scenario.faults.processes import ClockFault, Kill, Late
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
-from kantor_protocol.wire.version_vector import slots_told
+from kantor_protocol.wire.version_vector import covered_ids
 from kantor_protocol.wire.weights import WeightsSubscriber
 from kantor_worldsim.engine.process_faults import ScheduledProcessFault, schedule_of
 from kantor_worldsim.observers.checkers.conservation import (
@@ -628,7 +628,7 @@ class Checker:
             news = decode_gossip(envelope.body)
         except RefusedError:
             return None
-        slots = slots_told(news.version_vector, len(self._names), claims=self._limits.claims)
+        slots = covered_ids(news.version_vector, len(self._names), claims=self._limits.claims)
         if slots is None:
             return None
         return read_register(news.registers, slots, self._scenario.register_width, slot)

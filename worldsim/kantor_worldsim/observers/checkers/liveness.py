@@ -24,11 +24,10 @@ import numpy.typing as npt
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Outputs, ParticipantId, Pose
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.gossip import CONTACT_PERIODS, ack_timeout_steps
-from kantor_protocol.replication.replica import read_version_vector
 from kantor_protocol.scenario.faults.processes import Kill, OnProcesses
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
-from kantor_protocol.wire.version_vector import slots_told
+from kantor_protocol.wire.version_vector import covered_ids, read_version_vector
 from kantor_worldsim.observers.checkers.state import FORGED_FIRST
 from kantor_worldsim.radio.channel import Field, Walls, hears
 from kantor_worldsim.radio.link_faults import LinkFaults
@@ -354,5 +353,5 @@ def _version_vector_of(outputs: Outputs | None, roster: int, *, claims: bool) ->
         version_vector = decode_gossip(outputs.outbox[-1].body).version_vector
     except RefusedError:
         return None
-    slots = slots_told(version_vector, roster, claims=claims)
+    slots = covered_ids(version_vector, roster, claims=claims)
     return None if slots is None else read_version_vector(version_vector, slots)
