@@ -44,4 +44,4 @@ class DensitySupervisor:
 
     def validate(self) -> None:
         """Assert what its parts say of themselves; true between two steps."""
-        assert self._replica.empty == (not self._replica.weights.any())
+        self._replica.validate()

@@ -65,6 +65,7 @@ class MappingSupervisor:
 
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""
+        self._replica.validate()
         self._fused_map.validate(self._replica)
         self._cost_map.validate()
         registers = self._replica.registers

@@ -58,6 +58,7 @@ class Floor:
 
     def validate(self) -> None:
         """The map agrees with the log, and the costs with the map."""
+        self._replica.validate()
         self.fused_map.validate(self._replica)
         self.cost_map.validate()
 

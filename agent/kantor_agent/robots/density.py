@@ -74,6 +74,7 @@ class DensityRobot:
 
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""
+        self._replica.validate()
         self._belief.validate()
         assert self._belief.replica is self._replica
         assert self._goal is None or self._state is State.EXPLORING

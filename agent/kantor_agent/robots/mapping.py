@@ -107,6 +107,7 @@ class MappingRobot:
 
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""
+        self._replica.validate()
         self._fused_map.validate(self._replica)
         self._cost_map.validate()
         assert not (self._resting and self._task.target != NOWHERE)
