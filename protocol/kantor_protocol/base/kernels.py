@@ -1,4 +1,4 @@
-"""How kernels are compiled: for speed, to be called often, and kept on disk."""
+"""Compilation of kernels: for speed, to be called often, and kept on disk."""
 
 import contextlib
 from collections.abc import Callable

@@ -30,7 +30,7 @@ _MAGIC = b"kantor diary 1\n"
 _HEAD = struct.Struct("<II")
 _SKEW = struct.Struct("<q")
 _LOCK_S = 0.5
-"""How long to wait for the lock: a process that was killed a moment ago may still hold it."""
+"""Time to wait for the lock: a process that was killed a moment ago may still hold it."""
 
 
 class _Header(msgspec.Struct, frozen=True, array_like=True):
@@ -45,7 +45,7 @@ class _SoundPrefix(NamedTuple):
     entries: list[bytes]
     """Encoded inputs."""
     skew_ns: int
-    """Of the last entry."""
+    """The skew of the last entry."""
     ends: list[int]
     """Positions in the file at which the header and each entry end."""
     crc: int
@@ -62,7 +62,7 @@ class WalFile:
         self._end = 0
         self._crc = 0
         self.skew_ns = 0
-        """How far ahead the clock is by which the next entry was read; after `read`, that of the last entry."""
+        """The lead of the clock that the next entry was made by; after `read`, that of the last entry."""
 
     def read(self) -> WalContents | None:
         """The sound beginning of the log; None if there is none, or another process holds it. Raises OSError."""

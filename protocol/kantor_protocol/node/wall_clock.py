@@ -18,7 +18,7 @@ class WallClock:
         """name: the participant. The clock shows `start.now_ns` now."""
         assert start.observation is not None
         self.skew_ns = start.skew_ns
-        """How far ahead of this clock is the one that the machine reads."""
+        """The lead of the clock that the machine reads over this one."""
         self.inbox: deque[Envelope] = deque(maxlen=INBOX_MAX)
         """Envelopes since the last step, in order of arrival."""
         self.reported_ns = 0

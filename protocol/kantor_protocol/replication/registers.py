@@ -38,7 +38,7 @@ _BYTES_MAX = 48 * 1024
 """For one message; with the longest logs and claims a body still fits."""
 _NUMBER_BYTES, _HEAD_BYTES, _STAMP_BYTES = 8, 15, 6
 _STALE_STEPS = 6
-"""How many writes, or steps, behind a neighbour may be before a robot forwards another's register."""
+"""Writes, or steps, by which a neighbour may be behind before a robot forwards another's register."""
 FRESH_STEPS = 4
 """A participant of which a message was received within so many steps beyond `ack_timeout_steps` is a neighbour."""
 

@@ -24,7 +24,7 @@ _CLAIM_LEASE_STEPS = 12
 """A claim that has not been renewed for so many of the holder's steps is void."""
 
 _CLAIM_RENEWAL_STEPS = 6
-"""How stale a neighbour's knowledge of a foreign claim may be before a robot forwards it."""
+"""Steps by which a neighbour's knowledge of a foreign claim may be stale before a robot forwards the claim."""
 
 _REPEATED_ENTRIES = 32
 """So many unacknowledged entries are repeated with every message, so that one loss costs nothing. Bare entries wait
@@ -85,16 +85,16 @@ class ReplicaArrays(NamedTuple):
 
 
 class ReplicaConfig(NamedTuple):
-    """How a participant merges and sends; it never changes."""
+    """The rules by which a participant merges and sends; they never change."""
 
     me: int
-    """Its incarnation id."""
+    """The own incarnation id."""
     ledger: bool
     claims: bool
     relay: bool
-    """It forwards at once."""
+    """Entries of other origins are forwarded at once."""
     beacon: bool
-    """It sends all that it holds while it receives nothing."""
+    """All that it holds is sent while nothing is received."""
     ack_timeout_steps: int
     """Own steps within which an acknowledgement is due."""
     value_max: int

@@ -16,7 +16,7 @@ class StepClock(msgspec.Struct, frozen=True):
     period_ns: int
     phase_ns: int
     drift_ppm: int
-    """How much longer this clock's second is, in parts per million."""
+    """Excess of this clock's second, in parts per million."""
     jitter_ns: int
     seed: int
     who: int

@@ -66,7 +66,7 @@ class Robots(ScenarioTable, frozen=True, kw_only=True):
 
 
 class Starts(ScenarioTable, frozen=True, kw_only=True):
-    """Where robots stand at time 0."""
+    """The places of robots at time 0."""
 
     random: bool = False
     """Starts are drawn uniformly in the domain, or from the free cells of the map, by the seed."""
@@ -80,7 +80,7 @@ class Starts(ScenarioTable, frozen=True, kw_only=True):
 
 
 class VehicleOptions(ScenarioTable, frozen=True, kw_only=True):
-    """How a robot moves. Planners do not depend on it."""
+    """The motion of a robot. Planners do not depend on it."""
 
     name: VehicleName = "first-order"
     speed_m_s: Positive = 100.0
@@ -182,7 +182,7 @@ class RadioOptions(ScenarioTable, frozen=True, kw_only=True):
     wall_loss_m: NotNegative = 0.0
     """On a map: each wall between shortens the range by so much."""
     beacon: Literal["versions", "state"] = "versions"
-    """What a robot sends while it hears no other robot: its version vector, or all that it knows.
+    """The message of a robot that hears no other robot: its version vector, or all that it knows.
     With `state` one message is enough to inform a robot that comes into range, as Algorithm 3 presupposes."""
 
 
@@ -196,7 +196,7 @@ class SupervisorOptions(ScenarioTable, frozen=True, kw_only=True):
 
 
 class PlannerOptions(ScenarioTable, frozen=True, kw_only=True):
-    """How goals are chosen."""
+    """The planner and its options."""
 
     name: PlannerName = "transport"
     """On a density: transport (Kabir & Lee), spectral (multiscale coverage, Mathew & Mezic). On a map:
@@ -242,7 +242,7 @@ class PlannerOptions(ScenarioTable, frozen=True, kw_only=True):
 
 
 class PublishOptions(ScenarioTable, frozen=True, kw_only=True):
-    """What robots publish for observers on their weights key."""
+    """The messages of robots on their weights key, for observers."""
 
     weights_every: Annotated[int, Meta(ge=1)] = 10
     """Steps from one weights message to the next."""
@@ -251,7 +251,7 @@ class PublishOptions(ScenarioTable, frozen=True, kw_only=True):
 
 
 class MetricsOptions(ScenarioTable, frozen=True, kw_only=True):
-    """How often metrics are computed."""
+    """The rate of metrics."""
 
     every: Annotated[int, Meta(ge=0)] = 0
     """Periods from one row to the next; 0 chooses by size, 1 for the paper's scenarios."""

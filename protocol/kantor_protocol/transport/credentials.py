@@ -60,7 +60,7 @@ class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     """Its common name: the identity's id, a dot, and the certificate's serial number in hexadecimal."""
     until: datetime
-    """When it expires (UTC)."""
+    """Its expiry (UTC)."""
 
 
 class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -260,7 +260,7 @@ def _text(value: str) -> str:
 
 
 def expiry(until: datetime, now: datetime) -> str:
-    """When a certificate expires or has expired, in plain English."""
+    """The expiry of a certificate, in plain English."""
     when = f"{until:%Y-%m-%d %H:%M} UTC"
     return f"expires on {when}" if until > now else f"expired on {when}"
 

@@ -1,4 +1,4 @@
-"""How a Zenoh session is opened and closed, and the error of a bus that cannot be reached."""
+"""Opening and closing of Zenoh sessions, and the error of a bus that cannot be reached."""
 
 import contextlib
 import json
@@ -17,7 +17,7 @@ QUEUE_MAX = 16_384
 
 
 CLOSE_S = 5.0
-"""How long to wait for a session to close."""
+"""Time to wait for a session to close."""
 
 
 class BusError(ConnectionError):

@@ -120,7 +120,7 @@ class StartClock(_Message, frozen=True, array_like=True, tag=4):
     observation: Observation | None = None
     """The observation of the participant's first step."""
     skew_ns: int = 0
-    """How far ahead the clock is that its machine reads. Sent again, it sets that clock anew."""
+    """The lead of the clock that its machine reads. Sent again, it sets that clock anew."""
 
 
 class StepRequest(_Message, frozen=True, array_like=True, tag=5):
@@ -141,7 +141,7 @@ class Report(_Message, frozen=True, array_like=True, tag=6):
     observed: int = 0
     """Realtime: the step in the observation that it used."""
     skew_ns: int = 0
-    """Realtime: how far the clock that its machine read was ahead of now_ns."""
+    """Realtime: the lead over now_ns of the clock that its machine read."""
 
 
 class Ready(_Message, frozen=True, array_like=True, tag=7):

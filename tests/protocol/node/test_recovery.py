@@ -1,4 +1,4 @@
-"""Lives: what outlives a process, and who comes back."""
+"""Recovery: a participant that is killed and started again goes on, or becomes a new incarnation."""
 
 from collections.abc import Callable, Sequence
 
@@ -51,8 +51,8 @@ TIMES = st.lists(st.integers(1, 10**6), min_size=1, max_size=8)
 
 @examples(100)
 @given(before=TIMES, after=TIMES)
-def test_who_has_the_diary_has_the_machine(before: list[int], after: list[int]) -> None:
-    """Built anew from its diary it goes on as if nothing had been."""
+def test_the_log_determines_the_machine(before: list[int], after: list[int]) -> None:
+    """Recovered from its log it goes on as if it had not been killed."""
     wal = InMemoryLog()
     first = told(RecoverableNode(Rememberer, wal, HOME), before)
     again = RecoverableNode(Rememberer, wal, at(len(before)))
@@ -66,17 +66,17 @@ def test_who_has_the_diary_has_the_machine(before: list[int], after: list[int]) 
 def test_step_is_done_once(times_ns: list[int], again: int) -> None:
     """Asked again for its last step it answers from memory, before its death and after."""
     wal = InMemoryLog()
-    life = RecoverableNode(Rememberer, wal, HOME)
+    node = RecoverableNode(Rememberer, wal, HOME)
     last = turn(len(times_ns) - 1, times_ns[-1])
-    first = told(life, times_ns)
-    answers = [life.step(last).refused for _ in range(again)]
-    reborn = RecoverableNode(Rememberer, wal, at(len(times_ns) - 1))
+    first = told(node, times_ns)
+    answers = [node.step(last).refused for _ in range(again)]
+    recovered = RecoverableNode(Rememberer, wal, at(len(times_ns) - 1))
 
     assert answers == [first[-1]] * again
-    assert reborn.step(last).refused == first[-1]
-    assert reborn.last_step == (last, reborn.step(last))
+    assert recovered.step(last).refused == first[-1]
+    assert recovered.last_step == (last, recovered.step(last))
     assert len(wal.read() or ()) == 2
-    assert told(life, [7], len(times_ns)) == told(Rememberer(HOME), [*times_ns, 7])[-1:]
+    assert told(node, [7], len(times_ns)) == told(Rememberer(HOME), [*times_ns, 7])[-1:]
 
 
 @examples(50)
@@ -84,9 +84,9 @@ def test_step_is_done_once(times_ns: list[int], again: int) -> None:
 def test_encoded_turns_are_turns(times_ns: list[int]) -> None:
     """What comes encoded is noted as it came, and answered like any turn; also when it comes again."""
     wal = InMemoryLog()
-    life = RecoverableNode(Rememberer, wal, HOME)
+    node = RecoverableNode(Rememberer, wal, HOME)
     entries = [encode(turn(i, now_ns)) for i, now_ns in enumerate(times_ns)]
-    answers = [life.step_encoded(entry).refused for entry in (*entries, entries[-1])]
+    answers = [node.step_encoded(entry).refused for entry in (*entries, entries[-1])]
     read = wal.read()
 
     assert answers == [*(first := told(Rememberer(HOME), times_ns)), first[-1]]
@@ -95,7 +95,7 @@ def test_encoded_turns_are_turns(times_ns: list[int]) -> None:
 
 
 class FullDisk(InMemoryLog):
-    """A diary that cannot be written at times."""
+    """A log that cannot be written at times."""
 
     full = False
 
@@ -105,18 +105,18 @@ class FullDisk(InMemoryLog):
         super().append(inputs)
 
 
-def test_what_cannot_be_noted_is_not_done() -> None:
+def test_a_step_that_cannot_be_written_is_not_made() -> None:
     """On a full disk the machine stands still; when there is room again it goes on where it was."""
     wal = FullDisk()
-    life = RecoverableNode(Rememberer, wal, HOME)
-    before = told(life, [1, 2])
+    node = RecoverableNode(Rememberer, wal, HOME)
+    before = told(node, [1, 2])
     wal.full = True
     with pytest.raises(OSError, match="full"):
-        life.step(turn(2, 3))
+        node.step(turn(2, 3))
     wal.full = False
 
-    assert life.step_count == 2
-    assert before + told(life, [4], 2) == told(Rememberer(HOME), [1, 2, 4])
+    assert node.step_count == 2
+    assert before + told(node, [4], 2) == told(Rememberer(HOME), [1, 2, 4])
 
 
 def torn(wal: InMemoryLog) -> None:
@@ -135,15 +135,15 @@ def test_who_lacks_a_step_that_others_know_of_is_another(
     wal = InMemoryLog()
     told(RecoverableNode(Rememberer, wal, HOME), [1, 2, 3])
     damage(wal)
-    reborn = RecoverableNode(Rememberer, wal, at(3))
+    recovered = RecoverableNode(Rememberer, wal, at(3))
 
-    assert (reborn.incarnation, reborn.step_count, reborn.last_step) == (1, 3, None)
-    assert told(reborn, [4, 5], 3) == told(Rememberer(at(3, incarnation=1)), [4, 5], 3)
+    assert (recovered.incarnation, recovered.step_count, recovered.last_step) == (1, 3, None)
+    assert told(recovered, [4, 5], 3) == told(Rememberer(at(3, incarnation=1)), [4, 5], 3)
 
 
 @pytest.mark.parametrize("damage", [torn, lost])
 def test_who_never_acted_stays_the_same(damage: Callable[[InMemoryLog], None]) -> None:
-    """Nobody can hold anything of it."""
+    """No other participant can hold anything of it."""
     wal = InMemoryLog()
     RecoverableNode(Rememberer, wal, HOME)
     damage(wal)
@@ -151,7 +151,7 @@ def test_who_never_acted_stays_the_same(damage: Callable[[InMemoryLog], None]) -
     assert RecoverableNode(Rememberer, wal, HOME).incarnation == 0
 
 
-def test_diary_of_another_incarnation_is_no_use() -> None:
+def test_log_of_another_incarnation_is_not_used() -> None:
     """A process that comes back after another took its body over must not write on in its old log."""
     wal = InMemoryLog()
     told(RecoverableNode(Rememberer, wal, HOME), [1, 2, 3, 4])
@@ -173,25 +173,25 @@ def test_nothing_is_lost_and_nothing_is_twice(orders: list[tuple[str, Disk, int]
 
     An incarnation is the machine that took over the body as the world knew it, and knows what it told.
     """
-    mortal = KillableNode(Rememberer, HOME)
+    killable = KillableNode(Rememberer, HOME)
     initial_state, body = HOME, HOME
     times_ns: list[int] = []
     for order, disk, now_ns in orders:
         asked = turn(body.step, now_ns)
         if order == "die in a step":
-            mortal.step(asked)
+            killable.step(asked)
         if order != "step":
-            mortal.kill()
+            killable.kill()
             known = body
             forgets = disk == "lost" or (disk == "torn" and body.step > initial_state.step)
             if forgets and body.step:
                 body = replace(body, incarnation=body.incarnation + 1)
                 initial_state, times_ns = body, []
             unheard = order == "die in a step" and disk == "kept"
-            assert mortal.start(known, disk) == (body.incarnation, body.step + unheard)
+            assert killable.start(known, disk) == (body.incarnation, body.step + unheard)
         if order != "kill":
             times_ns.append(now_ns)
-            outputs = mortal.step(asked)
+            outputs = killable.step(asked)
             assert outputs.step == body.step + 1
             assert outputs.refused == told(Rememberer(initial_state), times_ns)[-1]
             body = at(outputs.step, body.incarnation)

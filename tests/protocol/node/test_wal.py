@@ -20,7 +20,7 @@ from kantor_protocol.node.wal import _MAGIC, WalFile, _frame, tear
 from kantor_protocol.wire.messages import encode
 from support.strategies import INPUTS, examples
 
-BIRTH = Body(Pose(1.0, 2.0), step=3, energy_spent=2, incarnation=1)
+INITIAL_STATE = Body(Pose(1.0, 2.0), step=3, energy_spent=2, incarnation=1)
 
 
 def entry(step: int) -> bytes:
@@ -28,20 +28,20 @@ def entry(step: int) -> bytes:
     return encode(Inputs(step * 10, Observation(step, Pose(float(step), 0.0))))
 
 
-PAGES = [entry(step) for step in range(3, 9)]
+ENTRIES = [entry(step) for step in range(3, 9)]
 
 
 def written(path: Path, entries: list[bytes], run: str = "run") -> None:
-    """A diary that somebody left."""
+    """A write-ahead log that another process left."""
     wal = WalFile(path, run)
-    wal.reset(BIRTH)
+    wal.reset(INITIAL_STATE)
     for content in entries:
         wal.append(content)
     wal.close()
 
 
 def found(path: Path, run: str = "run") -> WalContents | None:
-    """What whoever comes next finds."""
+    """The contents that the next process finds."""
     wal = WalFile(path, run)
     entries = wal.read()
     wal.close()
@@ -55,20 +55,20 @@ def test_what_is_noted_is_read(inputs: list[Inputs]) -> None:
         path = Path(folder) / "r1.diary"
         written(path, [encode(given_) for given_ in inputs])
 
-        assert found(path) == WalContents(BIRTH, [encode(given_) for given_ in inputs])
+        assert found(path) == WalContents(INITIAL_STATE, [encode(given_) for given_ in inputs])
 
 
-def test_a_diary_is_continued_where_it_ends(tmp_path: Path) -> None:
+def test_a_log_is_continued_where_it_ends(tmp_path: Path) -> None:
     path = tmp_path / "r1.diary"
-    written(path, PAGES[:2])
+    written(path, ENTRIES[:2])
     again = WalFile(path, "run")
     again.read()
     again.skew_ns = -7
-    again.append(PAGES[2])
+    again.append(ENTRIES[2])
     again.close()
 
     last = WalFile(path, "run")
-    assert last.read() == WalContents(BIRTH, PAGES[:3])
+    assert last.read() == WalContents(INITIAL_STATE, ENTRIES[:3])
     assert last.skew_ns == -7
 
 
@@ -77,7 +77,7 @@ def test_a_diary_is_continued_where_it_ends(tmp_path: Path) -> None:
 def test_any_cut_and_any_flipped_bit_leave_a_prefix(data: st.DataObject) -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "r1.diary"
-        written(path, PAGES)
+        written(path, ENTRIES)
         content = bytearray(path.read_bytes())
         bit = data.draw(st.integers(0, 8 * len(content) - 1) | st.none())
         if bit is not None:
@@ -87,15 +87,15 @@ def test_any_cut_and_any_flipped_bit_leave_a_prefix(data: st.DataObject) -> None
 
         first = found(path)
         assert first is None or (first.initial_state, first.inputs) == (
-            BIRTH,
-            PAGES[: len(first.inputs)],
+            INITIAL_STATE,
+            ENTRIES[: len(first.inputs)],
         )
         assert found(path) == first
 
 
 @given(st.binary(max_size=300))
 @examples(200)
-def test_no_file_is_taken_for_a_diary_that_is_none(content: bytes) -> None:
+def test_no_other_file_is_taken_for_a_log(content: bytes) -> None:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "r1.diary"
         path.write_bytes(content)
@@ -115,26 +115,26 @@ def test_a_header_that_says_nothing_is_no_header(tmp_path: Path, header: bytes) 
     assert found(path) is None
 
 
-def test_a_cut_diary_is_continued_after_its_last_sound_page(tmp_path: Path) -> None:
+def test_a_cut_log_is_continued_after_its_last_sound_entry(tmp_path: Path) -> None:
     path = tmp_path / "r1.diary"
-    written(path, PAGES[:3])
+    written(path, ENTRIES[:3])
     with path.open("ab") as file:
         file.truncate(path.stat().st_size - 3)
     again = WalFile(path, "run")
     again.read()
-    again.append(PAGES[4])
+    again.append(ENTRIES[4])
     again.close()
 
-    assert found(path) == WalContents(BIRTH, [*PAGES[:2], PAGES[4]])
+    assert found(path) == WalContents(INITIAL_STATE, [*ENTRIES[:2], ENTRIES[4]])
 
 
-def test_a_diary_of_another_run_or_of_none_is_nothing(tmp_path: Path) -> None:
+def test_a_log_of_another_run_or_of_none_is_discarded(tmp_path: Path) -> None:
     path = tmp_path / "r1.diary"
     assert found(path) is None
-    written(path, PAGES, run="yesterday's")
+    written(path, ENTRIES, run="yesterday's")
     assert found(path) is None
-    written(path, PAGES[:1])
-    assert found(path) == WalContents(BIRTH, PAGES[:1])
+    written(path, ENTRIES[:1])
+    assert found(path) == WalContents(INITIAL_STATE, ENTRIES[:1])
     assert [file.name for file in tmp_path.iterdir()] == ["r1.diary"]
 
 
@@ -143,19 +143,19 @@ def test_torn_it_lacks_a_step_and_ends_in_the_middle_of_a_page(
     tmp_path: Path, step: int, left: int
 ) -> None:
     path = tmp_path / "r1.diary"
-    written(path, PAGES)
+    written(path, ENTRIES)
     whole = path.stat().st_size
     tear(path, step)
 
-    assert (path.stat().st_size == whole) == (left == len(PAGES))
-    assert found(path) == WalContents(BIRTH, PAGES[:left])
+    assert (path.stat().st_size == whole) == (left == len(ENTRIES))
+    assert found(path) == WalContents(INITIAL_STATE, ENTRIES[:left])
     tear(path, 0)
     tear(path, 0)
-    assert found(path) == WalContents(BIRTH, [])
+    assert found(path) == WalContents(INITIAL_STATE, [])
 
 
 def found_beside(path: Path) -> list[bytes]:
-    """The pages in a diary that is still being written."""
+    """The entries in a log that is still being written."""
     copy = path.with_name("copy")
     copy.write_bytes(path.read_bytes())
     entries = found(copy)
@@ -175,29 +175,29 @@ def room_for(size: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("spare", [0, 1, 9, 30])
 def test_a_full_disk_takes_no_page_and_no_half_of_one(tmp_path: Path, spare: int) -> None:
-    """The page is refused with an error, and fits when there is room again."""
+    """The entry is refused with an error, and fits when there is room again."""
     path = tmp_path / "r1.diary"
     wal = WalFile(path, "run")
-    wal.reset(BIRTH)
-    wal.append(PAGES[0])
+    wal.reset(INITIAL_STATE)
+    wal.append(ENTRIES[0])
     with room_for(path.stat().st_size + spare), pytest.raises(OSError, match="File too large"):
-        wal.append(PAGES[1])
-    assert found_beside(path) == PAGES[:1]
-    wal.append(PAGES[1])
-    wal.append(PAGES[2])
+        wal.append(ENTRIES[1])
+    assert found_beside(path) == ENTRIES[:1]
+    wal.append(ENTRIES[1])
+    wal.append(ENTRIES[2])
     wal.close()
 
-    assert found(path) == WalContents(BIRTH, PAGES[:3])
+    assert found(path) == WalContents(INITIAL_STATE, ENTRIES[:3])
 
 
-def test_a_full_disk_keeps_the_old_diary_when_a_new_one_does_not_fit(tmp_path: Path) -> None:
+def test_a_full_disk_keeps_the_old_log_when_a_new_one_does_not_fit(tmp_path: Path) -> None:
     path = tmp_path / "r1.diary"
-    written(path, PAGES[:1])
+    written(path, ENTRIES[:1])
     wal = WalFile(path, "run")
     with room_for(20), pytest.raises(OSError, match="File too large"):
-        wal.reset(BIRTH)
+        wal.reset(INITIAL_STATE)
 
-    assert found(path) == WalContents(BIRTH, PAGES[:1])
+    assert found(path) == WalContents(INITIAL_STATE, ENTRIES[:1])
     assert [file.name for file in tmp_path.iterdir()] == ["r1.diary"]
 
 
@@ -213,14 +213,14 @@ class Counter:
 
 
 def keep_frozen(path: Path, ready: Callable[[], None]) -> None:
-    """A predecessor that was stopped in the middle of its life."""
-    life = RecoverableNode(Counter, WalFile(path, "run"), Body(Pose(0.0, 0.0)))
-    life.step(Inputs(1, Observation(0, Pose(0.0, 0.0))))
+    """A predecessor that was stopped in the middle of its steps."""
+    node = RecoverableNode(Counter, WalFile(path, "run"), Body(Pose(0.0, 0.0)))
+    node.step(Inputs(1, Observation(0, Pose(0.0, 0.0))))
     ready()
     signal.pause()
 
 
-def test_two_writers_never_share_a_diary(tmp_path: Path) -> None:
+def test_two_writers_never_share_a_log(tmp_path: Path) -> None:
     """A frozen predecessor has the file: its successor is a new incarnation with a file of its own."""
     path = tmp_path / "r1.diary"
     context = multiprocessing.get_context("spawn")

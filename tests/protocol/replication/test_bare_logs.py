@@ -12,7 +12,7 @@ from support.strategies import examples
 BOUND = 50
 
 
-def replica(me: int, origins: int = 3, *, relay: bool = False, patience: int = 2) -> Replica:
+def replica(me: int, origins: int = 3, *, relay: bool = False, timeout_steps: int = 2) -> Replica:
     """Of entries below 50."""
     return Replica(
         me,
@@ -22,12 +22,12 @@ def replica(me: int, origins: int = 3, *, relay: bool = False, patience: int = 2
         ledger=True,
         claims=False,
         relay=relay,
-        ack_timeout_steps=patience,
+        ack_timeout_steps=timeout_steps,
     )
 
 
 def log(held: Replica, origin: int) -> list[int]:
-    """What somebody holds of an origin's log."""
+    """The entries that a replica holds of an origin's log."""
     return [index for index, _ in entries(held, origin)]
 
 
@@ -44,7 +44,7 @@ def test_an_entry_is_one_number_on_the_air() -> None:
 
 
 def test_nothing_is_repeated_before_an_answer_is_due() -> None:
-    """There are dozens of entries a step: they go out once, and again only when nobody confirmed."""
+    """There are dozens of entries a step: they go out once, and again only without an acknowledgement."""
     one, two = replica(0, 2), replica(1, 2)
     assert one.merge(1, *two.compose())
     one.append(np.array([3, 4]))
@@ -84,7 +84,7 @@ def test_what_is_malformed_changes_nothing(logs: bytes) -> None:
     ),
     lost=st.sets(st.integers(0, 80)),
 )
-def test_everybody_ends_with_all_logs(written: list[tuple[int, list[int]]], lost: set[int]) -> None:
+def test_all_end_with_all_logs(written: list[tuple[int, list[int]]], lost: set[int]) -> None:
     """In a row, where the ends never hear each other, whatever is lost: in the end all hold all."""
     made = [replica(me) for me in range(3)]
     truth: list[list[int]] = [[], [], []]

@@ -1,4 +1,4 @@
-"""A participant's end of the radio: what is taken in, what is counted, what is said."""
+"""A participant's end of the radio: what is merged, what is counted, what is sent."""
 
 import pytest
 
@@ -45,7 +45,7 @@ def test_messages_are_learned_in_order_of_arrival() -> None:
         Envelope("r1", 1, "", SOUND[:-1]),
     ],
 )
-def test_unsound_envelopes_are_counted_and_learned_from_nobody(envelope: Envelope) -> None:
+def test_unsound_envelopes_are_counted_and_merged_from_no_origin(envelope: Envelope) -> None:
     """A stranger, the robot itself, noise, a cut message."""
     assert heard(envelope, Envelope("r3", 1, "", SOUND)) == ([2], 1)
 
@@ -132,5 +132,5 @@ def test_replica_follows_the_mission(
 def test_answer_is_due_after_both_ways_and_the_others_next_step(
     name: str, overrides: tuple[str, ...], steps: int
 ) -> None:
-    """Patience is counted in own steps; the supervisor's are shorter when robots act in turn."""
+    """The timeout is counted in own steps; the supervisor's are shorter when robots act in turn."""
     assert ack_timeout_steps(name, mission(*overrides)) == steps

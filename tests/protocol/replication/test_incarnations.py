@@ -1,6 +1,6 @@
-"""Participants that are born again: what their messages hold, and what others make of them.
+"""Participants that go on as new incarnations: what their messages hold, and what others make of them.
 
-Slots are counted by hand here: incarnation e of place i in a roster of n is e n + i.
+Incarnation ids are counted by hand here: incarnation e of place i in a roster of n is e n + i.
 """
 
 import random
@@ -31,12 +31,24 @@ CLAIMS = pytest.mark.parametrize("claims", [True, False], ids=["claims", "no-cla
 
 
 def replica(
-    slot: int, *, ledger: bool = True, claims: bool = True, width: int = 0, relay: bool = False
+    incarnation_id: int,
+    *,
+    ledger: bool = True,
+    claims: bool = True,
+    width: int = 0,
+    relay: bool = False,
 ) -> Replica:
     """An empty replica of an incarnation."""
-    registers = Registers(slot, ROSTER, width, relay=relay)
+    registers = Registers(incarnation_id, ROSTER, width, relay=relay)
     return Replica(
-        slot, ROSTER, N, UNITS, ledger=ledger, claims=claims, relay=relay, registers=registers
+        incarnation_id,
+        ROSTER,
+        N,
+        UNITS,
+        ledger=ledger,
+        claims=claims,
+        relay=relay,
+        registers=registers,
     )
 
 
@@ -73,19 +85,19 @@ def snapshot(held: Replica) -> list[Any]:
     return [(array.shape, array.tolist()) for array in arrays]
 
 
-def test_slots_come_in_blocks_of_the_roster() -> None:
+def test_incarnation_ids_come_in_blocks_of_the_roster() -> None:
     """One for each incarnation, up to the last that there may be."""
-    assert [known_ids(slot, 3) for slot in (0, 2, 3, 8, 47)] == [3, 3, 6, 9, 48]
-    for slot in (-1, 3 * (INCARNATIONS_MAX + 1)):
+    assert [known_ids(incarnation_id, 3) for incarnation_id in (0, 2, 3, 8, 47)] == [3, 3, 6, 9, 48]
+    for incarnation_id in (-1, 3 * (INCARNATIONS_MAX + 1)):
         with pytest.raises(ValueError, match="incarnation"):
-            known_ids(slot, 3)
+            known_ids(incarnation_id, 3)
     with pytest.raises(ValueError, match="incarnation 16"):
         replica(ROSTER * 16)
 
 
 @CLAIMS
-def test_a_vector_tells_for_how_many_slots_it_is(*, claims: bool) -> None:
-    """As many numbers as slots, twice as many with claims, whatever their length."""
+def test_a_vector_covers_a_number_of_incarnation_ids(*, claims: bool) -> None:
+    """As many numbers as ids, twice as many with claims, whatever their length."""
     parts = 2 if claims else 1
     for blocks in range(1, INCARNATIONS_MAX + 2):
         numbers = b"\x85\x01" + bytes(parts * 3 * blocks - 1)
@@ -94,8 +106,8 @@ def test_a_vector_tells_for_how_many_slots_it_is(*, claims: bool) -> None:
         assert covered_ids(content, 3, claims=claims) is None
 
 
-def test_a_new_incarnation_speaks_of_twice_as_many_slots() -> None:
-    """Its own log is in its own slot; its predecessor's is another's."""
+def test_a_new_incarnation_covers_twice_as_many_ids() -> None:
+    """Its own log is at its own id; its predecessor's log is another's."""
     one = replica(ROSTER + 1)
     buy(one, 2, 3)
     version_vector = one.compose(0)[0]
@@ -108,7 +120,7 @@ def test_a_new_incarnation_speaks_of_twice_as_many_slots() -> None:
 @MODES
 def test_shorter_vectors_are_of_who_holds_nothing_beyond(*, ledger: bool, claims: bool) -> None:
     """Who has not heard of an incarnation holds nothing of it, and is told."""
-    young, old, other = (replica(slot, ledger=ledger, claims=claims) for slot in (4, 0, 2))
+    young, old, other = (replica(origin, ledger=ledger, claims=claims) for origin in (4, 0, 2))
     for held in (young, old):
         buy(held, held.config.me, 1)
     young.claim(4, 5)
@@ -156,7 +168,7 @@ HOSTILE = {
     "cut-register-of-a-newcomer": (4, bytes(12), b"", b"", bytes(6) + bytes([4, 1, 1])),
     "register-that-it-does-not-know": (1, bytes(6), b"", b"", bytes(3) + bytes([3, 1, 0])),
     "stamps-of-fewer": (4, bytes(12), b"", b"", bytes(5)),
-    "own-slot": (0, bytes(6), b"", b"", b""),
+    "own-id": (0, bytes(6), b"", b"", b""),
 }
 
 
@@ -175,8 +187,8 @@ def test_hostile_words_make_no_room(*, ledger: bool, name: str) -> None:
 @examples(300)
 @given(data=st.data(), ledger=st.booleans())
 def test_any_bytes_are_survived_and_refused_whole(*, ledger: bool, data: st.DataObject) -> None:
-    """Two blocks of slots or three, noise beside: taken in whole or not at all; the sums stay exact."""
-    held, other = (replica(slot, ledger=ledger, width=WIDTH) for slot in (0, 4))
+    """Two blocks of ids or three, noise beside: taken in whole or not at all; the sums stay exact."""
+    held, other = (replica(origin, ledger=ledger, width=WIDTH) for origin in (0, 4))
     buy(other, 3, 2)
     other.registers.add(np.array([3, -2]))
     sound = (*other.compose(0), other.registers.compose(0))
@@ -195,7 +207,7 @@ def test_any_bytes_are_survived_and_refused_whole(*, ledger: bool, data: st.Data
 
 
 def test_boast_about_the_own_log_is_left() -> None:
-    """Who claims to hold more of a log than its writer has written is told nothing, and harms nobody."""
+    """A sender that claims to hold more of a log than was written gets nothing, and harms none."""
     held = replica(0)
     buy(held, 1, 2)
     before = replicas.entries(held, 0)
@@ -235,7 +247,7 @@ def test_a_new_incarnation_learns_what_it_once_said() -> None:
 
 
 def test_claim_of_the_dead_expires() -> None:
-    """Nobody gives it up, nobody renews it; also its successor need not wait longer."""
+    """It is neither given up nor renewed; also its successor need not wait longer."""
     dead, reader, young = replica(1), replica(0), replica(ROSTER + 1)
     dead.claim(3, 100)
     tell(dead, reader)
@@ -303,7 +315,7 @@ def test_register_of_the_newest_incarnation_that_has_written() -> None:
 def test_all_end_with_all_that_the_living_know(
     *, deeds: list[tuple[int, str, int]], drop: float, ledger: bool, luck: random.Random
 ) -> None:
-    """Whoever dies and whenever: equal weights, equal registers, sums over all incarnations exact."""
+    """Whichever robots die and whenever: equal weights, equal registers, sums over all incarnations exact."""
     made = [replica(place, ledger=ledger, width=WIDTH) for place in range(ROSTER)]
     for who, deed, sample in deeds:
         held = made[who]
@@ -319,10 +331,10 @@ def test_all_end_with_all_that_the_living_know(
             assert registers.total.tolist() == registers.values.sum(axis=0).tolist()
     known = [
         max(
-            (held.registers.values[slot].tolist() for held in made if slot < held.origins),
+            (held.registers.values[origin].tolist() for held in made if origin < held.origins),
             default=[],
         )
-        for slot in range(max(held.origins for held in made))
+        for origin in range(max(held.origins for held in made))
     ]
     for _ in range(30):
         for held in made:
@@ -345,23 +357,23 @@ def test_whole_state_is_the_join_of_its_deltas(
     parts: list[tuple[int, int, int]], luck: random.Random
 ) -> None:
     """ledger: nine writers of three incarnations each; words in any order, then all at once."""
-    writers = [replica(slot) for slot in range(3 * ROSTER)]
+    writers = [replica(origin) for origin in range(3 * ROSTER)]
     words: list[tuple[int, tuple[bytes, bytes, bytes]]] = []
-    for slot, sample, units in parts:
-        buy(writers[slot], sample, units)
-        words.append((slot, writers[slot].compose(2)))
+    for origin, sample, units in parts:
+        buy(writers[origin], sample, units)
+        words.append((origin, writers[origin].compose(2)))
     bit_by_bit, at_once = replica(4 * ROSTER + 2), replica(4 * ROSTER + 2)
     for _ in range(len(words) + 1):
         luck.shuffle(words)
-        for slot, word in words:
-            assert bit_by_bit.merge(slot, *word)
+        for origin, word in words:
+            assert bit_by_bit.merge(origin, *word)
     told = b"".join(whole_log(writer) for writer in writers)
     assert at_once.merge(0, bytes(2 * 3 * ROSTER), told, b"")
 
-    for slot in range(3 * ROSTER):
+    for origin in range(3 * ROSTER):
         assert (
-            replicas.entries(bit_by_bit, slot)
-            == replicas.entries(at_once, slot)
-            == replicas.entries(writers[slot], slot)
+            replicas.entries(bit_by_bit, origin)
+            == replicas.entries(at_once, origin)
+            == replicas.entries(writers[origin], origin)
         )
     assert at_once.weights.tolist() == bit_by_bit.weights.tolist()

@@ -1,4 +1,4 @@
-"""Registers: the newest value of every origin reaches everybody, whatever the radio does.
+"""Registers: the newest value of every origin reaches all, whatever the radio does.
 
 Content that a test writes itself comes from `content`, an encoder of the wire format that shares
 nothing with the kernels. The reference for a sum is a plain sum.
@@ -23,11 +23,13 @@ AMOUNTS = st.integers(0, 9).flatmap(
 
 
 def team(
-    origins: int, *, relay: int | None = None, beacon: bool = False, patience: int = 2
+    origins: int, *, relay: int | None = None, beacon: bool = False, timeout_steps: int = 2
 ) -> list[Registers]:
     """Empty registers of a team; one of them may relay."""
     return [
-        Registers(me, origins, WIDTH, relay=me == relay, beacon=beacon, ack_timeout_steps=patience)
+        Registers(
+            me, origins, WIDTH, relay=me == relay, beacon=beacon, ack_timeout_steps=timeout_steps
+        )
         for me in range(origins)
     ]
 
@@ -85,7 +87,7 @@ def told(said: bytes, origins: int) -> set[int]:
 
 
 def speak(made: list[Registers], hears: dict[int, list[int]] | None = None) -> list[set[int]]:
-    """A round: everybody speaks, then whoever is in range hears. Whose registers each one told."""
+    """A round: all send, then all in range receive. The origins whose registers each one sent."""
     said = [held.compose() for held in made]
     for source, word in enumerate(said):
         made[source].end_step()
@@ -119,7 +121,7 @@ def test_a_write_counts_and_adds() -> None:
     assert (one.total.tolist(), one.stamps.tolist()) == ([11, 3, -3], [2, 1])
 
 
-def test_while_nobody_is_heard_only_stamps_are_sent() -> None:
+def test_while_nothing_is_received_only_stamps_are_sent() -> None:
     """A register takes a kilobyte; a stamp is enough to be found by."""
     one, _ = team(2)
     add(one, 1, 1, 1)
@@ -128,7 +130,7 @@ def test_while_nobody_is_heard_only_stamps_are_sent() -> None:
 
 
 def test_beacon_tells_everything_into_the_dark() -> None:
-    """With `state` one message informs whoever comes into range, also of others."""
+    """With `state` one message informs a robot that comes into range, also of others."""
     one, _two, _three = team(3, beacon=True)
     add(one, 1, 0, 0)
     hear(one, 1, content([0, 1, 0], register(1, 1, 2, 0, 0)))
@@ -139,9 +141,9 @@ def test_beacon_tells_everything_into_the_dark() -> None:
     assert told(one.compose(2), 3) == set()
 
 
-def test_a_register_is_told_once_and_again_after_patience() -> None:
+def test_a_register_is_sent_once_and_again_after_the_timeout() -> None:
     """Without an acknowledgement it is repeated; with one it is not."""
-    one, two = team(2, patience=3)
+    one, two = team(2, timeout_steps=3)
     add(one, 1, 0, 0)
     hear(one, 1, two.compose())
     rounds = []
@@ -156,8 +158,8 @@ def test_a_register_is_told_once_and_again_after_patience() -> None:
         assert told(one.compose(), 2) == set()
 
 
-def test_whoever_fell_silent_is_told_nothing() -> None:
-    """A neighbour is who was heard within patience and four steps."""
+def test_a_silent_participant_is_no_neighbour() -> None:
+    """A neighbour is an origin that was heard within the timeout and four steps."""
     one, two = team(2)
     hear(one, 1, two.compose())
     for _ in range(7):
@@ -180,7 +182,7 @@ def test_a_relay_forwards_at_once_a_robot_when_it_has_grown_stale() -> None:
 
 
 def test_among_robots_that_all_hear_each_other_nothing_is_forwarded() -> None:
-    """Everybody tells its own, each step, and no more."""
+    """Each sends its own, each step, and no more."""
     made = team(4)
     for step in range(20):
         for held in made:
@@ -203,7 +205,7 @@ def test_one_participant_is_told_what_it_lacks() -> None:
 
 
 def test_what_does_not_fit_follows_with_the_next_message() -> None:
-    """A thousand numbers and 70 origins: each message within bounds, in turn everybody's."""
+    """A thousand numbers and 70 origins: each message within bounds, in turn those of all."""
     width, origins = 1024, 70
     one = Registers(0, origins, width, relay=True)
     numbers = [NUMBER_MAX, *[-NUMBER_MAX] * (width - 1)]
@@ -238,7 +240,7 @@ def test_without_registers_nothing_is_said_and_nothing_heard() -> None:
 def test_loss_repetition_and_order_change_nothing_but_time(
     writes: list[tuple[int, list[int]]], order: object
 ) -> None:
-    """Any messages, any number of times, in any order: everybody ends with the plain sums."""
+    """Any messages, any number of times, in any order: all end with the plain sums."""
     made = team(3, beacon=True)
     air: list[tuple[int, bytes]] = []
     for who, amounts in writes:
@@ -293,7 +295,7 @@ MALFORMED = {
     "cut-number": content([0, 0], register(1, 1, 5, 1, 1))[:-1],
     "cut-inside-a-number": content([0, 0], register(1, 1, 300, 1, 200))[:-1],
     "a-number-more": content([0, 0], register(1, 1, 5, 1, 1, 1)),
-    "nobody's": content([0, 0], register(2, 1, 5, 1, 1)),
+    "of-no-origin": content([0, 0], register(2, 1, 5, 1, 1)),
     "never-written": content([0, 0], register(1, 0, 5, 1, 1)),
     "stamp-beyond-reason": content([0, 0], register(1, STAMP_MAX + 1, 5, 1, 1)),
     "known-stamp-beyond-reason": content([0, STAMP_MAX + 1]),
@@ -331,7 +333,7 @@ def test_any_bytes_are_sound_or_refused(*, noise: bytes, whole: bool) -> None:
     assert read_register(noise, 2, WIDTH, 1) is None or len(noise) >= 2
 
 
-def test_nobody_writes_the_register_of_another() -> None:
+def test_no_participant_writes_the_register_of_another() -> None:
     """What comes back of the own register is left, however new it claims to be."""
     one, _ = team(2)
     add(one, 1, 1, 1)
@@ -390,7 +392,7 @@ def test_age_tells_how_long_nothing_new_came() -> None:
 
 
 def test_more_numbers_than_a_register_has_are_refused() -> None:
-    """Whoever writes too much is not understood."""
+    """The message is malformed."""
     held = Registers(0, 2, WIDTH, sums=False)
 
     assert not held.is_well_formed(content([0, 1], register(1, 1, 1, 2, 3, 4)), 2)

@@ -42,7 +42,7 @@ def replica(
     claims: bool = True,
     relay: bool = False,
     beacon: bool = False,
-    patience: int = 2,
+    timeout_steps: int = 2,
     units: Units = UNITS,
     samples: int = N,
 ) -> Replica:
@@ -56,7 +56,7 @@ def replica(
         claims=claims,
         relay=relay,
         beacon=beacon,
-        ack_timeout_steps=patience,
+        ack_timeout_steps=timeout_steps,
     )
 
 
@@ -129,7 +129,7 @@ def vector(held: Replica) -> list[int]:
 
 
 def truth(made: Iterable[Replica]) -> list[int]:
-    """What everybody's weights must come to, by a plain dictionary."""
+    """The weights that all must come to, by a plain dictionary."""
     made = list(made)
     if not made[0].config.ledger:
         return [min(column) for column in zip(*map(vector, made), strict=True)]
@@ -163,7 +163,7 @@ class Air:
         self._inboxes: list[list[tuple[int, Message]]] = [[] for _ in made]
 
     def round(self) -> None:
-        """Everybody listens, then everybody speaks."""
+        """All receive, then all send."""
         for i, held in enumerate(self._made):
             for source, message in self._inboxes[i]:
                 assert held.merge(source, *message)
@@ -176,7 +176,7 @@ class Air:
                     self._inboxes[j].append((i, message))
 
     def rounds_until(self, agreed: list[int], most: int) -> int:
-        """Rounds until everybody's weights are these; fails after `most`."""
+        """Rounds until the weights of all are these; fails after `most`."""
         for count in range(most):
             if all(vector(held) == agreed for held in self._made):
                 return count
@@ -285,7 +285,7 @@ def test_largest_units_are_exact(*, ledger: bool) -> None:
 
 
 def test_acknowledgement_beyond_any_log_is_taken_for_all_of_it() -> None:
-    """Whoever says that it holds more than can be gets nothing, and harms nobody."""
+    """A sender that claims to hold more than can be gets nothing, and harms none."""
     held = replica(0, 2, ledger=True)
     buy(held, [(3, 1)])
     boast = b"".join(leb128(number) for number in (1 << 62, 1 << 31, (1 << 31) - 1, 0))
@@ -319,7 +319,7 @@ def test_suffix_that_overlaps_adds_what_is_new() -> None:
     assert vector(held) == [3, 2, 1, 4, 4, 4]
 
 
-def test_nobody_else_writes_a_log() -> None:
+def test_no_other_participant_writes_a_log() -> None:
     """Single writer: a suffix of the robot's own log changes nothing, whoever sends it."""
     held = replica(0, 2, ledger=True)
     buy(held, [(0, 1)])
@@ -352,7 +352,7 @@ def test_message_to_one_participant_needs_no_answer_first(*, ledger: bool) -> No
 def test_beacon_of_state_informs_with_one_message(
     *, ledger: bool, beacon: bool, informed: bool
 ) -> None:
-    """Beacon `state`: whoever comes into range knows at once (Algorithm 3, line 5); with versions
+    """Beacon `state`: a robot that comes into range knows at once (Algorithm 3, line 5); with versions
     it takes an answer.
     """
     lonely, passing = (replica(i, 2, ledger=ledger, beacon=beacon) for i in range(2))
@@ -368,9 +368,9 @@ def test_beacon_of_state_informs_with_one_message(
 
 
 @pytest.mark.parametrize(("relay", "waits"), [(True, 0), (False, 2)])
-def test_relay_forwards_at_once_and_a_robot_after_its_patience(*, relay: bool, waits: int) -> None:
+def test_relay_forwards_at_once_and_a_robot_after_its_timeout(*, relay: bool, waits: int) -> None:
     """A robot's neighbours most likely heard the news themselves; a supervisor's never do."""
-    middle = replica(1, 3, ledger=True, relay=relay, patience=2)
+    middle = replica(1, 3, ledger=True, relay=relay, timeout_steps=2)
     author, reader = replica(0, 3, ledger=True), replica(2, 3, ledger=True)
     middle.merge(2, *reader.compose())
     middle.merge(0, *author.compose())
@@ -401,18 +401,20 @@ def test_what_is_acknowledged_is_not_sent_again() -> None:
 
 @MODES
 @examples(40)
-@given(bought=st.tuples(PURCHASES, PURCHASES, PURCHASES, PURCHASES), patience=st.integers(1, 4))
+@given(
+    bought=st.tuples(PURCHASES, PURCHASES, PURCHASES, PURCHASES), timeout_steps=st.integers(1, 4)
+)
 def test_news_travels_along_a_chain(
-    *, ledger: bool, bought: tuple[Purchases, ...], patience: int
+    *, ledger: bool, bought: tuple[Purchases, ...], timeout_steps: int
 ) -> None:
-    """Four robots in a row, only neighbours hear each other: everybody comes to the same truth, in
+    """Four robots in a row, only neighbours hear each other: all come to the same truth, in
     a few rounds a hop.
     """
-    made = [replica(i, 4, ledger=ledger, patience=patience) for i in range(4)]
+    made = [replica(i, 4, ledger=ledger, timeout_steps=timeout_steps) for i in range(4)]
     for held, purchases in zip(made, bought, strict=True):
         buy(held, purchases)
 
-    Air(made, lambda i, j: abs(i - j) == 1).rounds_until(truth(made), 6 * (patience + 2))
+    Air(made, lambda i, j: abs(i - j) == 1).rounds_until(truth(made), 6 * (timeout_steps + 2))
 
 
 @MODES
@@ -421,7 +423,7 @@ def test_news_travels_along_a_chain(
     bought=TEAM_PURCHASES,
     later=TEAM_PURCHASES,
     silence=st.integers(0, 40),
-    patience=st.integers(1, 4),
+    timeout_steps=st.integers(1, 4),
 )
 def test_team_that_was_apart_agrees_when_it_meets(
     *,
@@ -429,10 +431,10 @@ def test_team_that_was_apart_agrees_when_it_meets(
     bought: tuple[Purchases, ...],
     later: tuple[Purchases, ...],
     silence: int,
-    patience: int,
+    timeout_steps: int,
 ) -> None:
-    """However long nobody heard anybody, one encounter of a few rounds is enough."""
-    made = [replica(i, 3, ledger=ledger, patience=patience) for i in range(3)]
+    """However long no robot heard another, one encounter of a few rounds is enough."""
+    made = [replica(i, 3, ledger=ledger, timeout_steps=timeout_steps) for i in range(3)]
     apart = Air(made, lambda _i, _j: False)
     for i, held in enumerate(made):
         buy(held, bought[i])
@@ -441,7 +443,7 @@ def test_team_that_was_apart_agrees_when_it_meets(
     for i, held in enumerate(made):
         buy(held, later[i])
 
-    Air(made).rounds_until(truth(made), 2 * patience + 4)
+    Air(made).rounds_until(truth(made), 2 * timeout_steps + 4)
 
 
 @MODES
@@ -581,7 +583,7 @@ def test_malformed_suffix_is_refused(*, ledger: bool, name: str) -> None:
 
 
 def test_ledger_entry_is_at_most_a_point() -> None:
-    """Nobody ships more than a point to one sample at once."""
+    """No robot ships more than a point to one sample at once."""
     held = replica(0, 2, ledger=True)
 
     assert not held.merge(1, version_vector(2), suffix(1, 0, [(0, UNITS.point + 1)]), b"")
@@ -657,7 +659,7 @@ def test_renewal_keeps_the_first_time() -> None:
 
 
 def test_claimed_sample_is_left_by_who_has_none() -> None:
-    """Whoever is not there yet leaves it; when it is given up it is free again."""
+    """A robot that is not there yet leaves it; when it is given up it is free again."""
     a, b = (replica(i, 2, ledger=True) for i in range(2))
     b.claim(3, 100)
     a.merge(1, *b.compose())

@@ -3,7 +3,7 @@
 Robots spend, claim and speak; some lose all that they held and are born again; the radio drops, repeats,
 delays, reorders and damages what they say. After every event the invariants hold; whenever the radio is
 good for a while, all weights come to the plain sum (ledger) or the plain minimum (min) of what was spent,
-but for what nobody alive has heard of.
+but for entries that no living robot has received.
 """
 
 from collections import Counter
@@ -23,8 +23,8 @@ N = 6
 UNITS = Units.of(8, N)
 """Four units a sample, three a point."""
 
-BIRTHS_MAX = 3
-"""In a run; any robot's, at any moment."""
+INCARNATIONS = 3
+"""New ones in a run, of any robot, at any moment."""
 
 Message = tuple[bytes, bytes, bytes]
 
@@ -32,7 +32,7 @@ Message = tuple[bytes, bytes, bytes]
 class Replicas(RuleBasedStateMachine):
     """Two to four participants and everything that is on the air between them.
 
-    Slots are counted here by hand: incarnation e of place i of n is e n + i.
+    Incarnation ids are counted here by hand: incarnation e of place i of n is e n + i.
     """
 
     def __init__(self) -> None:
@@ -40,11 +40,11 @@ class Replicas(RuleBasedStateMachine):
         self.made: list[Replica] = []
         """The living, by place."""
         self.authors: dict[int, Replica] = {}
-        """Everybody there ever was, by slot; the dead as they were in the end."""
+        """All replicas there ever were, by incarnation id; lost ones as they were in the end."""
         self.air: list[tuple[int, int, Message]] = []
-        """(slot of the source, place of the target, message): said and not yet heard or lost."""
+        """(id of the source, place of the target, message): sent and not yet received or lost."""
         self.bought: dict[int, list[tuple[int, int]]] = {}
-        """By slot: (sample, units), in order. Written here, never by the code under test."""
+        """By incarnation id: (sample, units), in order. Written here, never by the code under test."""
         self.seen: list[list[int]] = []
         """The weights after the event before."""
 
@@ -54,26 +54,33 @@ class Replicas(RuleBasedStateMachine):
         claims=st.booleans(),
         relay=st.booleans(),
         beacon=st.booleans(),
-        patience=st.integers(1, 3),
+        timeout_steps=st.integers(1, 3),
     )
     def assemble(
-        self, *, count: int, ledger: bool, claims: bool, relay: bool, beacon: bool, patience: int
+        self,
+        *,
+        count: int,
+        ledger: bool,
+        claims: bool,
+        relay: bool,
+        beacon: bool,
+        timeout_steps: int,
     ) -> None:
-        """One mission's manner for all; the last of the team may be a relay."""
+        """One mission's rules for all; the last of the team may be a relay."""
 
-        def born(slot: int) -> Replica:
+        def born(incarnation_id: int) -> Replica:
             held = Replica(
-                slot,
+                incarnation_id,
                 count,
                 N,
                 UNITS,
                 ledger=ledger,
                 claims=claims,
-                relay=relay and slot % count == count - 1,
+                relay=relay and incarnation_id % count == count - 1,
                 beacon=beacon,
-                ack_timeout_steps=patience,
+                ack_timeout_steps=timeout_steps,
             )
-            self.authors[slot], self.bought[slot] = held, []
+            self.authors[incarnation_id], self.bought[incarnation_id] = held, []
             return held
 
         self.born = born
@@ -93,7 +100,7 @@ class Replicas(RuleBasedStateMachine):
             spend(held.store, held.config, sample, units)
             self.bought[held.config.me].append((sample, units))
 
-    @precondition(lambda self: len(self.authors) < len(self.made) + BIRTHS_MAX)
+    @precondition(lambda self: len(self.authors) < len(self.made) + INCARNATIONS)
     @rule(who=st.integers(0, 3))
     def lose_all(self, who: int) -> None:
         """A robot has lost its disk, and goes on as its next incarnation."""
@@ -109,7 +116,7 @@ class Replicas(RuleBasedStateMachine):
 
     @rule(who=st.integers(0, 3))
     def speak(self, who: int) -> None:
-        """A robot ends its step with a message to everybody."""
+        """A robot ends its step with a message to all."""
         who %= len(self.made)
         held = self.made[who]
         message = held.compose()
@@ -123,8 +130,8 @@ class Replicas(RuleBasedStateMachine):
         who, whom = who % len(self.made), whom % len(self.made)
         if who != whom:
             held, theirs = self.made[who], self.made[whom].config.me
-            slot = theirs if theirs < held.origins else whom  # it may not have heard of it yet
-            self.air.append((held.config.me, whom, held.compose(slot)))
+            origin = theirs if theirs < held.origins else whom  # it may not have heard of it yet
+            self.air.append((held.config.me, whom, held.compose(origin)))
             held.end_step()
 
     @precondition(lambda self: self.air)
@@ -157,7 +164,7 @@ class Replicas(RuleBasedStateMachine):
 
     @rule()
     def clear_up(self) -> None:
-        """The radio is good for a while: everybody comes to the same weights, the true ones."""
+        """The radio is good for a while: all come to the same weights, the true ones."""
         self.air = []
         made, expected = self.made, self._truth()
         for _ in range(2 * made[0].config.ack_timeout_steps + 6):
@@ -192,7 +199,7 @@ class Replicas(RuleBasedStateMachine):
 
     @invariant()
     def views_are_not_below_what_is_left(self) -> None:
-        """Whatever is lost or heard twice: nobody believes that more was spent than was."""
+        """Whatever is lost or received twice: no view has more spending than there was."""
         spent = Counter[int]()
         for sample, units in (entry for bought in self.bought.values() for entry in bought):
             spent[sample] += units
@@ -201,7 +208,7 @@ class Replicas(RuleBasedStateMachine):
 
     @invariant()
     def logs_are_prefixes_of_what_was_spent(self) -> None:
-        """ledger: whoever holds anything of a log holds its beginning, and weighs exactly that."""
+        """ledger: what is held of a log is its beginning, and weights are exactly what it leaves."""
         for held in self.made if self.made and self.made[0].config.ledger else []:
             spent: Counter[int] = Counter()
             for origin in range(held.origins):
@@ -217,27 +224,29 @@ class Replicas(RuleBasedStateMachine):
     def acknowledged_minima_were_merged(self) -> None:
         """min: who says that it holds a log up to some length weighs no more than it says there."""
         for held in self.made if self.made and not self.made[0].config.ledger else []:
-            for slot, author in self.authors.items():
-                length = int(held.store.length[slot]) if slot < held.origins else 0
-                assert length <= len(replicas.entries(author, slot))
-                for sample, value in replicas.entries(author, slot)[:length]:
+            for origin, author in self.authors.items():
+                length = int(held.store.length[origin]) if origin < held.origins else 0
+                assert length <= len(replicas.entries(author, origin))
+                for sample, value in replicas.entries(author, origin)[:length]:
                     assert held.weights[sample] <= value
 
     @invariant()
-    def nobody_is_thought_to_hold_more_than_it_does(self) -> None:
+    def no_acknowledgement_is_ahead_of_the_truth(self) -> None:
         """An acknowledgement is never ahead of the truth, so nothing is ever held back for good."""
         for held in self.made:
-            for slot, other in self.authors.items():
-                if other is held or slot >= held.origins:
+            for origin, other in self.authors.items():
+                if other is held or origin >= held.origins:
                     continue
                 for part, truly in enumerate((other.store.length, other.store.claims[2])):
-                    known = held.store.known[slot, part * held.origins : (part + 1) * held.origins]
+                    known = held.store.known[
+                        origin, part * held.origins : (part + 1) * held.origins
+                    ]
                     holds = [*truly.tolist(), *[0] * held.origins]
                     assert all(x <= y for x, y in zip(known.tolist(), holds, strict=False))
 
     @invariant()
     def room_is_for_whole_rosters(self) -> None:
-        """Slots come in blocks, one for each incarnation of somebody that was heard of."""
+        """Incarnation ids come in blocks, one for each incarnation that is known."""
         for held in self.made:
             assert held.origins % len(self.made) == 0
             assert held.config.me < held.origins <= max(self.authors) + len(self.made)
@@ -255,8 +264,8 @@ class Replicas(RuleBasedStateMachine):
         if not self.made[0].config.ledger:
             return [min(int(held.weights[sample]) for held in self.made) for sample in range(N)]
         spent = Counter[int]()
-        for slot, bought in self.bought.items():
-            heard = max(int(h.store.length[slot]) if slot < h.origins else 0 for h in self.made)
+        for origin, bought in self.bought.items():
+            heard = max(int(h.store.length[origin]) if origin < h.origins else 0 for h in self.made)
             for sample, units in bought[:heard]:
                 spent[sample] += units
         return [max(0, UNITS.sample - spent[sample]) for sample in range(N)]

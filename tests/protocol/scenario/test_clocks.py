@@ -16,7 +16,7 @@ PERIOD_NS = 100_000_000
 
 
 def timetable(scenario: Scenario, seed: int, steps: int) -> list[tuple[int, str]]:
-    """Everybody's first steps, by time."""
+    """The first steps of all participants, by time."""
     return sorted(
         (clock.due_ns(step), name)
         for name, clock in step_clocks(scenario, seed).items()
@@ -65,7 +65,7 @@ def test_concurrent_robots_step_at_the_same_moment() -> None:
 
 
 def test_supervisor_steps_half_way_between_concurrent_robots() -> None:
-    """Its word is in time for the robots' next step (Algorithm 2: merge after everybody moved)."""
+    """Its message is in time for the robots' next step (Algorithm 2: merge after all have moved)."""
     scenario = mission("coordination=centralized")
 
     assert timetable(scenario, 1, 2) == [

@@ -258,7 +258,7 @@ REFUSED = {
         "faults[0].probability: expected `float` > 0.0",
     ),
     "kill of whom": ({"kind": "kill"}, "faults[0].who: missing; set it"),
-    "kill of nobody": ({"kind": "kill", "who": []}, "faults[0].who: expected `array` of length >="),
+    "kill of none": ({"kind": "kill", "who": []}, "faults[0].who: expected `array` of length >="),
     "kill of a stranger": (
         {"kind": "kill", "who": ["r1", "r9"]},
         "faults[0].who: r9 is not in the team; known: r1 to r3",
@@ -319,7 +319,7 @@ REFUSED = {
         {"kind": "late", "who": ["r1"], "from_s": 1, "until_s": 2},
         "faults[0].from_s: a late joiner is missing from the start; leave it out",
     ),
-    "everybody late": (
+    "all late": (
         {"kind": "late", "who": ["r3", "r1", "r2"], "until_s": 2},
         "faults[0].who: no robot would be there at the start; leave one out",
     ),
@@ -490,7 +490,9 @@ WINDOWS = st.tuples(st.integers(0, 8), st.integers(1, 4)).map(lambda w: (w[0], w
 
 @examples(100)
 @given(windows=st.lists(WINDOWS, min_size=1, max_size=4), pauses=st.sets(st.integers(0, 3)))
-def test_nobody_is_stopped_twice_at_once(windows: list[tuple[int, int]], pauses: set[int]) -> None:
+def test_no_process_is_stopped_twice_at_once(
+    windows: list[tuple[int, int]], pauses: set[int]
+) -> None:
     """Refused if, and only if, two windows share a moment."""
     faults = [
         process("pause" if i in pauses else "kill", "r2", *window)

@@ -339,7 +339,7 @@ def test_mission_is_cut_after_half_as_long_again_as_its_energy() -> None:
 
 
 def test_supervisor_stands_in_the_middle_unless_placed() -> None:
-    """Its place is in the scenario, like everybody's."""
+    """Its place is in the scenario, like that of all others."""
     assert mission().supervisor_m == (50.0, 50.0)
     assert mission("supervisor.pose_m=[1.0, 2.0]").supervisor_m == (1.0, 2.0)
 

@@ -57,7 +57,7 @@ def test_what_one_end_of_a_link_lets_out_the_other_lets_in(members: list[str]) -
 
 
 def test_everything_else_is_denied() -> None:
-    """Rules have ids of their own, and every rule is somebody's."""
+    """Rules have ids of their own, and every rule has a subject."""
     control = acl.control(
         [(name, {"usernames": [name]}, acl.robot(FLEET, name)) for name in ROSTER]
     )

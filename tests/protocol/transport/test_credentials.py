@@ -1,4 +1,4 @@
-"""Identity files: what is written is read again, and nobody is let in whom the register does not name."""
+"""Identity files: what is written is read again, and only members in the list are admitted."""
 
 import tomllib
 from datetime import UTC, datetime, timedelta

@@ -290,7 +290,7 @@ def test_older_report_gets_the_defaults() -> None:
 
 
 def test_a_mission_without_a_body_is_refused() -> None:
-    """Whoever takes part has to know from where it goes on, and in which run."""
+    """A participant has to know from where it goes on, and in which run."""
     nothing, body = Array.of(scattered(0)), Body(Pose(1.0, 2.0))
     told = Mission(VERSION, "n", mission(), 1, nothing, nothing, "wall", None, "run", body)
     plain = msgpack.unpackb(encode(told))

@@ -153,9 +153,9 @@ class Bandwidth(Fault, frozen=True, kw_only=True, tag="bandwidth"):
     robots: Names = ()
     """Senders, each for itself; by default all participants."""
     bytes_per_s: Positive
-    """Of message bodies. A message takes its time on the air whether it reaches a receiver or not."""
+    """Rate of message bodies. A message takes its time on the air whether it reaches a receiver or not."""
     queue_bytes: Annotated[int, Meta(ge=0, le=2**62)] | None = None
-    """How much may wait; a message that finds more waiting is dropped. By default everything waits."""
+    """Bytes that may wait; a message that finds more waiting is dropped. By default everything waits."""
 
 
 class Range(OnLinks, frozen=True, kw_only=True, tag="range"):

@@ -11,7 +11,7 @@ from msgspec import Meta
 from kantor_protocol.scenario.faults.base import Fault, Names
 
 Disk = Literal["kept", "torn", "lost"]
-"""What is left of the write-ahead log of a process that starts again: all, all but the end, or nothing."""
+"""State of the write-ahead log of a process that starts again: whole, without its end, or lost."""
 
 
 class OnProcesses(Fault, frozen=True, kw_only=True):
@@ -39,13 +39,13 @@ class Kill(OnProcesses, frozen=True, kw_only=True, tag="kill"):
     """SIGKILL at from_s; at until_s it is started again, or never if there is none."""
 
     disk: Disk = "kept"
-    """What is left of its write-ahead log. A participant whose log lacks a step comes back as a new incarnation."""
+    """State of its write-ahead log. A participant whose log lacks a step comes back as a new incarnation."""
     mid_step: bool = False
-    """It is killed in its next step: after that was written to the log, before it was reported."""
+    """The process is killed in its next step: after that was written to the log, before it was reported."""
 
     @property
     def of_world_sim(self) -> bool:
-        """It can: it starts again from its journal."""
+        """True: world-sim starts again from its journal."""
         return True
 
 
@@ -54,22 +54,22 @@ class Pause(WithEnd, frozen=True, kw_only=True, tag="pause"):
 
     @property
     def of_world_sim(self) -> bool:
-        """It can: all participants hold until it goes on."""
+        """True: all participants hold until world-sim goes on."""
         return True
 
 
 class Late(WithEnd, frozen=True, kw_only=True, tag="late"):
-    """It is missing from the start and joins at until_s."""
+    """A process that is missing from the start and joins at until_s."""
 
 
 class Slow(OnProcesses, frozen=True, kw_only=True, tag="slow"):
-    """It makes only one of so many of its steps; messages to it wait meanwhile."""
+    """A process that makes only one of so many of its steps; messages to it wait meanwhile."""
 
     every: Annotated[int, Meta(ge=2, le=1000)]
 
 
 class FullDisk(WithEnd, frozen=True, kw_only=True, tag="full-disk"):
-    """It cannot write its write-ahead log, and so must make no step."""
+    """A process that cannot write its write-ahead log, and so must make no step."""
 
 
 class ClockFault(OnProcesses, frozen=True, kw_only=True, tag="clock"):
@@ -81,11 +81,11 @@ class ClockFault(OnProcesses, frozen=True, kw_only=True, tag="clock"):
 
     @property
     def stops(self) -> bool:
-        """It does not: the process goes on."""
+        """False: the process goes on."""
         return False
 
     def skew_ns(self, now_ns: int) -> int:
-        """How far the clock is ahead at a time in the window."""
+        """The lead of the clock at a time in the window."""
         drift_ns = (now_ns - self.from_ns) * round(self.rate_ppm) // 1_000_000
         return round(self.offset_s * 1e9) + drift_ns
 
@@ -95,7 +95,7 @@ class Impostor(OnProcesses, frozen=True, kw_only=True, tag="impostor"):
 
     @property
     def stops(self) -> bool:
-        """It does not: the impostor is another process."""
+        """False: the impostor is another process."""
         return False
 
 
