@@ -37,7 +37,7 @@ CLUSTERS = 8
 
 
 class Setting(NamedTuple):
-    """What is run, for how many ticks."""
+    """A scenario, the number of its ticks, and its target."""
 
     name: str
     scenario: Scenario
@@ -46,11 +46,11 @@ class Setting(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """One run."""
+    """The cost of one run."""
 
     steps_per_s: float
     """Robot-steps in a CPU second."""
-    heard: float
+    deliveries: float
     """Messages that reached a robot in a step, on average."""
 
 
@@ -71,7 +71,7 @@ def measure(*, quick: bool) -> Table:
                 setting.name,
                 f"{setting.scenario.robots.count}",
                 f"{setting.ticks}",
-                f"{recorded[0].heard:.1f}",
+                f"{recorded[0].deliveries:.1f}",
                 f"{fast:,.0f}",
                 f"{slow:,.0f}",
                 f"{1e6 / fast:.0f}",
@@ -87,7 +87,7 @@ def measure(*, quick: bool) -> Table:
             "scenario",
             "robots",
             "ticks",
-            "heard",
+            "deliveries",
             "bare",
             "recorded",
             "bare, us/step",
@@ -96,7 +96,7 @@ def measure(*, quick: bool) -> Table:
             "",
         ),
         rows,
-        ("heard: deliveries per robot and tick, the supervisor's included",),
+        ("deliveries: per robot and tick, the supervisor's included",),
         met,
     )
 

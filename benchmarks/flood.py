@@ -1,13 +1,13 @@
-"""What a robot that floods the bus costs the others, in one mission with and without it.
+"""Cost of a robot that floods the bus for the other robots, with and without the flood in one mission.
 
     python benchmarks/flood.py [--quick] [--beside]
 
-A mission on the wall with five robots over the real bus. Four are honest; the fifth has got ready with its own
-credentials and is hostile. Windows with and without its flood follow each other, so that both see the same
-machine. A *tick* is from a robot's first word of a step to the world's acceptance of it in its hands.
+A realtime mission with five robots on the real bus. Four are honest; the fifth has joined with its own
+credentials and is hostile. Windows with and without its flood alternate, so that both see the same machine. A
+*tick* is the time from a robot's first report of a step until it has received world-sim's acceptance of it.
 
 A robot would be another machine: its own use of a core is not what is measured. The flooder therefore has a core
-to itself and everybody else shares the others; `--beside` lets it compete for all of them. Exits with 1 if a
+to itself and all other processes share the rest; `--beside` lets it compete for all of them. Exits with 1 if a
 flood at least doubles the p99 of ticks, or memory grows.
 """
 
@@ -65,15 +65,15 @@ SMALL, LARGE = bytes(100), bytes(MIB)
 
 
 class Flood(NamedTuple):
-    """What the flooder does."""
+    """The messages of the flooder."""
 
     name: str
     on: tuple[str, ...]
     """Kinds of keys."""
     payload: bytes | None
-    """None: sound reports of a step that was done long ago."""
+    """Bytes of a message; None: valid reports of a step that was reported long ago."""
     per_s: float
-    """inf: as fast as they go."""
+    """Messages a second; inf: as fast as possible."""
 
 
 FLOODS = (
@@ -97,7 +97,7 @@ class Window(NamedTuple):
 
 
 class Use(NamedTuple):
-    """World-sim's, at a moment."""
+    """Resources that world-sim has used up to a moment."""
 
     at_s: float
     cpu_s: float
@@ -105,25 +105,25 @@ class Use(NamedTuple):
 
 
 class Timed(ParticipantSession):
-    """A robot's line that times its steps."""
+    """A robot's session that measures the time of its steps."""
 
     ticks: list[tuple[float, float]]
-    """When each was said first, and how long its acceptance took, in seconds."""
+    """For each step, the time of its first report and the time until its acceptance, in seconds."""
 
     def __init__(self, *arguments: object) -> None:
         super().__init__(*arguments)  # type: ignore[arg-type]
         type(self).ticks = []
         self._step, self._said_s = 0, 0.0
 
-    def send(self, payload: bytes, *, patiently: bool) -> None:
-        """Note when a step is said for the first time."""
+    def send(self, payload: bytes, *, blocking: bool) -> None:
+        """Note the time of the first report of a step."""
         message = _FROM.decode(payload)
         if isinstance(message, Report) and message.outputs.step > self._step:
             self._step, self._said_s = message.outputs.step, time.monotonic()
-        super().send(payload, patiently=patiently)
+        super().send(payload, blocking=blocking)
 
     def next(self, timeout_s: float | None) -> bytes | None:
-        """Note when it is heard to be accepted."""
+        """Note the time at which its acceptance is received."""
         payload = super().next(timeout_s)
         if payload is not None and self._said_s:
             message: ToParticipant = decode_to_participant(payload)
@@ -208,7 +208,7 @@ def _load(uses: list[Use], windows: list[Window]) -> float:
 def _mission(
     flood: Flood, rounds: int, *, beside: bool
 ) -> tuple[list[tuple[float, float]], list[Window], list[Use]]:
-    """Ticks of the honest, windows (calm and rough in turn), and what world-sim used."""
+    """Ticks of the honest robots, windows (without and with flood in turn), and resources of world-sim."""
     cores = sorted(os.sched_getaffinity(0))
     ours, theirs = (cores, cores) if beside else (cores[:-1] or cores, cores[-1:])
     context = multiprocessing.get_context("spawn")
@@ -246,7 +246,7 @@ def _await(done: Callable[[], bool]) -> None:
     give_up = time.monotonic() + START_S
     while not done():
         if time.monotonic() > give_up:
-            raise RuntimeError("world-sim does not come up")
+            raise RuntimeError("world-sim did not start")
         time.sleep(0.02)
 
 
@@ -258,7 +258,7 @@ def _use(pid: int) -> Use:
 
 
 def _be_world(cores: list[int], listen: str, secrets: Path, out: Path) -> None:
-    from kantor_fleet.processes.standalone import host_standalone  # noqa: PLC0415  the others need none of it
+    from kantor_fleet.processes.standalone import host_standalone  # noqa: PLC0415  robots do without it
     from kantor_fleet.scenarios.catalog import find  # noqa: PLC0415
 
     os.sched_setaffinity(0, cores)
@@ -288,7 +288,7 @@ def _be_flooder(
     identity = credentials.find(secrets, FLOODER)
     with participant_session(connect, identity, "flood", START_S) as line:
         mission = _await_message(line, Mission)
-        line.send(encode(Ready(VERSION, "flood")), patiently=True)
+        line.send(encode(Ready(VERSION, "flood")), blocking=True)
         _await_message(line, StepRequest, Ready(VERSION, "flood"))
         time.sleep(2.0)
         assert isinstance(mission, Mission)
@@ -317,7 +317,7 @@ def _be_flooder(
 
 
 class Tokens:
-    """Comes and goes."""
+    """Joins and leaves repeatedly."""
 
     def __init__(self, line: ParticipantSession, key: str) -> None:
         self._liveliness = line._session.liveliness()
@@ -325,7 +325,7 @@ class Tokens:
         self._held: list[Any] = []
 
     def __call__(self) -> None:
-        """Comes, or goes."""
+        """Joins or leaves."""
         if self._held:
             self._held.pop().undeclare()
         else:

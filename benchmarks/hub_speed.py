@@ -1,11 +1,11 @@
-"""What one hub carries: robots times rate that world-sim relays on the wall, and what that costs it.
+"""Capacity of one hub: robots times rate that world-sim relays in realtime, and its cost.
 
-World-sim is the real one in a process of its own: router, access control, doorway, relay, radio, referees,
+World-sim is the real one in a process of its own: router, access control, lobby, relay, radio, checkers,
 record on disk. Robots are real clients of its bus with the real planner; many of them share a process and one
 loop, so that the machine has time left for the hub. Their clocks differ by up to 5 % and jitter, as robots' do.
 
-`answer` is the time from a robot's report until it has the world's answer, at the robot. A robot that has none
-when its next step is due holds, so a rate is carried if 99 in 100 answers take less than a period.
+`answer` is the time from a robot's report until the robot has received world-sim's answer. A robot without it
+holds when its next step is due, so a rate is carried if 99 in 100 answers take less than a period.
 """
 
 import gc
@@ -65,12 +65,12 @@ RATES_HZ = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0)
 SITE_MAX = 100
 """Robots behind one site."""
 WARM_S, MEASURED_S = 1.0, 3.0
-"""Real seconds of a mission that are left out, and that count."""
+"""Real seconds of a mission that are left out, and that are measured."""
 START_S = 60.0
 ROBOTS_PER_PROCESS = 50
 FLEET = "hub"
 PERIOD_S = 0.1
-"""Of the scenario. Other rates are the same mission at another speed."""
+"""Period of the scenario. Other rates are the same mission at another speed."""
 DEGREE = 5.0
 """Robots in range of one, on average, where they start."""
 SIDE_M, CLUSTERS = 8000.0, 8
@@ -87,27 +87,27 @@ class Load(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """What the hub spent on one mission."""
+    """Cost of one mission for the hub."""
 
     steps: int
-    """Robot-ticks that it took in."""
+    """Robot-ticks that it settled."""
     cpu_s: float
-    """Of the whole process, Zenoh's threads included."""
+    """CPU time of the whole process, Zenoh's threads included."""
     main_s: float
-    """Of the thread that relays."""
+    """CPU time of the thread that relays."""
     real_s: float
 
 
 class Pace(NamedTuple):
-    """What robots saw of one mission."""
+    """Measures of one mission at the robots."""
 
     cost: Cost
     answers_s: list[float]
-    """From a report to its answer."""
+    """Times from a report to its answer."""
     held: int
-    """Steps that were due and could not be made, since the world's answer was not there."""
+    """Steps that were due and were held, since world-sim's answer had not arrived."""
     site_cpu_s: float | None = None
-    """Of a site's router, from its start to its end."""
+    """CPU time of a site's router, from its start to its end."""
 
     @property
     def p99_s(self) -> float:
@@ -130,7 +130,7 @@ class Pace(NamedTuple):
 
 
 def measure(*, quick: bool) -> Table:
-    """For each number of robots the highest rate that is carried, and what a robot-tick costs there."""
+    """For each number of robots the highest rate that is carried, and the cost of a robot-tick there."""
     await_fork_server()
     rows = []
     for link in LINKS:
@@ -157,12 +157,12 @@ def measure(*, quick: bool) -> Table:
                 )
             )
     return Table(
-        "hub: robots times rate that one world-sim carries on the wall",
+        "hub: robots times rate that one world-sim carries in realtime",
         (
             "link",
             "robots",
             "highest rate, Hz",
-            "asked, robot-ticks/s",
+            "requested, robot-ticks/s",
             "done/s",
             "answer p50, ms",
             "p99, ms",
@@ -224,7 +224,7 @@ def _mission(load: Load) -> Pace:
         cost = _told(hub_pipe, load)
         parts = []
         for pipe in robots:
-            pipe.send(None)  # whoever has lost the last word from the hub ends as well
+            pipe.send(None)  # robots that missed the end of the mission end as well
             parts.append(_told(pipe, load))
         answers_s = [answer for part, _ in parts for answer in part]
         pace = Pace(cost, answers_s, sum(held for _, held in parts))
@@ -242,7 +242,7 @@ def batched(names: Sequence[str], size: int) -> Iterator[Sequence[str]]:
 
 def _told(pipe: Connection, load: Load) -> Any:
     if not pipe.poll(START_S + WARM_S + MEASURED_S):
-        raise RuntimeError(f"{load}: it does not come to an end")
+        raise RuntimeError(f"{load}: the mission did not end")
     return pipe.recv()
 
 
@@ -258,12 +258,12 @@ def _start(stack: ExitStack, target: Callable[..., None], *arguments: object) ->
 
 
 def _endpoint(load: Load) -> str:
-    """A loopback endpoint that nobody uses now."""
+    """A free loopback endpoint."""
     return free_endpoint("tcp" if load.link == "tcp" else "tls")
 
 
 def _issue(load: Load, place: Path) -> None:
-    """Identities for everybody."""
+    """Identities for all processes."""
     names = _scenario(load).robot_ids
     if load.link == "tcp":
         credentials.issue(place, FLEET, names)
@@ -317,14 +317,14 @@ def _be_hub(load: Load, endpoint: str, place: Path, pipe: Connection) -> None:
 
 
 class _Meter:
-    """What the hub has spent between the end of the warm-up and its last word to observers."""
+    """Resources of the hub between the end of the warm-up and its last progress message."""
 
     def __init__(self, steps: Callable[[], int]) -> None:
         self._steps = steps
         self._seen: list[Cost] = []
 
     def look(self, progress: object) -> None:
-        """Whenever observers are told."""
+        """Take a sample with each progress message."""
         if getattr(progress, "phase", "") == "running":
             reading = Cost(self._steps(), time.process_time(), time.thread_time(), time.monotonic())
             if not self._seen or reading.real_s > self._seen[0].real_s + WARM_S:
@@ -332,7 +332,7 @@ class _Meter:
 
     @property
     def cost(self) -> Cost:
-        """Between the first and the last look that count; a machine that is too busy has fewer."""
+        """The cost between the first and the last sample that are measured; a busy machine has fewer."""
         first, last = (self._seen[1:] or self._seen)[0], self._seen[-1]
         spent = Cost(*(b - a for a, b in zip(first, last, strict=True)))
         return spent._replace(steps=max(1, spent.steps), real_s=max(PERIOD_S, spent.real_s))
@@ -373,7 +373,7 @@ def _robot(name: str, endpoint: str, place: Path) -> "Iterator[_Robot]":
 
 
 class _Robot:
-    """A participant on the wall in a loop that it shares; without a diary on disk."""
+    """A realtime participant in a loop that it shares; without a write-ahead log on disk."""
 
     def __init__(self, line: ParticipantSession, name: str) -> None:
         self._line, self._name = line, name
@@ -387,7 +387,7 @@ class _Robot:
         self.over = False
 
     def step_record(self) -> bool:
-        """Take what has come, and step if that is due; whether there was anything to do."""
+        """Handle messages, and step if that is due; whether there was anything to do."""
         busy = False
         while (payload := self._line.next(0.0)) is not None:
             self._handle(decode_to_participant(payload))
@@ -420,7 +420,7 @@ class _Robot:
 
         self._life = RecoverableNode(build, InMemoryLog(), mission.body or Body(pose))
         self._clock = step_clocks(scenario, mission.seed)[self._name]
-        self._line.send(encode(Ready(VERSION, self._line.nonce)), patiently=True)
+        self._line.send(encode(Ready(VERSION, self._line.nonce)), blocking=True)
 
     def _start(self, go: StartClock) -> None:
         assert go.observation is not None
@@ -447,10 +447,10 @@ class _Robot:
         inputs = Inputs(now_ns, self._observation, tuple(self._inbox))
         self._inbox.clear()
         outputs = life.step(inputs)
-        heard = tuple((envelope.source, envelope.sequence) for envelope in inputs.inbox)
+        received = tuple((envelope.source, envelope.sequence) for envelope in inputs.inbox)
         self._report = encode(
             Report(
-                VERSION, self._line.nonce, outputs, inputs.now_ns, heard, inputs.observation.step
+                VERSION, self._line.nonce, outputs, inputs.now_ns, received, inputs.observation.step
             )
         )
         self._said_s, self._waits = time.monotonic(), True
@@ -463,4 +463,4 @@ class _Robot:
 
     def _say(self) -> None:
         self._again_s = time.monotonic()
-        self._line.send(self._report, patiently=False)
+        self._line.send(self._report, blocking=False)

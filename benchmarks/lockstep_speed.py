@@ -34,13 +34,13 @@ COUNTS_QUICK = (5, 20)
 PAYLOAD = bytes(64)
 BLOCK = zenoh.CongestionControl.BLOCK
 START_S = 90.0
-"""Within which everybody must be there."""
+"""Time within which all processes must have joined."""
 MISSION_S = 120.0
-"""After which a mission that has not ended is an error."""
+"""Time after which a mission that has not ended is an error."""
 
 
 class Pace(NamedTuple):
-    """What was reached."""
+    """The speed of a mission or of the barrier."""
 
     rounds_per_s: float
     rounds: int
@@ -85,7 +85,7 @@ def measure(*, quick: bool) -> Table:
         ),
         rows,
         (
-            "kantor with access control, record on disk, metrics and checker; robots hear whom they meet",
+            "kantor with access control, record on disk, metrics and checker; robots hear those in range",
         ),
     )
 
@@ -105,12 +105,12 @@ def _scenario(count: int) -> Scenario:
 
 
 def _mission(count: int, seconds: float) -> Pace:
-    """Ticks a second of a mission under way, from what it tells observers."""
+    """Ticks a second of a mission under way, from its progress messages."""
     scenario = _scenario(count)
     marks: list[tuple[float, int]] = []
     with tempfile.TemporaryDirectory(prefix="kantor-speed-") as folder:
-        order = FleetConfig(scenario, 0, "lockstep", 1.0, Path(folder))
-        with local_fleet(order) as fleet:
+        config = FleetConfig(scenario, 0, "lockstep", 1.0, Path(folder))
+        with local_fleet(config) as fleet:
             give_up = time.monotonic() + MISSION_S
             for progress in watch_progress(fleet):
                 now = time.monotonic()
@@ -173,7 +173,7 @@ def _be_hub(endpoint: str, count: int, seconds: float, send: Connection) -> None
         rounds += 1
     elapsed_s = time.monotonic() - start
     send.send_bytes(json.dumps((rounds / elapsed_s, rounds)).encode())
-    time.sleep(START_S)  # until it is ended; a router that goes lets its clients complain
+    time.sleep(START_S)  # until it is ended: clients log errors when a router closes
 
 
 def _be_client(endpoint: str, number: int) -> None:
@@ -185,7 +185,7 @@ def _be_client(endpoint: str, number: int) -> None:
 
     session = _patient_open(_config("client", endpoint))
     _subscriber = session.declare_subscriber(f"bench/{number}/rx/turn", on_turn)
-    # Again and again, since the hub may listen a moment after it lets clients in.
+    # Repeated, since the hub may subscribe a moment after clients can connect.
     while turns.empty():
         session.put(f"bench/{number}/here", PAYLOAD)
         time.sleep(0.1)

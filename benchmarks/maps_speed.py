@@ -1,4 +1,4 @@
-"""What missions on an unknown map cost: CPU time with every referee, and what robots tell of the map.
+"""Cost of missions on an unknown map: CPU time with every checker, and bytes that robots publish of the map.
 
 The office at 0.2 m, three robots that hear each other within 12 m, or a supervisor that hears all; and eight
 robots in a field of obstacles. Runs are in process and exactly repeatable but for the time; over the bus
@@ -19,18 +19,18 @@ from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.world.world import WorldSetup
 
 BYTES_MAX = 60.0
-"""Of maps, per robot and tick on average, at 0.2 m."""
+"""Bytes of maps per robot and tick, on average, at 0.2 m."""
 _EIGHT = ("robots.count=8", "coordination=centralized")
 
 
 class Cost(NamedTuple):
-    """One run."""
+    """The cost of one run."""
 
     steps_per_s: float
     """Robot-steps in a CPU second."""
     cpu_s: float
     map_bytes: float
-    """Per robot and tick."""
+    """Bytes per robot and tick."""
     cells: int
 
 

@@ -1,8 +1,8 @@
 """Robot-steps that one CPU second buys in other simulators of many robots, in the same run.
 
-They do less in a step, so this is a scale and no race: ir-sim moves bodies (differential drive, no lidar,
+They do less in a step, so this gives a scale and no ranking: ir-sim moves bodies (differential drive, no lidar,
 no radio); coverage-control senses an importance field and computes Voronoi coverage, decentralized, in
-C++. kantor plans, merges, passes every message through the codec, and records with every referee on.
+C++. kantor plans, merges, passes every message through the codec, and records with every checker on.
 
     pip install --group peers
 """
@@ -44,12 +44,12 @@ def measure(*, quick: bool) -> Table:
     for name, (package, does, _) in PEERS.items():
         for robots in ROBOTS:
             try:
-                told = f"{package} {version(package)}"
+                label = f"{package} {version(package)}"
             except PackageNotFoundError:
                 rows.append((package, does, f"{robots}", "not installed"))
                 continue
             speeds = [_in_a_process(name, robots, budget_s) for _ in range(repeats)]
-            rows.append((told, does, f"{robots}", f"{statistics.median(speeds):,.0f}"))
+            rows.append((label, does, f"{robots}", f"{statistics.median(speeds):,.0f}"))
     return Table(
         "peers: robot-steps per CPU second of other simulators",
         ("simulator", "a step is", "robots", "robot-steps/s"),
@@ -104,7 +104,7 @@ PEERS = {
 
 
 def _in_a_process(name: str, robots: int, budget_s: float) -> float:
-    """Measured by this file, run anew: nobody inherits another's threads or caches."""
+    """The speed that this file measures in a new process, without threads or caches of another."""
     done = subprocess.run(
         [sys.executable, __file__, name, str(robots), str(budget_s)],
         capture_output=True,

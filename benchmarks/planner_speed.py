@@ -1,12 +1,11 @@
 """CPU time of one planner step: choose, order, move, consume.
 
-What an `Agent` does in a step of Algorithm 1 with what it has learnt: the goal through its belief, a
-step of the first-order vehicle, one point shipped by Proposition 1 and logged. The robot flies a real
-mission on section VI-A's density with M = 2.5 N.
+The work of a robot in a step of Algorithm 1: the goal by its belief, a step of the first-order
+vehicle, one point shipped by Proposition 1 and logged. The robot runs a real mission on section VI-A's density with M = 2.5 N.
 
-Beside it, from the same state, the paper's algorithm taken to the letter with numpy: distances to all
+It is compared, from the same state, with the literal algorithm of the paper in numpy: distances to all
 samples that have weight, the h nearest, all h! orders, and the linear program by repeated search for
-the nearest. Both must come to the same goals.
+the nearest. Both must choose the same goals.
 """
 
 import itertools
@@ -34,9 +33,9 @@ SIZES = (2_000, 20_000, 200_000, 1_000_000)
 SIZES_QUICK = (2_000, 200_000)
 TARGETS_US = {2_000: 5.0, 20_000: 8.0, 200_000: 8.0, 1_000_000: 8.0}
 FLAT_MAX = 2.0
-"""The dearest cell of the table may cost so many times the cheapest."""
+"""The most expensive cell of the table may cost so many times the cheapest."""
 PHASES = (0.0, 0.5, 0.9)
-"""Shares of the mission flown when measuring begins."""
+"""Shares of the mission done when measuring begins."""
 CHUNK = 50
 """Steps between two readings of the clock."""
 CHUNKS = 80
@@ -84,7 +83,7 @@ class Literal:
 
 
 class Mission:
-    """One robot that flies by what an `Agent` does between its messages."""
+    """A mission of one robot by the work that a robot does between its messages."""
 
     def __init__(self, scenario: Scenario, samples_m: npt.NDArray[np.float64]) -> None:
         """samples_m: (N, 2) world frame."""
@@ -100,7 +99,7 @@ class Mission:
         self._period_ns = scenario.period_ns
         self._now_ns = 0
 
-    def fly(self, steps: int) -> None:
+    def advance(self, steps: int) -> None:
         """Planner steps without messages."""
         belief, replica, pose, now_ns = self.belief, self.replica, self.pose, self._now_ns
         choose, drive, dt_s = self.planner.choose, self._vehicle.drive, self._dt_s
@@ -124,7 +123,7 @@ class Beside(NamedTuple):
 
 
 def measure(*, quick: bool) -> Table:
-    """CPU microseconds per step by N and by how much of the mission is flown."""
+    """CPU microseconds per step by N and by the share of the mission that is done."""
     rows, costs, met = [], [], True
     for count in SIZES_QUICK if quick else SIZES:
         scenario = _scenario(count, claims=False)
@@ -183,29 +182,29 @@ def _scenario(count: int, *, claims: bool) -> Scenario:
 def _phases(
     scenario: Scenario, samples_m: npt.NDArray[np.float64], phases: tuple[float, ...] = PHASES
 ) -> list[float]:
-    """The median over chunks in each phase; a short mission is flown several times."""
+    """The median over chunks in each phase; a short mission is run several times."""
     chunks: list[list[float]] = [[] for _ in phases]
     each = min(CHUNKS, scenario.energy.points // 20 // CHUNK)
     warm = Mission(scenario, samples_m)
-    warm.fly(CHUNK)
+    warm.advance(CHUNK)
     while len(chunks[0]) < CHUNKS:
-        mission, flown = Mission(scenario, samples_m), 0
+        mission, done = Mission(scenario, samples_m), 0
         for phase, costs in zip(phases, chunks, strict=True):
             begin = round(phase * scenario.energy.points)
-            mission.fly(begin - flown)
+            mission.advance(begin - done)
             costs += [_cpu_us(mission) for _ in range(each)]
-            flown = begin + each * CHUNK
+            done = begin + each * CHUNK
     return [statistics.median(costs) for costs in chunks]
 
 
 def _cpu_us(mission: Mission) -> float:
     start_ns = time.process_time_ns()
-    mission.fly(CHUNK)
+    mission.advance(CHUNK)
     return (time.process_time_ns() - start_ns) / CHUNK / 1e3
 
 
 def _beside(scenario: Scenario, samples_m: npt.NDArray[np.float64]) -> Beside:
-    """The literal algorithm's first steps against ours."""
+    """The literal algorithm's first steps compared with kantor's."""
     steps = 100 if samples_m.shape[0] <= 20_000 else 5
     mission = Mission(scenario, samples_m)
     literal = Literal(samples_m, mission.belief.weights)
@@ -217,5 +216,5 @@ def _beside(scenario: Scenario, samples_m: npt.NDArray[np.float64]) -> Beside:
         goal, pose = literal.step(pose, scenario.planner.horizon, stride_m, mission.units.point)
         costs.append((time.process_time_ns() - start_ns) / 1e3)
         same += ours is not None and goal == ours.sample
-        mission.fly(1)
+        mission.advance(1)
     return Beside(statistics.median(costs), steps, same)

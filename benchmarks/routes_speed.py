@@ -1,4 +1,4 @@
-"""CPU time of the value function over a whole map, beside two that do the same.
+"""CPU time of the value function over a whole map, compared with two libraries.
 
 Maps of which a fifth is wall, from one corner: an office, and single walls scattered over open floor.
 The others are scikit-image's MCP_Geometric, of which only find_costs counts, and scipy's Dijkstra, to
@@ -25,12 +25,12 @@ from kantor_agent.mapping.routes import Routes, length_cost, smoothed_cost
 SIZES = ((100, 135), (200, 270), (1000, 1000))
 WALLS = 0.2
 ROOM = 20
-"""Of the office, in cells: from wall to wall."""
+"""Size of a room of the office, in cells, from wall to wall."""
 WALL, DOOR = 3, 4
 REPEATS = 7
 REPEATS_QUICK = 3
 FASTER = 1.5
-"""Than either of the others, on the largest map."""
+"""Required ratio to either of the others, on the largest map."""
 
 Map = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]

@@ -1,15 +1,15 @@
-"""How fast kantor is, measured in one go, as CPU time and as ratios to what was run beside it.
+"""Speed of kantor: CPU times, and ratios to references measured in the same run.
 
     python benchmarks/run.py [--quick] [--only SECTION] [--save FILE]
 
-planner   CPU time of one planner step, beside the paper's algorithm taken to the letter in numpy
-spectral  the same of multiscale coverage by its modes, and what its registers cost
+planner   CPU time of one planner step, beside the literal algorithm of the paper in numpy
+spectral  the same for multiscale coverage, by its modes, and the cost of its registers
 routes    CPU time of the value function over a map, beside two other libraries
 fleet     robot-steps that one CPU second buys when the whole fleet is in one process
-maps      what missions on an unknown map cost, and what robots tell of the map
+maps      cost of missions on an unknown map, and bytes that robots publish of it
 peers     the speed of other simulators, if they are installed
 lockstep  ticks a second with a process for every robot, beside a bare Zenoh barrier
-hub       robots times rate that one world-sim relays on the wall
+hub       robots times rate that one world-sim relays in realtime
 wire      bytes that a robot publishes in a tick, beside its whole weight vector
 
 Exits with 1 if a target is missed. Nothing is written unless --save names a file.
@@ -42,7 +42,7 @@ def main() -> int:
     print(", ".join(f"{key} {value}" for key, value in machine.items()))
     tables: dict[str, Table] = {}
     for name in (options.only,) if options.only else SECTIONS:
-        # A section imports what it measures; the others' children need none of it.
+        # Each section imports only what it measures; child processes of others do without it.
         tables[name] = import_module(f"{name}_speed").measure(quick=options.quick)
         show(tables[name])
     if options.save is not None:
@@ -53,7 +53,7 @@ def main() -> int:
 
 
 def _machine() -> dict[str, Any]:
-    """What the figures depend on."""
+    """The machine and the versions on which the figures depend."""
     return {
         "cores": len(os.sched_getaffinity(0)),
         "load": round(os.getloadavg()[0], 1),

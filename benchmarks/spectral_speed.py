@@ -1,7 +1,7 @@
-"""CPU time of one step of multiscale coverage by its modes, beside a step of optimal transport.
+"""CPU time of one step of multiscale coverage by its modes, compared with a step of optimal transport.
 
-The robot flies section VI-A's density alone. Its register, of 1,000 visits, is then written into a
-message, checked at the door, and taken in; a robot does so once for each register that it hears.
+The robot explores section VI-A's density alone. Its register, of 1,000 visits, is then written into a
+message, checked on arrival, and taken in; a robot does so once for each register that it receives.
 """
 
 import statistics
@@ -24,12 +24,12 @@ CHUNK = 50
 """Steps between two readings of the clock."""
 CHUNKS = 80
 VISITS = 1_000
-DEAREST_US = 25.0
-"""What a step with the paper's most modes may cost."""
+LIMIT_US = 25.0
+"""Bound on the cost of a step with the largest number of modes in the paper."""
 
 
-class Word(NamedTuple):
-    """What a register costs."""
+class RegisterCost(NamedTuple):
+    """The cost of a register."""
 
     compose_us: float
     sound_us: float
@@ -47,7 +47,7 @@ def measure(*, quick: bool) -> Table:
         scenario = find("paper-single", ("planner=spectral", f"planner.modes={modes}"))
         spectral_us, whole_us = _costs(scenario)
         word = _word(scenario)
-        reached = whole_us <= DEAREST_US
+        reached = whole_us <= LIMIT_US
         met = met and reached
         rows.append(
             (
@@ -69,7 +69,7 @@ def measure(*, quick: bool) -> Table:
             "choose",
             "choose, move, consume",
             "ratio",
-            f"<= {DEAREST_US:g}",
+            f"<= {LIMIT_US:g}",
             "code",
             "check",
             "take in",
@@ -94,20 +94,20 @@ def _costs(scenario: Scenario) -> tuple[float, float]:
 
     plan_us = _median_us(plan)
     mission = Mission(scenario, samples_m)
-    return plan_us, _median_us(lambda: mission.fly(CHUNK))
+    return plan_us, _median_us(lambda: mission.advance(CHUNK))
 
 
-def _word(scenario: Scenario) -> Word:
-    """A register of so many visits, from one that hears another."""
+def _word(scenario: Scenario) -> RegisterCost:
+    """The cost of a register of so many visits, at a robot that receives it from another."""
     mission = Mission(scenario, samples_of(scenario, 0))
-    mission.fly(VISITS)
+    mission.advance(VISITS)
     amounts = mission.belief.registers.total
     width = scenario.register_width
     one, two = Registers(0, 2, width, beacon=True), Registers(1, 2, width)
     one.add(amounts)
-    said = one.compose()
+    composed = one.compose()
     stamps = bytes([0, 0])
-    newer = [stamps + bytes([0, stamp]) + said[4:] for stamp in range(1, CHUNK + 1)]
+    newer = [stamps + bytes([0, stamp]) + composed[4:] for stamp in range(1, CHUNK + 1)]
 
     def take_in() -> None:
         two.stamps[:] = 0
@@ -120,10 +120,10 @@ def _word(scenario: Scenario) -> Word:
 
     def check() -> None:
         for _ in range(CHUNK):
-            two.is_well_formed(said, 2)
+            two.is_well_formed(composed, 2)
 
     assert all(two.is_well_formed(word, 2) for word in newer)
-    return Word(_median_us(compose), _median_us(check), _median_us(take_in), len(said))
+    return RegisterCost(_median_us(compose), _median_us(check), _median_us(take_in), len(composed))
 
 
 def _median_us(work: Callable[[], None]) -> float:

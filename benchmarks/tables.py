@@ -1,4 +1,4 @@
-"""What a section of the benchmark hands over, and how it is printed."""
+"""The table of a section of the benchmark, and its printing."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -28,12 +28,12 @@ def show(table: Table) -> None:
 
 
 def verdict(*, met: bool) -> str:
-    """A target's outcome in a word."""
+    """The outcome of a target in one word."""
     return "ok" if met else "MISS"
 
 
 def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
-    """The first column to the left, numbers to the right."""
+    """A line with its first column aligned to the left and numbers to the right."""
     first, *rest = (
         cell.rjust(width) if i else cell.ljust(width)
         for i, (cell, width) in enumerate(zip(line, widths, strict=True))

@@ -1,6 +1,6 @@
 """Bytes that a robot publishes in a tick, beside its whole weight vector as float64.
 
-The paper's robots exchange their vectors; kantor's publish what changed. Runs are in process and
+The paper's robots exchange their vectors; kantor's publish changes. Runs are in process and
 exactly repeatable; over the bus the bytes are the same.
 """
 

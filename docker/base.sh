@@ -12,7 +12,7 @@ mark=kantor.stand-in
 
 if [ "${1:-}" != --force ] && docker image inspect "$base" >/dev/null 2>&1; then
     if [ "$(docker image inspect --format "{{index .Config.Labels \"$mark\"}}" "$base")" = yes ]; then
-        echo "$base: the stand-in is there already; --force makes it anew"
+        echo "$base: the stand-in is there already; --force makes it again"
         exit 0
     fi
     echo "base.sh: $base is a real image, use it as it is; --force puts the stand-in in its place" >&2

@@ -4,7 +4,7 @@
 #   docker/build.sh [--tag kantor] [further arguments of docker build, such as --build-arg BASE=...]
 #
 # PYTHON names a Python of the version that the base image has, 3.11. Beside compose.yaml it leaves runs/ and .env, which
-# says who runs the containers: the user, whose are the identities and the runs, and never root.
+# names the user of the containers: the owner of the identities and the runs, and never root.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-python3}

@@ -15,7 +15,7 @@ dependencies)
 kantor)
     PIP_CONSTRAINT=constraints.txt pip install --quiet --no-compile --no-deps .
     cd /opt/kantor/lib/python3*/site-packages
-    # Without those that only PDF output and tables of sweeps want.
+    # Without modules that only PDF output and tables of sweeps need.
     /opt/kantor/bin/python -m compileall -q -j 0 --invalidation-mode unchecked-hash -x '/(fontTools|pygments|scipy/(io|signal|stats))/' .
     /opt/kantor/bin/python -c 'from kantor_fleet.execution.preload import warm_up; warm_up()'
     ;;

@@ -1,10 +1,10 @@
 # ruff: noqa: INP001
-"""Inside the first stage of the image: leaves out of installed packages what no kantor command opens.
+"""Removes files of installed packages that no kantor command opens; run in the first stage of the image.
 
     lighten.py SITE-PACKAGES
 
-Tests, sources and headers of compiled parts, stubs, and what a loader does not read of shared libraries: symbols,
-debugging information, section headers. (binutils, which has `strip`, is in no slim base.)
+It removes tests, sources and headers of compiled parts, stubs, and the parts of shared libraries that a loader does
+not read: symbols, debugging information, section headers. (binutils, which has `strip`, is in no slim base.)
 """
 
 import os
@@ -31,7 +31,7 @@ cryptography `_cffi_backend` alone, and numba imports cffi just because it is th
 
 
 def lighten(site: Path) -> None:
-    """Everything below a folder of packages."""
+    """Lighten all packages below a folder."""
     for pattern in _PLACES:
         for path in site.glob(pattern):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -47,7 +47,7 @@ def lighten(site: Path) -> None:
 
 
 def strip(path: Path) -> None:
-    """Cut a 64-bit ELF file off behind its last segment."""
+    """Cut off a 64-bit ELF file behind its last segment."""
     with path.open("r+b") as file:
         header = bytearray(file.read(64))
         if header[:6] != b"\x7fELF\x02\x01":  # 64 bits, little-endian

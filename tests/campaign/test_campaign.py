@@ -1,4 +1,4 @@
-"""Campaigns: fresh seeds hold; a broken one is found, told, replayed and made small."""
+"""Campaigns: fresh seeds hold; a violation is found, reported, replayed and shrunk."""
 
 import re
 from collections.abc import Iterable
@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from campaign.mutants import MUTANTS
+from kantor_agent.robots.density import DensityRobot
 from kantor_fleet.campaign import run as campaigns
 from kantor_fleet.campaign.draw import draw
 from kantor_fleet.campaign.fault_coverage import CLASSES
@@ -24,7 +25,7 @@ from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.run_folder import JOURNAL
 
 FRESH = 120
-"""Seeds that nobody has run before: those of today."""
+"""Seeds that no earlier run has had: those of today."""
 
 BUGS = {mutant.name: mutant for mutant in MUTANTS}
 
@@ -62,24 +63,24 @@ def test_a_campaign_goes_on_where_it_was_stopped(
 
     assert campaign(CampaignConfig(numbered("2:6"), tmp_path), noting) is Exit.DONE
     assert again == [4, 5]
-    told = capsys.readouterr().out
-    assert "2 missions are known" in told
-    assert re.search(r"\d+ robot-steps per CPU second", told)
-    assert all(name in told for name in (*CLASSES, *RARE_EVENTS))
+    printed = capsys.readouterr().out
+    assert "2 missions are known" in printed
+    assert re.search(r"\d+ robot-steps per CPU second", printed)
+    assert all(name in printed for name in (*CLASSES, *RARE_EVENTS))
 
 
-def test_a_violation_ends_it_with_all_that_is_needed(
+def test_a_violation_ends_a_campaign_with_all_that_repeats_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     BUGS["range-plus-five-percent"].plant(monkeypatch)
     monkeypatch.setattr(campaigns, "_SHRINK_S", 5.0)
     assert campaign(CampaignConfig(range(1000), tmp_path), here) is Exit.NOT_MET
-    told = capsys.readouterr().out
-    found = re.search(r"VIOLATION  seed (\d+)", told)
+    printed = capsys.readouterr().out
+    found = re.search(r"VIOLATION  seed (\d+)", printed)
     assert found
     seed = int(found[1])
-    assert f"kantor campaign --replay {seed}" in told
-    assert re.search(r"commit +\S+, sources [0-9a-f]{16}", told)
+    assert f"kantor campaign --replay {seed}" in printed
+    assert re.search(r"commit +\S+, sources [0-9a-f]{16}", printed)
     smallest = load(tmp_path / f"seed-{seed}" / "smallest.toml")
     assert smallest.robots.count <= draw(seed).robots.count
     assert len(smallest.faults) <= len(draw(seed).faults)
@@ -111,10 +112,26 @@ def test_a_crash_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> str:
         raise RuntimeError("no such day")
 
-    monkeypatch.setattr("kantor_fleet.campaign.mission.play", broken)
+    monkeypatch.setattr("kantor_fleet.campaign.mission.simulate", broken)
     trial = attempt(Case(draw(1), 1))
     assert trial.violation == "RuntimeError: no such day"
     assert trial.rule == "RuntimeError"
+
+
+def test_state_that_contradicts_itself_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The participants of a campaign validate themselves; hunts for planted bugs do without."""
+    seed = next(s for s in range(50) if not draw(s).mapping and not draw(s).faults)
+
+    def validate(_: DensityRobot) -> None:
+        raise AssertionError("more energy is spent than there was\n  details")
+
+    monkeypatch.setattr(DensityRobot, "validate", validate, raising=False)
+    trial = attempt(Case(draw(seed), seed))
+
+    assert trial.rule == "invariant"
+    assert trial.violation is not None
+    assert trial.violation.endswith("s: r1: more energy is spent than there was")
+    assert attempt(Case(draw(seed), seed), validate=False).violation is None
 
 
 def test_what_was_never_reached_fails_a_long_campaign(

@@ -1,4 +1,4 @@
-"""A seed stands for one scenario, which is always one that can be run."""
+"""A seed gives one scenario, which can always be run."""
 
 from collections import Counter
 from itertools import chain
@@ -18,7 +18,7 @@ MANY = 2000
 
 @given(seed=SEEDS)
 @examples(300)
-def test_every_seed_is_a_scenario_that_a_user_could_write(seed: int) -> None:
+def test_every_seed_gives_a_scenario_that_a_user_could_write(seed: int) -> None:
     scenario = draw(seed)
     assert from_tree(to_tree(scenario), "drawn") == scenario
     assert parse(to_toml(scenario), "written") == scenario
@@ -45,14 +45,14 @@ def test_the_second_phase_is_without_faults() -> None:
             assert (fault.until_ns or fault.from_ns) < 0.75 * scenario.limit_ns
 
 
-def test_the_same_seed_is_the_same_scenario() -> None:
+def test_the_same_seed_gives_the_same_scenario() -> None:
     assert [draw(seed) for seed in range(50)] == [draw(seed) for seed in range(50)]
     assert draw(1) != draw(2)
 
 
 @given(seed=SEEDS)
 @examples(100)
-def test_dice_stay_within_bounds(seed: int) -> None:
+def test_keyed_draws_stay_within_bounds(seed: int) -> None:
     draws = KeyedDraws(seed, 7)
     assert 2.0 <= draws.between(2.0, 3.0) <= 3.0
     assert 0.1 <= draws.scale(0.1, 10.0) <= 10.0

@@ -94,7 +94,7 @@ def test_every_member_gets_one_file(tmp_path: Path) -> None:
     assert identity(folder, "r1").members == {}
 
 
-def test_again_keeps_what_is_there_and_adds_what_is_missing(tmp_path: Path) -> None:
+def test_a_second_command_keeps_members_and_adds_missing_ones(tmp_path: Path) -> None:
     """Also what was handed out; world-sim's copy follows."""
     issue(tmp_path, Wanted("demo", 2), NOW)
     (tmp_path / "r1.toml").unlink()  # it is with its robot
@@ -114,27 +114,27 @@ def test_again_keeps_what_is_there_and_adds_what_is_missing(tmp_path: Path) -> N
     assert set(identity(tmp_path, "worldsim").members) == {"observer", "worldsim", "r1", "r2", "r3"}
 
 
-def test_renewed_and_revoked(tmp_path: Path) -> None:
-    """Renewed: the old one ceases to count. Revoked: it stays so until its name is renewed."""
+def test_renewal_and_revocation_invalidate_the_old_certificate(tmp_path: Path) -> None:
+    """Renewed: the old one becomes invalid. Revoked: it stays so until its name is renewed."""
     issue(tmp_path, Wanted("demo", 3), NOW)
     old = {name: identity(tmp_path, name).name for name in ("r1", "r2", "r3")}
 
     issue(tmp_path, Wanted("demo", renew=("r1",), revoke=("r2",)), NOW)
     router, team = identity(tmp_path, "worldsim"), ("r1", "r2", "r3")
-    assert router.objection(identity(tmp_path, "r1").name, team) == ""
-    assert "use the newest r1.toml" in router.objection(old["r1"], team)
-    assert "has been revoked" in router.objection(old["r2"], team)
-    assert router.objection(old["r3"], team) == ""
+    assert router.refusal_reason(identity(tmp_path, "r1").name, team) == ""
+    assert "use the newest r1.toml" in router.refusal_reason(old["r1"], team)
+    assert "has been revoked" in router.refusal_reason(old["r2"], team)
+    assert router.refusal_reason(old["r3"], team) == ""
 
     issue(tmp_path, Wanted("demo", 3), NOW)
-    assert "r2" not in identity(tmp_path, "worldsim").members
+    assert "r2" not in authority_in(tmp_path).members
     issue(tmp_path, Wanted("demo", renew=("r2",)), NOW)
     router = identity(tmp_path, "worldsim")
-    assert router.objection(identity(tmp_path, "r2").name, team) == ""
-    assert "has been revoked" in router.objection(old["r2"], team)
+    assert router.refusal_reason(identity(tmp_path, "r2").name, team) == ""
+    assert "has been revoked" in router.refusal_reason(old["r2"], team)
 
 
-def test_sites_carry_a_register_of_their_own(tmp_path: Path) -> None:
+def test_sites_carry_member_lists_of_their_own(tmp_path: Path) -> None:
     """Their robots and world-sim; it follows what becomes of these; each has names of its own."""
     issue(
         tmp_path,
@@ -158,7 +158,7 @@ def test_sites_carry_a_register_of_their_own(tmp_path: Path) -> None:
     (tmp_path / "site-south.toml").unlink()  # handed out
     lines = issue(tmp_path, Wanted("demo", revoke=("r2",)), NOW)
     assert set(identity(tmp_path, "site-north").members) == {"worldsim", "r1"}
-    assert identity(tmp_path, "worldsim").behind()["site-north"] == ("r1",)
+    assert identity(tmp_path, "worldsim").robots_by_site()["site-north"] == ("r1",)
     assert [line.partition(":")[0].rpartition("/")[2] for line in lines] == [
         "r2", "worldsim.toml", "site-north.toml",
     ]  # fmt: skip
@@ -201,9 +201,7 @@ def test_sites_carry_a_register_of_their_own(tmp_path: Path) -> None:
         (Wanted("other", 2), "the authority of fleet demo; choose another --out"),
     ],
 )
-def test_what_makes_no_sense_changes_nothing(
-    tmp_path: Path, wanted: Wanted, complaint: str
-) -> None:
+def test_a_refused_request_changes_nothing(tmp_path: Path, wanted: Wanted, complaint: str) -> None:
     issue(tmp_path, Wanted("demo", 2), NOW)
     issue(tmp_path, Wanted("demo", revoke=("r2",)), NOW)
     before = contents(tmp_path)
@@ -215,7 +213,7 @@ def test_what_makes_no_sense_changes_nothing(
     assert contents(tmp_path) == before
 
 
-def test_what_is_not_the_authoritys_is_left_alone(tmp_path: Path) -> None:
+def test_files_that_are_not_the_authoritys_are_left_alone(tmp_path: Path) -> None:
     """A folder of passwords, a damaged authority, a lost identity of world-sim."""
     credentials.issue(tmp_path / "passwords", "demo", ("r1",))
     issue(tmp_path / "damaged", Wanted("demo", 1), NOW)
@@ -244,7 +242,7 @@ def test_what_is_not_the_authoritys_is_left_alone(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wanted", [Wanted("demo", 3), Wanted("demo", 2, renew=("r1",), revoke=("r2",))]
 )
-def test_what_was_interrupted_is_made_good_by_running_it_again(
+def test_an_interrupted_request_is_completed_by_running_it_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wanted: Wanted
 ) -> None:
     """The disk is full at the n-th file: what there is is whole, and the next run ends where this would have."""
@@ -304,12 +302,12 @@ def test_what_was_interrupted_is_made_good_by_running_it_again(
     )
 )
 @examples(20)
-def test_the_register_counts_one_certificate_for_each(
-    tmp_path_factory: pytest.TempPathFactory, orders: list[Wanted]
+def test_the_member_list_has_one_valid_certificate_for_each(
+    tmp_path_factory: pytest.TempPathFactory, requests: list[Wanted]
 ) -> None:
-    """After any orders, refused ones too: files, register and routers' copies agree; nothing counts twice."""
+    """After any requests, refused ones too: files, member list and routers' copies agree; no member has two."""
     folder, ever = tmp_path_factory.mktemp("keys"), set()
-    for wanted in (Wanted("demo", 1), *orders):
+    for wanted in (Wanted("demo", 1), *requests):
         with suppress(CredentialsError):
             issue(folder, wanted, NOW)
         own = authority_in(folder)
@@ -323,7 +321,7 @@ def test_the_register_counts_one_certificate_for_each(
         assert all(
             identity(folder, user).name == member.name for user, member in own.members.items()
         )
-        counts = {name for name in ever if not router.objection(name, own.members)}
+        counts = {name for name in ever if not router.refusal_reason(name, own.members)}
         assert counts == {member.name for member in own.members.values()}
         placed = [name for there in own.sites.values() for name in there]
         assert len(set(placed)) == len(placed)
@@ -333,7 +331,7 @@ def test_the_register_counts_one_certificate_for_each(
                 assert set(identity(folder, site).members) == known
 
 
-def test_the_list_says_who_counts_and_until_when(kantor: "Kantor") -> None:
+def test_the_listing_has_members_and_expiry(kantor: "Kantor") -> None:
     assert kantor("keys", "demo", "--list").code == 2
     made = kantor("keys", "demo", "--robots", 2, "--days", 10)
     assert (made.code, made.err) == (0, "")

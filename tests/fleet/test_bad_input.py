@@ -21,7 +21,7 @@ def refused(kantor: "Kantor", *arguments: object) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(
-    ("override", "says"),
+    ("override", "message"),
     [
         ("radio.rang_m=3", "radio.rang_m: no such key; did you mean range_m?"),
         ("radio.range_m=wide", "radio.range_m: expected `float`, got `str`"),
@@ -40,13 +40,13 @@ def refused(kantor: "Kantor", *arguments: object) -> tuple[int, str]:
     ],
 )
 def test_a_bad_scenario_value_is_refused_by_name(
-    kantor: "Kantor", override: str, says: str
+    kantor: "Kantor", override: str, message: str
 ) -> None:
     """`--set` with a value that cannot be run exits with 2 and names the key."""
     code, line = refused(kantor, "run", "fleet", "--exchange", "in-process", "--set", override)
 
     assert code == 2
-    assert says in line
+    assert message in line
 
 
 NAV2 = """
@@ -69,7 +69,7 @@ def painted(folder: Path, name: str, shade: int, side: int = 60) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "says"),
+    ("overrides", "message"),
     [
         (("map={file='nowhere.yaml'}",), "nowhere.yaml: no such file"),
         (("map={file='lost.yaml'}",), "lost.png: no such file"),
@@ -87,7 +87,7 @@ def painted(folder: Path, name: str, shade: int, side: int = 60) -> None:
     ],
 )  # fmt: skip
 def test_a_map_that_cannot_be_explored_is_refused(
-    kantor: "Kantor", overrides: tuple[str, ...], says: str
+    kantor: "Kantor", overrides: tuple[str, ...], message: str
 ) -> None:
     """One line that names the key or the file, exit code 2, and no run folder."""
     (kantor.folder / "lost.yaml").write_text(NAV2.format(image="lost.png", free=0.196))
@@ -96,7 +96,7 @@ def test_a_map_that_cannot_be_explored_is_refused(
     code, line = refused(kantor, "run", "office", "--exchange", "in-process", "--set", *overrides)
 
     assert code == 2
-    assert says in line
+    assert message in line
 
 
 def test_a_map_whose_unknown_cells_become_free_is_warned_of(kantor: "Kantor") -> None:
@@ -141,7 +141,7 @@ def test_an_override_without_a_value_is_refused(kantor: "Kantor") -> None:
 
 
 @pytest.mark.parametrize(
-    ("flags", "says"),
+    ("flags", "message"),
     [
         (("--exact-every", "-1"), "--exact-every -1: give a number of periods"),
         (("--exact-every", "9", "--exchange", "realtime"), "not in realtime"),
@@ -150,13 +150,13 @@ def test_an_override_without_a_value_is_refused(kantor: "Kantor") -> None:
     ],
 )
 def test_an_exact_distance_out_of_reach_is_refused(
-    kantor: "Kantor", flags: tuple[str, ...], says: str
+    kantor: "Kantor", flags: tuple[str, ...], message: str
 ) -> None:
     """It takes seconds and memory, and a realtime mission does not wait."""
     code, line = refused(kantor, "run", "fleet", *flags)
 
     assert code == 2
-    assert says in line
+    assert message in line
 
 
 def test_an_unknown_scenario_is_refused_with_the_known_ones(kantor: "Kantor") -> None:
@@ -186,7 +186,7 @@ def test_a_scenario_that_is_no_toml_is_refused(kantor: "Kantor") -> None:
 
 
 @pytest.mark.parametrize(
-    ("points", "says"),
+    ("points", "message"),
     [
         (np.zeros((0, 2)), "no points in it"),
         (np.zeros((3, 4)), "give two columns"),
@@ -195,7 +195,7 @@ def test_a_scenario_that_is_no_toml_is_refused(kantor: "Kantor") -> None:
     ],
 )
 def test_a_useless_file_of_samples_is_refused(
-    kantor: "Kantor", points: np.ndarray, says: str
+    kantor: "Kantor", points: np.ndarray, message: str
 ) -> None:
     """Files are checked before anything is made; nothing in them is ever unpickled."""
     path = kantor.folder / "points.npy"
@@ -204,7 +204,7 @@ def test_a_useless_file_of_samples_is_refused(
     code, line = refused(kantor, "run", "fleet", "--set", f"samples.file={path}")
 
     assert code == 2
-    assert says in line
+    assert message in line
 
 
 def test_usage_errors_exit_with_two(kantor: "Kantor") -> None:
@@ -234,7 +234,7 @@ def test_a_folder_that_is_no_run_cannot_be_verified(kantor: "Kantor", tmp_path: 
 
 
 def test_where_nothing_listens_the_bus_is_unreachable(kantor: "Kantor") -> None:
-    """Exit code 4, with what to do, after the patience that was given."""
+    """Exit code 4, with what to do, after the time that `--patience` gives."""
     endpoint = "tcp/127.0.0.1:9"
     code, line = refused(kantor, "agent", "r1", "--connect", endpoint, "--patience", "0.2")
 
@@ -243,7 +243,7 @@ def test_where_nothing_listens_the_bus_is_unreachable(kantor: "Kantor") -> None:
 
 
 def test_an_endpoint_that_is_none_is_refused(kantor: "Kantor") -> None:
-    """The form of an endpoint is told."""
+    """The message shows the form of an endpoint."""
     code, line = refused(kantor, "agent", "r1", "--connect", "here")
 
     assert code == 4

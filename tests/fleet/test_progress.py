@@ -40,7 +40,7 @@ ON_A_MAP = msgspec.structs.replace(
 )
 
 
-class Watch:
+class ManualClock:
     """Real time as the test wants it."""
 
     def __init__(self) -> None:
@@ -54,10 +54,10 @@ class Log:
     """A view that writes where no terminal is."""
 
     def __init__(self) -> None:
-        self.watch = Watch()
+        self.clock = ManualClock()
         self._file = io.StringIO()
         console = Console(file=self._file, width=40, force_terminal=False)
-        self.view = ProgressView("fleet", console, self.watch)
+        self.view = ProgressView("fleet", console, self.clock)
 
     @property
     def lines(self) -> list[str]:
@@ -77,7 +77,7 @@ def screen(progress: Progress, *notes: str, width: int = 80, colours: bool = Fal
     console = Console(
         file=file, width=width, force_terminal=True, color_system=kind, legacy_windows=False
     )
-    with ProgressView("fleet", console, Watch()) as view:
+    with ProgressView("fleet", console, ManualClock()) as view:
         view.show(progress)
         for note in notes:
             view.note(note)
@@ -89,14 +89,14 @@ def test_mission_under_way_is_one_line() -> None:
     assert line_of(UNDER_WAY) == LINE
 
 
-def test_mission_without_targets_says_nothing_of_them() -> None:
-    """0/0 is no news."""
+def test_line_of_a_mission_without_targets_omits_them() -> None:
+    """A line does not show 0/0."""
     line = line_of(msgspec.structs.replace(UNDER_WAY, detected=0, targets=0))
 
     assert line == LINE.replace("  detected 47/300", "")
 
 
-def test_mission_on_a_map_tells_of_the_way_and_not_of_bounds() -> None:
+def test_line_of_a_mission_on_a_map_has_distances_and_no_bounds() -> None:
     """There is neither energy nor W_UB where a map is explored."""
     line = "t=  12.3 s  explored 57 %  distance 321 m  links 3  msg/s 42  done 0/5"
     shown = screen(ON_A_MAP)
@@ -118,13 +118,13 @@ def test_bound_keeps_its_digits_as_it_falls(w_ub: float, digits: str) -> None:
     assert f"  W_UB {digits}  " in line
 
 
-def test_waiting_says_for_whom_and_nothing_else() -> None:
+def test_line_of_a_wait_names_the_missing_only() -> None:
     """Before the start there is nothing to measure."""
     assert line_of(at(0.0, phase="waiting", detail="r2, r3")) == "t=   0.0 s  waiting for r2, r3"
     assert line_of(at(0.0, phase="waiting")) == "t=   0.0 s  waiting"
 
 
-def test_end_says_why() -> None:
+def test_last_line_has_the_reason_of_the_end() -> None:
     """The last line of a mission has its reason."""
     assert line_of(at(12.3, phase="over", detail="limit")) == f"{LINE}  over: limit"
 
@@ -135,7 +135,7 @@ def test_log_takes_a_line_a_second() -> None:
     with log.view as view:
         for step in range(35):
             view.show(at(float(step)))
-            log.watch.now_s += 0.125
+            log.clock.now_s += 0.125
 
     times = [line.split()[1] for line in log.lines]
     assert times == ["0.0", "8.0", "16.0", "24.0", "32.0", "34.0"]
@@ -181,19 +181,19 @@ def test_end_does_not_wait_for_its_second() -> None:
 
 
 def test_long_wait_is_one_line() -> None:
-    """What has not changed is not said again."""
+    """An unchanged line is not printed again."""
     log = Log()
     with log.view as view:
         for _ in range(60):
             view.show(at(0.0, phase="waiting", detail="r2, r3"))
-            log.watch.now_s += 1.0
+            log.clock.now_s += 1.0
         view.show(at(0.0, phase="waiting", detail="r3"))
 
     assert log.lines == ["t=   0.0 s  waiting for r2, r3", "t=   0.0 s  waiting for r3"]
 
 
 def test_nothing_shown_writes_nothing() -> None:
-    """A mission that never spoke leaves no trace in the log."""
+    """A mission without progress leaves an empty log."""
     log = Log()
     with log.view:
         pass
@@ -213,7 +213,7 @@ def test_notes_come_at_once_and_whole() -> None:
     assert log.lines[1:] == [command, command]
 
 
-def test_foreign_text_cannot_steer_the_terminal() -> None:
+def test_text_of_other_processes_cannot_control_the_terminal() -> None:
     """Details and notes may come from other processes; escape sequences in them have no effect."""
     line = line_of(at(0.0, phase="waiting", detail="r1\x1b[2J\r\n"))
     assert line == "t=   0.0 s  waiting for r1?[2J??"
@@ -233,8 +233,8 @@ def test_terminal_shows_a_panel() -> None:
     assert "━" in shown
 
 
-def test_terminal_says_who_is_missing() -> None:
-    """While waiting, the panel is about who is missing alone."""
+def test_terminal_names_missing_robots() -> None:
+    """While waiting, the panel shows the missing robots alone."""
     shown = screen(at(0.0, phase="waiting", detail="r2, r3"))
 
     assert "waiting for r2, r3" in shown
@@ -252,12 +252,12 @@ def test_narrow_terminal_breaks_no_figure() -> None:
 
 def test_terminal_refreshes_ten_times_a_second() -> None:
     """The panel is drawn at the pace of real time, however fast the mission runs."""
-    file, watch = io.StringIO(), Watch()
+    file, clock = io.StringIO(), ManualClock()
     console = Console(file=file, width=80, force_terminal=True)
-    with ProgressView("fleet", console, watch) as view:
+    with ProgressView("fleet", console, clock) as view:
         for step in range(100):
             view.show(at(step / 10.0))
-            watch.now_s += 1.0 / 64.0
+            clock.now_s += 1.0 / 64.0
 
     # 100 steps take 1.56 s; each refresh waits for the seventh step; the last one is extra.
     assert file.getvalue().count("╭") == pytest.approx(17, abs=1)

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from kantor_fleet.execution.in_process_team import team
-from kantor_fleet.report.picture import RunHistory, Trail
+from kantor_fleet.report.history import RunHistory, Trail
 from kantor_fleet.report.report import draw
 from kantor_fleet.report.style import team_colours
 from kantor_protocol.base.counter_rng import Purpose
@@ -75,7 +75,7 @@ def play(*overrides: str, seed: int = 1) -> list[Record]:
 
 
 def followed(records: list[Record]) -> RunHistory:
-    """What the picture knows of a run."""
+    """The history of a run."""
     run = RunHistory.of(records)
     assert run is not None
     return run
@@ -134,12 +134,12 @@ def without_ending(records: list[Record]) -> list[Record]:
 
 
 def opening_alone(records: list[Record]) -> list[Record]:
-    """A record cut before anybody acted."""
+    """A record cut before any step."""
     return records[:1]
 
 
-def without_acts(records: list[Record]) -> list[Record]:
-    """Everybody was late, always."""
+def without_steps(records: list[Record]) -> list[Record]:
+    """A record in which every robot is absent from every batch."""
     silent = (
         Batch(record.now_ns, (), (), 0, ("r1", "r2"))
         for record in records
@@ -168,7 +168,7 @@ CASES: dict[str, tuple[tuple[str, ...], Cut]] = {
     "all in one point": ((), in_one_point),
     "no ending": ((), without_ending),
     "no batches": ((), opening_alone),
-    "nobody ever acts": ((), without_acts),
+    "no robot ever steps": ((), without_steps),
     "unreadable pairs": ((), garbled),
     "longest name": ((f"name={'long-name-' * 6}abcd",), opening_alone),
     "narrow domain far from the origin": (
@@ -197,7 +197,7 @@ def test_record_without_an_opening_has_no_picture(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_records_are_taken_once_in_order(tmp_path: Path) -> None:
+def test_records_are_read_once_in_order(tmp_path: Path) -> None:
     """A journal is read from disk as it is drawn: an iterator is enough."""
     draw(iter(play()), tmp_path / "report.png")
 
@@ -215,7 +215,7 @@ def test_same_record_gives_the_same_picture(tmp_path: Path) -> None:
 
 
 def test_drawing_leaves_matplotlib_as_it_was(tmp_path: Path) -> None:
-    """The report has its own style and changes nobody else's."""
+    """The report has its own style and does not change matplotlib's."""
     before = dict(mpl.rcParams)
 
     draw(play(), tmp_path / "report.png")
@@ -331,8 +331,8 @@ STRUCK = (
 )
 
 
-def test_outages_are_when_processes_did_nothing() -> None:
-    """From what stopped them to what had them go on; where a robot was when it died."""
+def test_outages_are_the_times_in_which_processes_were_down() -> None:
+    """From the event that stopped a process to the one that resumed it; and the place of a robot's death."""
     records = play(*STRUCK)
     run = followed(records)
     where = next(
@@ -345,8 +345,8 @@ def test_outages_are_when_processes_did_nothing() -> None:
     )
 
     assert [
-        (who, what, round(from_s, 6), until_s and round(until_s, 6))
-        for who, what, from_s, until_s in run.outages
+        (who, cause, round(from_s, 6), until_s and round(until_s, 6))
+        for who, cause, from_s, until_s in run.outages
     ] == [
         ("r1", "late", 0.0, 0.4),
         ("r2", "kill", 1.0, 1.9),

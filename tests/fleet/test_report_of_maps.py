@@ -10,7 +10,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 
-from kantor_fleet.report.picture import RunHistory, draw_bumps, draw_known
+from kantor_fleet.report.history import RunHistory
+from kantor_fleet.report.map_drawing import draw_bumps, draw_known
 from kantor_fleet.report.report import draw
 from kantor_fleet.report.summary import summary
 from kantor_protocol.base.grid import Frame
@@ -103,7 +104,7 @@ def test_any_map_has_a_picture(ground: Ground, tmp_path: Path) -> None:
 
 
 def test_colours_are_those_of_the_stamps() -> None:
-    """A cell's colour tells when it was first seen; walls are darker, what nobody saw is pale."""
+    """The colour of a cell shows when it was first seen; walls are darker, unseen cells are pale."""
     run, exploration = followed(explored()[:12])
     axes = Figure().subplots()
     draw_known(axes, exploration.map_tracker, 0.1)
@@ -149,8 +150,8 @@ def test_bumps_stand_where_they_happened() -> None:
     assert len(exploration.map_tracker.bumps) > 10
 
 
-def test_summary_of_a_map_tells_what_was_explored() -> None:
-    """A person reads shares, ticks and metres; nothing of energy and bounds."""
+def test_summary_of_a_map_has_shares_ticks_and_metres() -> None:
+    """It has no energy and no bounds."""
     _, exploration = followed(explored())
     result = exploration.result(
         exchange="in-process", digest="d", wall_s=1.0, record="whole", complaints=()
@@ -167,7 +168,7 @@ def test_summary_of_a_map_tells_what_was_explored() -> None:
     assert not any("W_UB" in line or "energy" in line or "detected" in line for line in lines)
 
 
-def test_summary_of_a_cut_run_has_dashes() -> None:
+def test_summary_of_a_cut_run_has_dashes_for_missing_ticks() -> None:
     """What did not happen has no tick."""
     _, exploration = followed(explored()[:4])
     result = exploration.result(exchange="-", digest="", wall_s=0.0, record="whole", complaints=())

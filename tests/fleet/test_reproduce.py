@@ -45,7 +45,7 @@ def test_a_median_must_lie_in_its_band() -> None:
     assert verdict(4, 4, why="the published figure is impossible") == MISS
 
 
-def test_a_median_is_told_with_its_quartiles_and_its_band() -> None:
+def test_a_median_is_printed_with_its_quartiles_and_its_band() -> None:
     line = MedianInBand("it", HERE, "2", 1.0, math.inf, number, 1, " %").judge(
         "fig0", {HERE: runs_of(1, 2, 3, 4, 5)}
     )
@@ -71,7 +71,7 @@ def test_the_narrowest_spread_must_be_the_narrowest() -> None:
         ((1, 2, 3), (5, 6, 7), True, MISS),
     ],
 )
-def test_being_ahead_takes_pairs_and_where_asked_intervals_apart(
+def test_a_lead_needs_pairs_and_if_asked_separate_intervals(
     upper: Sequence[float], lower: Sequence[float], *, apart: bool, verdict: str
 ) -> None:
     claim = PairedLead("it", HERE, THERE, "ahead", "", number, "", apart=apart)
@@ -81,13 +81,13 @@ def test_being_ahead_takes_pairs_and_where_asked_intervals_apart(
     assert line.verdict == verdict
 
 
-def test_an_unsure_reading_takes_any_sign() -> None:
+def test_a_reading_that_is_not_significant_accepts_either_sign() -> None:
     claim = PairedLead("it", HERE, THERE, "ahead", "", number, "", sure=False)
 
     assert claim.judge("fig0", {HERE: runs_of(1, 2), THERE: runs_of(2, 1)}).verdict == OK
 
 
-def test_a_ratio_is_told_and_not_judged() -> None:
+def test_a_ratio_of_medians_is_reported_and_not_judged() -> None:
     claim = MedianRatio("it", HERE, THERE, "much less", number, "it depends")
 
     line = claim.judge("fig0", {HERE: runs_of(1, 1), THERE: runs_of(2, 2)})
@@ -111,7 +111,7 @@ def test_a_share_counts_runs() -> None:
     assert claim.judge("fig0", {HERE: runs_of(1, 2, 11, 11)}).verdict == MISS
 
 
-def test_an_interval_is_students() -> None:
+def test_an_interval_is_that_of_student() -> None:
     """Mean 2, standard error 1/sqrt(3), two degrees of freedom: t = 4.303."""
     assert interval([1.0, 2.0, 3.0]) == pytest.approx((2.0, 4.3026527 / math.sqrt(3.0)))
     assert quartiles([7.0]) == (7.0, 7.0, 7.0)
@@ -173,16 +173,16 @@ def test_a_figure_comes_with_its_numbers_and_its_verdicts(kantor: "Kantor") -> N
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("--runs", 1), "--runs 1: give at least 2, an interval needs them"),
         (("--jobs", 0), "--jobs 0: give at least 1"),
     ],
 )
 def test_what_cannot_be_run_is_refused(
-    kantor: "Kantor", arguments: tuple[object, ...], says: str
+    kantor: "Kantor", arguments: tuple[object, ...], message: str
 ) -> None:
     done = kantor("reproduce", "fig8", *arguments, "--out", "figures")
 
-    assert (done.code, done.err) == (2, f"kantor: {says}\n")
+    assert (done.code, done.err) == (2, f"kantor: {message}\n")
     assert not (kantor.folder / "figures").exists()

@@ -63,7 +63,7 @@ POSITIVE = st.floats(min_value=1e-3, max_value=1e6)
 
 
 def test_a_ratio_of_means_must_lie_in_its_band_and_needs_none() -> None:
-    """The band's ends belong to it; where the paper's number is out of reach the verdict says so."""
+    """The band's ends belong to it; where the paper's number is out of reach the verdict is UNMATCHED."""
 
     def verdict(*over: float, low: float = -math.inf, high: float = math.inf, why: str = "") -> str:
         claim = MeanRatio("it", HERE, THERE, "", "", number, low, high, why)
@@ -129,7 +129,7 @@ def test_the_lowest_lies_below_those_that_a_reading_has_above(
     assert line.why == ("" if min(there, far) > 3 else "it depends")
 
 
-def test_geometric_ratios_take_the_runs_that_there_are() -> None:
+def test_geometric_ratios_use_the_runs_of_both_settings() -> None:
     """A part of the configurations has no runs of some settings; with one run there is no interval."""
     claim = GeometricMeanRatio("it", (HERE, FAR), (THERE, FAR), "", "", number, 0.5)
     found = {HERE: runs_of(1, 4), THERE: runs_of(2, 8)}
@@ -145,8 +145,8 @@ def test_geometric_ratios_take_the_runs_that_there_are() -> None:
 
 @given(st.lists(POSITIVE, min_size=2, max_size=20))
 @examples(25)
-def test_a_geometric_mean_of_ratios_turns_over_with_them(values: list[float]) -> None:
-    """KME over the others, or the others over KME: the same is said."""
+def test_inverse_ratios_have_the_inverse_geometric_mean(values: list[float]) -> None:
+    """The ratio of KME to the others and its inverse have inverse means and equal factors."""
     mean, factor = geometric(values)
 
     assert geometric([1.0 / value for value in values]) == pytest.approx((1.0 / mean, factor))
@@ -154,7 +154,7 @@ def test_a_geometric_mean_of_ratios_turns_over_with_them(values: list[float]) ->
     assert mean <= max(values) * (1 + 1e-9)
 
 
-def test_lower_is_judged_setting_by_setting_and_beyond_chance() -> None:
+def test_lower_is_judged_setting_by_setting_beyond_the_interval() -> None:
     claim = LowerThroughout("it", (("one", (HERE, FAR), (THERE, FAR)),), "", number)
 
     def verdict(here: Iterable[float], there: Iterable[float]) -> str:
@@ -169,7 +169,7 @@ def test_lower_is_judged_setting_by_setting_and_beyond_chance() -> None:
 # Configurations
 
 
-def test_configurations_are_the_papers() -> None:
+def test_configurations_are_those_of_the_paper() -> None:
     """V-C: 3 maps, 2 kinds of starts, 2 to 8 robots, 15 spots: 630, each once."""
     assert kme.CONFIGURATIONS == 630
     assert set(kme.configurations()) == set(
@@ -182,7 +182,7 @@ def test_configurations_are_the_papers() -> None:
 
 @given(st.integers(0, 630 - 42))
 @examples(50)
-def test_any_beginning_of_the_configurations_is_even(first: int) -> None:
+def test_any_beginning_of_the_configurations_is_balanced(first: int) -> None:
     some = kme.configurations()[first : first + 42]
 
     assert len({(each.map, each.starts) for each in some[:6]}) == 6
@@ -190,7 +190,7 @@ def test_any_beginning_of_the_configurations_is_even(first: int) -> None:
     assert len({(each.map, each.starts, each.robots) for each in some}) == 42
 
 
-def test_a_part_has_every_planner_under_the_same_conditions() -> None:
+def test_requested_runs_have_every_planner_under_the_same_conditions() -> None:
     requested = kme.requests(24)
 
     assert sum(map(len, requested.values())) == 4 * 24
@@ -218,7 +218,7 @@ def test_every_setting_of_a_figure_is_a_map_that_can_be_run(name: str) -> None:
     assert {setting for claim in figure.claims for setting in claim.settings} <= requested.keys()
     scenarios = [setting.find() for setting in requested]
     assert {scenario.planner.name for scenario in scenarios} <= MAP_PLANNERS
-    assert len(set(scenarios)) == len(scenarios)  # runs are told apart by their scenarios
+    assert len(set(scenarios)) == len(scenarios)  # runs are distinguished by their scenarios
 
 
 def test_all_stands_for_the_first_paper() -> None:
@@ -320,7 +320,7 @@ def test_a_run_that_has_ended_stays_where_it_ended() -> None:
     np.testing.assert_allclose(mean, [0.0, 3.0, 5.0, 6.0])
 
 
-def test_the_table_tells_every_measure_by_number_of_robots(
+def test_the_table_has_every_measure_by_number_of_robots(
     drawn: Callable[[str], tuple[MeasuredRuns, Picture]],
 ) -> None:
     found, picture = drawn("kme-all")
@@ -342,7 +342,7 @@ def test_the_table_tells_every_measure_by_number_of_robots(
     assert whole[0]["configurations"] == 5 * 6
 
 
-def test_the_numbers_of_a_run_stand_flat() -> None:
+def test_a_row_of_a_run_has_flat_columns() -> None:
     row = map_row(finished_run())
 
     assert (row["finished_tick"], row["explored"]) == (7, 0.5)
@@ -400,7 +400,7 @@ def kept(folder: Path) -> int:
         return 0
 
 
-def test_kept_flights_read_back_as_they_were(tmp_path: Path) -> None:
+def test_kept_runs_read_back_as_they_were(tmp_path: Path) -> None:
     key, run = RunKey("a", "b", 3, exact=False), MeasuredRun(course=(Moment(0, 1.5, 0.1),))
     with RunsJournal(tmp_path / "runs.jsonl", MeasuredRun) as journal:
         journal.add(key, run)
@@ -419,7 +419,7 @@ def simple_figure() -> PaperFigure:
 
 
 def pool_of(*runs_by_seed: MeasuredRun) -> Callable[[Iterable[Case]], Pool]:
-    """Flies nothing, and has the answers."""
+    """A pool that runs nothing and has the outcomes."""
 
     def start(cases: Iterable[Case]) -> Pool:
         for case in cases:
@@ -429,7 +429,7 @@ def pool_of(*runs_by_seed: MeasuredRun) -> Callable[[Iterable[Case]], Pool]:
     return start
 
 
-def test_a_run_that_broke_a_rule_counts_and_is_told(
+def test_a_run_that_broke_a_rule_counts_and_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     good, bad = (
@@ -470,21 +470,21 @@ def test_a_run_without_a_result_is_run_again(
     assert reproduce({"a": simple_figure()}, None, again, tmp_path) == Exit.DONE
 
 
-def test_interrupted_it_goes_on_where_it_was_stopped(kantor: "Kantor") -> None:
+def test_an_interrupted_figure_resumes_where_it_was_stopped(kantor: "Kantor") -> None:
     """`kantor reproduce kme-all`: what is finished is kept; a narrower one then runs nothing."""
     folder = kantor.folder / "figures"
-    order = ("reproduce", "kme-all", "--runs", 3, "--jobs", 1, "--out", "figures")
-    running = kantor.start(*order)
+    command = ("reproduce", "kme-all", "--runs", 3, "--jobs", 1, "--out", "figures")
+    running = kantor.start(*command)
     wait_until(lambda: kept(folder) >= 2)
     running.send_signal(signal.SIGINT)
-    _, told = running.communicate(timeout=EVENT_LIMIT_S)
+    _, err = running.communicate(timeout=EVENT_LIMIT_S)
     before = kept(folder)
 
     assert running.returncode == 130
-    assert f"{before} of 12 runs are done; the same command goes on from there" in told
+    assert f"{before} of 12 runs are done; the same command goes on from there" in err
     assert {path.name for path in folder.iterdir()} == {"runs.jsonl"}
 
-    done = kantor(*order)
+    done = kantor(*command)
     assert done.code in (0, 1), done.err  # so few runs may miss a band
     assert kept(folder) == 12
     assert {path.name for path in folder.iterdir()} == {
@@ -499,7 +499,7 @@ def test_interrupted_it_goes_on_where_it_was_stopped(kantor: "Kantor") -> None:
     verdicts = rows_of(folder / "verdicts.csv")
     assert done.code == (1 if any(line["verdict"] == MISS for line in verdicts) else 0)
 
-    again = kantor(*order)
+    again = kantor(*command)
     assert kept(folder) == 12
     assert "runs" not in again.out.splitlines()[0]
     assert rows_of(folder / "kme-all.csv") == runs

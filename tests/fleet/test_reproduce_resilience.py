@@ -1,4 +1,4 @@
-"""The figure of quality under loss: what it flies, what it concludes, what it draws."""
+"""The figure of quality under loss: its runs, its verdicts and its drawing."""
 
 import math
 from collections.abc import Callable
@@ -41,7 +41,7 @@ def faults(graded: GradedFault, degree: float, seed: int = 0) -> tuple[Fault, ..
     return setting("ledger", DETECTION, graded, degree, seed).find().faults
 
 
-def test_every_condition_is_flown_with_the_same_seeds() -> None:
+def test_every_condition_has_the_same_seeds() -> None:
     requested = requests(RUNS)
 
     for objective in OBJECTIVES:
@@ -54,7 +54,7 @@ def test_every_condition_is_flown_with_the_same_seeds() -> None:
     assert sum(map(len, requested.values())) == conditions * len(MERGES) * len(OBJECTIVES) * RUNS
 
 
-def test_energy_is_scarce_for_one_aim_and_plenty_for_the_other() -> None:
+def test_energy_is_scarce_for_detection_and_plenty_for_finishing() -> None:
     scarce, plenty = (setting("min", objective, DROPPING, 0, 0).find() for objective in OBJECTIVES)
 
     assert scarce.steps_per_robot * ROBOTS == pytest.approx(1.05 * POINTS)
@@ -91,12 +91,12 @@ def made_up(outcome: Callable[[str, Objective, float, int], float]) -> MeasuredR
         for graded in GRADED_FAULTS:
             for degree in graded.degrees:
                 for merge in MERGES:
-                    flown = {
+                    settings = {
                         setting(merge, objective, graded, degree, seed): seed
                         for seed in range(RUNS)
                     }
-                    for made, seed in flown.items():
-                        seeds = range(RUNS) if len(flown) == 1 else (seed,)
+                    for made, seed in settings.items():
+                        seeds = range(RUNS) if len(settings) == 1 else (seed,)
                         found = [outcome(merge, objective, degree, each) for each in seeds]
                         measured[made] = [
                             MeasuredRun(
@@ -112,7 +112,7 @@ def made_up(outcome: Callable[[str, Objective, float, int], float]) -> MeasuredR
 
 
 def plain(merge: str, objective: Objective, degree: float, seed: int) -> float:
-    """The ledger 10 better; each degree costs 1, each seed has its own luck."""
+    """The ledger 10 better; each degree costs 1, each seed has its own offset."""
     sign = 1.0 if objective is DETECTION else -1.0
     return 80.0 + 3.0 * seed - sign * degree + (5.0 if merge == "ledger" else -5.0) * sign
 
@@ -126,8 +126,8 @@ def test_values_are_in_the_order_of_the_seeds() -> None:
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_what_is_better_seed_by_seed_is_better(objective: Objective) -> None:
-    """Whatever luck the seeds have."""
+def test_a_lead_in_every_seed_is_met(objective: Objective) -> None:
+    """Whatever the offsets of the seeds."""
     verdict = LedgerLead(objective, LOSING).judge("resilience", made_up(plain))
 
     assert verdict.verdict == OK
@@ -135,7 +135,7 @@ def test_what_is_better_seed_by_seed_is_better(objective: Objective) -> None:
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_what_is_worse_in_one_degree_is_missed(objective: Objective) -> None:
+def test_a_lead_that_one_degree_lacks_is_missed(objective: Objective) -> None:
     def once(merge: str, objective: Objective, degree: float, seed: int) -> float:
         other = {"min": "ledger", "ledger": "min"}[merge]
         return plain(other if degree == 30 else merge, objective, degree, seed)
@@ -144,7 +144,7 @@ def test_what_is_worse_in_one_degree_is_missed(objective: Objective) -> None:
     assert LedgerLead(objective, PARTED).judge("resilience", made_up(once)).verdict == OK
 
 
-def test_a_price_is_told() -> None:
+def test_the_cost_of_a_fault_is_reported() -> None:
     verdict = CostOfFault("min", FINISHING, DROPPING).judge("resilience", made_up(plain))
 
     assert verdict.verdict == REPORTED

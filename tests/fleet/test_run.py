@@ -63,7 +63,7 @@ until_s = 3.0
 """
 
 
-def test_a_run_under_faults_tells_what_they_did(kantor: "Kantor") -> None:
+def test_a_run_under_faults_reports_their_effects(kantor: "Kantor") -> None:
     """Those of the scenario and those of the file; the record holds them, so that it verifies."""
     (kantor.folder / "storm.toml").write_text(STORM)
     own = (
@@ -75,12 +75,12 @@ def test_a_run_under_faults_tells_what_they_did(kantor: "Kantor") -> None:
 
     (folder,) = kantor.runs()
     result = result_of(folder)
-    told = result["faults"]
-    assert isinstance(told, dict)
-    assert list(told) == ["0 drop", "1 clog", "2 burst", "3 partition"]
-    assert told["3 partition"]["dropped"] > 100
+    effects = result["faults"]
+    assert isinstance(effects, dict)
+    assert list(effects) == ["0 drop", "1 clog", "2 burst", "3 partition"]
+    assert effects["3 partition"]["dropped"] > 100
     assert result["violations"] == 0
-    assert f"fault 0 drop           {told['0 drop']['dropped']} dropped" in finished.out
+    assert f"fault 0 drop           {effects['0 drop']['dropped']} dropped" in finished.out
     assert kantor("verify", folder).code == 0
     again = in_process(kantor, folder / "scenario.toml")
     assert str(result["digest"]) in again.out
@@ -203,7 +203,7 @@ def test_verify_finds_a_forged_record_behind_a_forged_manifest(kantor: "Kantor")
     assert "executed again" in finished.out
 
 
-def test_verify_tells_of_an_opening_that_is_no_use(kantor: "Kantor") -> None:
+def test_verify_reports_an_opening_from_which_no_run_can_start(kantor: "Kantor") -> None:
     """A damaged opening is a verdict, not a traceback."""
     in_process(kantor, "paper-decentralized", *SHORT)
     (folder,) = kantor.runs()
@@ -246,7 +246,7 @@ def test_ctrl_c_while_kernels_are_compiled_ends_the_command_at_once(kantor: "Kan
 
 
 def test_a_full_disk_cuts_the_record_and_not_the_mission(kantor: "Kantor") -> None:
-    """The run goes on to its end and says where the record was cut; what was written verifies."""
+    """The run goes on to its end and reports where the record was cut; the written part verifies."""
     arguments = ["run", "fleet", "--exchange", "in-process"]
     script = (
         "import resource, sys; "
@@ -313,7 +313,7 @@ def test_world_sim_that_is_killed_on_its_way_out_leaves_its_run_alone(kantor: "K
     assert in_process(kantor, "fleet", *SHORT).code == 1
     (folder,) = kantor.runs()
     before = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
-    order = FleetConfig(find("fleet"), 0, "lockstep", 1.0, folder)
-    _be_world_sim(order, "tcp/127.0.0.1:1", folder, kantor.folder / "log", Pipe()[1], True, False)
+    config = FleetConfig(find("fleet"), 0, "lockstep", 1.0, folder)
+    _be_world_sim(config, "tcp/127.0.0.1:1", folder, kantor.folder / "log", Pipe()[1], True, False)
 
     assert {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before

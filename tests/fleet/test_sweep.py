@@ -1,4 +1,4 @@
-"""`kantor sweep`: plans, journals, tables, and what happens to workers and to impatient users."""
+"""`kantor sweep`: plans, journals, tables, and workers and commands that are interrupted."""
 
 import json
 import os
@@ -96,12 +96,12 @@ def test_a_run_is_known_by_what_is_in_its_files_not_by_where_they_are(tmp_path: 
 @pytest.mark.parametrize(
     ("text", "seeds"), [("0:3", (0, 1, 2)), ("7", (7,)), ("1,4,9", (1, 4, 9)), ("5,0:2", (5, 0, 1))]
 )
-def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
+def test_seeds_are_parsed(text: str, seeds: tuple[int, ...]) -> None:
     assert parse_seeds(text) == seeds
 
 
 @pytest.mark.parametrize(
-    ("vary", "seeds", "override", "says"),
+    ("vary", "seeds", "override", "message"),
     [
         ("radio.rang_m=3,4", "0", "", "radio.rang_m: no such key; did you mean range_m?"),
         ("radio.range_m=50,wide", "0", "", "radio.range_m=wide: "),
@@ -120,13 +120,13 @@ def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
     ],
 )  # fmt: skip
 def test_a_sweep_that_cannot_be_run_is_refused_before_it_runs(
-    vary: str, seeds: str, override: str, says: str
+    vary: str, seeds: str, override: str, message: str
 ) -> None:
     """Every variant is checked first; one line names the place and the remedy."""
     with pytest.raises(SweepError) as caught:
         plan("fleet", [vary], seeds, [override] if override else [])
 
-    assert says in str(caught.value)
+    assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -137,7 +137,7 @@ def test_a_key_that_is_varied_twice_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("--vary", "radio.rang_m=1,2"), "did you mean range_m?"),
         (("--plot", "detection"), "--plot detection: no such measure; did you mean detection_rate?"),
@@ -146,26 +146,26 @@ def test_a_key_that_is_varied_twice_is_refused() -> None:
     ],
 )  # fmt: skip
 def test_the_command_refuses_in_one_line_and_leaves_nothing(
-    kantor: "Kantor", arguments: tuple[str, ...], says: str
+    kantor: "Kantor", arguments: tuple[str, ...], message: str
 ) -> None:
     """Exit code 2, and no folder."""
     finished = kantor("sweep", "fleet", *arguments)
 
     assert (finished.code, finished.out) == (2, "")
-    assert says in finished.err
+    assert message in finished.err
     assert len(finished.err.splitlines()) == 1
     assert not list(kantor.folder.iterdir())
 
 
 @pytest.mark.parametrize(
-    ("arguments", "library", "says"),
+    ("arguments", "library", "message"),
     [
         (("--format", "parquet"), "pyarrow", "pip install 'kantor[parquet]'"),
         (("--cluster", "tcp://127.0.0.1:9"), "distributed", "pip install 'kantor[cluster]'"),
     ],
 )
-def test_what_an_extra_is_needed_for_names_it(
-    kantor: "Kantor", arguments: tuple[str, ...], library: str, says: str
+def test_an_option_without_its_extra_names_the_extra(
+    kantor: "Kantor", arguments: tuple[str, ...], library: str, message: str
 ) -> None:
     """As where the extra is not installed."""
     (kantor.folder / "sitecustomize.py").write_text(
@@ -176,7 +176,7 @@ def test_what_an_extra_is_needed_for_names_it(
     finished = kantor("sweep", "fleet", *arguments, PYTHONPATH=str(kantor.folder))
 
     assert finished.code == 2
-    assert says in finished.err
+    assert message in finished.err
     assert not (kantor.folder / "sweeps").exists()
 
 
@@ -203,26 +203,28 @@ def test_a_journal_keeps_runs_and_forgets_a_torn_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         (b'{"format":1,"kantor":"0.0.9"}\n', "written by kantor 0.0.9, this is"),
         (b"my shopping list", "no journal of a sweep; give another --out"),
         (b"my shopping list\nmilk\n", "no journal of a sweep; give another --out"),
     ],
 )
-def test_a_file_of_somebody_else_is_left_alone(tmp_path: Path, text: bytes, says: str) -> None:
+def test_a_file_that_is_no_journal_of_this_version_is_left_alone(
+    tmp_path: Path, text: bytes, message: str
+) -> None:
     """Another version's, or no journal at all."""
     path = tmp_path / "runs.jsonl"
     path.write_bytes(text)
 
-    with pytest.raises(SweepError, match=says):
+    with pytest.raises(SweepError, match=message):
         RunsJournal(path)
 
     assert path.read_bytes() == text
 
 
 def test_a_line_that_is_no_run_is_named(tmp_path: Path) -> None:
-    """It was not torn, so somebody wrote it."""
+    """It was not torn, so it is not dropped."""
     path = tmp_path / "runs.jsonl"
     with RunsJournal(path):
         pass
@@ -233,7 +235,7 @@ def test_a_line_that_is_no_run_is_named(tmp_path: Path) -> None:
 
 
 def test_two_sweeps_do_not_write_into_one_journal(tmp_path: Path) -> None:
-    """The second is told."""
+    """The second is refused."""
     with (
         RunsJournal(tmp_path / "runs.jsonl"),
         pytest.raises(SweepError, match="another sweep writes"),
@@ -245,14 +247,14 @@ def test_two_sweeps_do_not_write_into_one_journal(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("work", "says"),
+    ("work", "message"),
     [
         (die_of_a_seed, "its worker died: SIGKILL"),
         (fail_of_a_seed, "its worker died: exit code 7"),
     ],
 )
 def test_a_case_that_kills_its_worker_fails_alone(
-    work: Callable[[Case], Outcome], says: str
+    work: Callable[[Case], Outcome], message: str
 ) -> None:
     """It has a second try; the others have their outcomes, each once."""
     cases = [Case(mission(), seed) for seed in range(8)]
@@ -260,7 +262,7 @@ def test_a_case_that_kills_its_worker_fails_alone(
         done = [one for one in pool if one is not None]
 
     failed = {case.seed: outcome.failed for case, outcome in done if outcome.failed}
-    assert failed == {DEADLY_SEED: says}
+    assert failed == {DEADLY_SEED: message}
     assert sorted(case.seed for case, _ in done) == list(range(8))
     assert done[-1][0].seed == DEADLY_SEED
 
@@ -292,15 +294,15 @@ def test_whatever_a_run_raises_is_its_outcome(tmp_path: Path) -> None:
 # Numbers
 
 
-def test_a_spread_is_what_numpy_says_and_the_same_every_time() -> None:
+def test_a_distribution_is_exact_and_the_same_every_time() -> None:
     """Median and quartiles as `statistics` has them; the interval holds the median of its source."""
     draws = np.random.default_rng(1).normal(50.0, 5.0, (200, 25))
-    spreads = [Distribution.of(row) for row in draws]
+    distributions = [Distribution.of(row) for row in draws]
     first, median, third = statistics.quantiles(draws[0].tolist(), n=4, method="inclusive")
 
-    assert spreads[0][:4] == pytest.approx((25, median, first, third))
-    assert Distribution.of(draws[0]) == spreads[0]
-    covered = sum(spread.low <= 50.0 <= spread.high for spread in spreads) / len(spreads)
+    assert distributions[0][:4] == pytest.approx((25, median, first, third))
+    assert Distribution.of(draws[0]) == distributions[0]
+    covered = sum(one.low <= 50.0 <= one.high for one in distributions) / len(distributions)
     assert 0.90 <= covered <= 0.99
     assert Distribution.of(np.array([4.0])) == (1, 4.0, 4.0, 4.0, None, None)
     assert Distribution.of(np.array([])) == (0, None, None, None, None, None)
@@ -451,7 +453,7 @@ def test_a_wider_sweep_runs_only_what_is_new(kantor: "Kantor") -> None:
 
 
 def test_a_run_that_fails_is_kept_with_its_reason(kantor: "Kantor") -> None:
-    """It does not stop the others, is not tried again unasked, and is told by the exit code."""
+    """It does not stop the others, is run again only on request, and shows in the exit code."""
     (kantor.folder / "good.csv").write_text("x,y\n" + "800,700\n810,720\n" * 40)
     (kantor.folder / "bad.csv").write_text("x,y\n800,nan\n")
     arguments = (
@@ -464,7 +466,7 @@ def test_a_run_that_fails_is_kept_with_its_reason(kantor: "Kantor") -> None:
     again = kantor(*arguments)
 
     assert (first.code, again.code) == (1, 1)
-    assert first.out.count("a run failed: ") == 1, "one reason, told once"
+    assert first.out.count("a run failed: ") == 1, "one reason, printed once"
     assert "2 failed: " in again.out
     assert "row 1 is not finite" in again.out
     assert len(journal_lines(folder)) == 4
@@ -485,18 +487,18 @@ def thunder(cases: Iterable[Case]) -> Pool:
         yield case, Outcome(failed="thunder")
 
 
-def test_the_exit_code_tells_of_failures(tmp_path: Path) -> None:
+def test_failed_runs_show_in_the_exit_code(tmp_path: Path) -> None:
     """Whatever the pool."""
-    order = SweepConfig(plan("fleet", [], "0:2"), tmp_path)
+    config = SweepConfig(plan("fleet", [], "0:2"), tmp_path)
 
-    assert sweep(order, thunder) is Exit.NOT_MET
+    assert sweep(config, thunder) is Exit.NOT_MET
     assert [row["failed"] for row in rows_of(tmp_path / "table.csv")] == ["thunder", "thunder"]
 
 
 def test_changed_sources_and_exact_distances_are_other_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Who edits a planner does not want the old one's results."""
+    """Results of an edited planner are not those of the old one."""
     plans = plan("fleet", [], "0:2"), plan("fleet", [], "0:2", exact=True)
     for made in plans:
         sweep(SweepConfig(made, tmp_path), thunder)

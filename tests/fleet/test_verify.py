@@ -67,7 +67,7 @@ PACES = {
 
 
 def troubled(*overrides: str) -> Scenario:
-    """A small mission in which everybody dies at least once."""
+    """A small mission in which every robot and world-sim die at least once."""
     roomy = ("samples.count=60", "energy.points=90", "energy.steps=60", "limit_s=12")
     return parse(SMALL + TROUBLE, "troubled", (*roomy, "radio.drop=0.2", *overrides))
 
@@ -82,13 +82,13 @@ def recorded(scenario: Scenario, folder: Path, machines: Exchange | None = None)
 
 
 def as_exchange(folder: Path, exchange: str) -> None:
-    """Have the manifest say that another exchange ran it."""
+    """Write another exchange into the manifest."""
     manifest = json.loads((folder / MANIFEST).read_text())
     (folder / MANIFEST).write_text(json.dumps(manifest | {"exchange": exchange}))
 
 
 @pytest.mark.parametrize("pace", list(PACES))
-def test_ordered_faults_are_executed_again(
+def test_scheduled_faults_are_executed_again(
     pace: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Deaths, absences and new incarnations are in the scenario: every byte comes out the same."""
@@ -105,7 +105,7 @@ def test_ordered_faults_are_executed_again(
 def test_incarnations_are_replayed(
     pace: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """As on the wall: machines go on over their deaths, or take over the body as the world knew it."""
+    """As in realtime: machines go on after deaths, or take over the body in the state that the world knows."""
     scenario = troubled(*PACES[pace])
     recorded(scenario, tmp_path)
     as_exchange(tmp_path, "wall")
@@ -115,25 +115,25 @@ def test_incarnations_are_replayed(
     assert f"steps of {len(scenario.roster)} participants, all the same" in out, out
 
 
-class Forgetful:
-    """A crew in which r1 does not answer at times, as over a bus that is too slow."""
+class SlowBus:
+    """An exchange in which r1 does not answer at times, as over a bus that is too slow."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self._crew = InProcessExchange(team(scenario, 1, WorldSetup.of(scenario, 1)))
+        self._exchange = InProcessExchange(team(scenario, 1, WorldSetup.of(scenario, 1)))
 
     def __call__(self, inputs: dict[ParticipantId, Inputs], /) -> dict[ParticipantId, Outputs]:
         asleep = {"r1"} if inputs["r1"].now_ns == 500_000_000 else set()
         self.asked = getattr(self, "asked", 0) + bool(asleep)
-        given = {who: told for who, told in inputs.items() if who not in asleep or self.asked > 3}
-        return dict(self._crew(given))
+        given = {who: its for who, its in inputs.items() if who not in asleep or self.asked > 3}
+        return dict(self._exchange(given))
 
 
-def test_absence_that_nobody_ordered_is_replayed(
+def test_absence_that_no_fault_schedules_is_replayed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Executed again it would not happen; the inboxes are on record all the same."""
     scenario = parse(SMALL, "small", ("limit_s=3", "energy.steps=60"))
-    result = recorded(scenario, tmp_path, Forgetful(scenario))  # type: ignore[arg-type]
+    result = recorded(scenario, tmp_path, SlowBus(scenario))  # type: ignore[arg-type]
     code = verify(tmp_path)
 
     out = capsys.readouterr().out

@@ -346,9 +346,9 @@ def diary_files() -> Mutations:
         for pages in (0, 1, 3):
             path = Path(folder) / str(pages)
             diary = WalFile(path, "run")
-            diary.begin(Body(Pose(1.0, 2.0)))
+            diary.reset(Body(Pose(1.0, 2.0)))
             for inputs in given[:pages]:
-                diary.note(encode(inputs))
+                diary.append(encode(inputs))
             diary.close()
             contents.append(path.read_bytes())
     return files(contents)

@@ -401,11 +401,11 @@ class _Leaf:
         """What it holds."""
         return WalContents(Body(Pose(10.0, 10.0)), (self._page,))
 
-    def begin(self, birth: Body) -> None:
+    def reset(self, initial_state: Body) -> None:
         """Never."""
-        raise AssertionError("a diary that covers all is thrown away")
+        raise AssertionError("a log that covers all is thrown away")
 
-    def note(self, inputs: bytes) -> None:
+    def append(self, inputs: bytes) -> None:
         """Forget it."""
 
 

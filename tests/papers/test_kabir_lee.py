@@ -22,6 +22,7 @@ from kantor_protocol.base.varint import Pairs
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.observers.metrics.density import DensityMetrics, DensityRow
 from kantor_worldsim.observers.metrics.result import Result
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.record.records import Batch, Record
 from kantor_worldsim.world.world import WorldSetup
@@ -313,12 +314,13 @@ def small(*overrides: str) -> Small:
     scenario = mission("metrics.every=1", *overrides)
     site = WorldSetup.of(scenario, 1)
     metrics = DensityMetrics()
+    pipeline = Pipeline(metrics)
     shipped: list[tuple[float, float]] = []
     robots_m = site.starts_m.copy()
     told: list[tuple[int, list[tuple[float, float]], Places]] = [(0, [], robots_m.copy())]
 
     def follow(record: Record) -> None:
-        metrics.observe(record)
+        pipeline.observe(record)
         for step_record in record.step_records if isinstance(record, Batch) else ():
             if (
                 step_record.outputs is None

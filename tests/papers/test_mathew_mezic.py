@@ -20,6 +20,7 @@ from kantor_protocol.replication.cosine_basis import VISIT, rectangle_of, visit_
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.observers.checkers.checker import Checker
 from kantor_worldsim.observers.metrics.density import DensityMetrics
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.records import Batch, Record, StepRecord
 from kantor_worldsim.world.world import WorldSetup
 
@@ -56,7 +57,7 @@ def flown(overrides: tuple[str, ...], seed: int) -> Flight:
                 if step_record.outputs and step_record.outputs.spent
             )
 
-    play(scenario, seed, site, [metrics.observe, checker.observe, keep])
+    play(scenario, seed, site, [Pipeline(metrics, checker).observe, keep])
     assert checker.complaints == []
     return Flight(scenario, 100.0 * len(metrics.finds) / len(site.targets_m), step_records)
 

@@ -20,7 +20,7 @@ from kantor_protocol.transport import credentials, tls, zenoh_config
 from kantor_protocol.transport.client import participant_session
 from kantor_protocol.transport.credentials import Certificate, Identity
 from kantor_protocol.transport.endpoint import free_endpoint
-from kantor_protocol.transport.events import Heard, Joined, Left
+from kantor_protocol.transport.events import Joined, Left, Received
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import BusError
 from kantor_protocol.wire import keys
@@ -194,10 +194,10 @@ def test_a_revoked_robot_with_plain_zenoh_neither_sends_nor_receives(folder: Pat
         ) as honest:
             assert host.next(EVENT_LIMIT_S) == Joined("r1", "nonce")
             for name in ROSTER:
-                host.send(name, b"secret", patiently=True)
+                host.send(name, b"secret", blocking=True)
             assert honest.next(EVENT_LIMIT_S) == b"secret"
-            honest.send(b"true", patiently=True)
-            assert host.next(EVENT_LIMIT_S) == Heard("r1", b"true")
+            honest.send(b"true", blocking=True)
+            assert host.next(EVENT_LIMIT_S) == Received("r1", b"true")
         assert host.next(EVENT_LIMIT_S) == Left("r1", "nonce")
         token.undeclare()
         assert {sample.payload.to_bytes() for sample in heard} == {b"forged"}  # its own words
@@ -226,7 +226,7 @@ def test_a_robot_that_is_revoked_during_a_run_is_told_why(folder: Path) -> None:
             assert host.next(EVENT_LIMIT_S) == Joined("r1", "r1")
             with pytest.raises(BusError, match="refuses r3: its certificate has been revoked"):
                 r3.next(EVENT_LIMIT_S)
-            host.send("r1", b"go on", patiently=True)
+            host.send("r1", b"go on", blocking=True)
             assert r1.next(EVENT_LIMIT_S) == b"go on"
 
     assert [text.partition(";")[0] for text in said] == [
@@ -313,7 +313,7 @@ def test_a_connection_that_is_reset_after_the_handshake_is_no_objection(
     monkeypatch.setattr(tls, "context", lambda _identity: Slow())
     with socket.create_server(("127.0.0.1", 0)) as listener, ThreadPoolExecutor(1) as pool:
         gone = pool.submit(reset, listener)
-        assert tls.objection(*listener.getsockname(), identity(folder, "r1")) == ""
+        assert tls.handshake_failure(*listener.getsockname(), identity(folder, "r1")) == ""
 
 
 def test_both_ends_need_the_same_kind_of_credentials(kantor: "Kantor") -> None:

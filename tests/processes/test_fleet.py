@@ -13,6 +13,7 @@ from kantor_fleet.scenarios.catalog import find
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.transport.endpoint import free_endpoint
 from kantor_worldsim.observers.metrics.density import DensityMetrics
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.world.world import WorldSetup
 from support.fleets import acts_of, await_act, await_line, children_named, records_of, result_of
 from support.limits import EVENT_LIMIT_S
@@ -29,7 +30,7 @@ LOSSY = (
 def detection(scenario: Scenario, seed: int) -> float:
     """The detection rate in virtual time."""
     site, metrics = WorldSetup.of(scenario, seed), DensityMetrics()
-    play(scenario, seed, site, [metrics.observe])
+    play(scenario, seed, site, [Pipeline(metrics).observe])
     return len(metrics.finds) / len(site.targets_m)
 
 

@@ -19,7 +19,7 @@ from kantor_protocol.transport.client import (
     participant_session,
 )
 from kantor_protocol.transport.endpoint import free_endpoint
-from kantor_protocol.transport.events import Flooded, Heard, Joined
+from kantor_protocol.transport.events import Flooded, Joined, Received
 from kantor_protocol.transport.rate_limit import BURST_BYTES, BURST_MESSAGES, RateLimit
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.zenoh_config import POSE_BYTES_MAX, SHOWN_PER_S
@@ -62,11 +62,11 @@ def next_of(host: HubRouter, kind: type) -> Joined:
     return event  # type: ignore[return-value]
 
 
-def until(host: HubRouter, payload: bytes) -> tuple[list[Heard], list[Flooded]]:
+def until(host: HubRouter, payload: bytes) -> tuple[list[Received], list[Flooded]]:
     """What comes before a message."""
     heard, flooded = [], []
     while (event := host.next(EVENT_LIMIT_S)) is not None:
-        if isinstance(event, Heard):
+        if isinstance(event, Received):
             if event.payload == payload:
                 return heard, flooded
             heard.append(event)
@@ -80,14 +80,14 @@ def test_other_robots_do_not_wait_behind_a_flood(tmp_path: Path) -> None:
     with hosted(tmp_path) as (host, honest, hostile, _):
         start_s = time.monotonic()
         for _ in range(MESSAGES):
-            hostile.send(b"flood", patiently=True)
-        honest.send(b"news", patiently=True)
+            hostile.send(b"flood", blocking=True)
+        honest.send(b"news", blocking=True)
         before, flooded = until(host, b"news")
         ahead, elapsed_s = len(before), time.monotonic() - start_s
         while sum(excess.messages for excess in host.excess.values()) + len(before) < MESSAGES:
             event = host.next(0.02)  # what is beyond the quota is no event
             assert time.monotonic() < start_s + EVENT_LIMIT_S
-            before += [event] if isinstance(event, Heard) else []
+            before += [event] if isinstance(event, Received) else []
             flooded += [event] if isinstance(event, Flooded) else []
 
         assert ahead <= BURST_MESSAGES + elapsed_s * QUOTA.messages_per_s
@@ -101,8 +101,8 @@ def test_long_messages_beyond_the_quota_are_dropped(tmp_path: Path) -> None:
     with hosted(tmp_path) as (host, honest, hostile, _):
         start_s = time.monotonic()
         for _ in range(LARGE_MESSAGES):
-            hostile.send(bytes(MIB), patiently=True)
-        honest.send(b"news", patiently=True)
+            hostile.send(bytes(MIB), blocking=True)
+        honest.send(b"news", blocking=True)
         before, _ = until(host, b"news")
         elapsed_s = time.monotonic() - start_s
 
@@ -124,8 +124,8 @@ def test_what_observers_see_is_limited_by_the_router(tmp_path: Path) -> None:
                     congestion_control=zenoh.CongestionControl.BLOCK,
                 )
             honest.publish_pose(bytes(POSE_BYTES_MAX))
-            honest.send(b"end", patiently=True)
-            hostile.send(b"end", patiently=True)
+            honest.send(b"end", blocking=True)
+            hostile.send(b"end", blocking=True)
             counts: dict[tuple[str, bytes], int] = {}
             ends = 0
             while ends < len(ROSTER):
@@ -155,7 +155,7 @@ def test_a_mission_after_a_flood_is_the_mission_without_it(kantor: "Kantor") -> 
     with participant_session(endpoint, identity, "flood", EVENT_LIMIT_S) as hostile:
         assert hostile.next(EVENT_LIMIT_S) is not None  # it is let in, and so is heard
         for _ in range(MESSAGES):
-            hostile.send(b"flood", patiently=True)
+            hostile.send(b"flood", blocking=True)
     robots = [kantor.start("agent", name, "--connect", endpoint) for name in ("r1", "r2")]
     for robot in robots:
         assert robot.wait(timeout=EVENT_LIMIT_S) == 0

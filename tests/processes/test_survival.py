@@ -353,7 +353,7 @@ def test_impossible_commands_are_refused_in_a_line(kantor: "Kantor") -> None:
     await_line(world, "t=")
     refused = kantor("agent", "r1", "--connect", endpoint, "--state", "file/below")
     assert refused.code == 2
-    assert "file/below: no diary can be kept there (Not a directory)" in refused.err
+    assert "file/below: no write-ahead log can be kept there (Not a directory)" in refused.err
     world.kill()
     world.wait()
 

@@ -20,7 +20,7 @@ from kantor_agent.mapping.cost_map import CostMap
 from kantor_agent.mapping.fused_map import FusedMap
 from kantor_agent.planners.map_base import Member, Situation, Task
 from kantor_protocol.base.counter_rng import Purpose, uniform
-from kantor_protocol.base.grid import NOWHERE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.base.grid import NOWHERE, OCCUPIED, UNKNOWN, Frame, neighbour
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.scenario.schema import Scenario
 
@@ -34,18 +34,6 @@ NO_REGION = -1
 
 Ints = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
-
-
-@kernel
-def beside(cell: int, side: int, columns: int, count: int) -> int:
-    """One of the four neighbours of a cell, or NOWHERE."""
-    if side == 0:
-        return cell - columns if cell >= columns else NOWHERE
-    if side == 1:
-        return cell - 1 if cell % columns > 0 else NOWHERE
-    if side == 2:
-        return cell + 1 if (cell + 1) % columns > 0 else NOWHERE
-    return cell + columns if cell + columns < count else NOWHERE
 
 
 @kernel
@@ -105,7 +93,7 @@ def gather(
             size -= 1
             cell = stack[size]
             for side in range(4):
-                n = beside(cell, side, columns, count)
+                n = neighbour(cell, side, columns, count)
                 if n >= 0 and cells[n] == UNKNOWN and region[n] == NO_REGION:
                     region[n] = 0
                     stack[size] = n
@@ -229,7 +217,7 @@ def find_contour(
         edge = cells[cell] != UNKNOWN and inside[its] == 0
         if cells[cell] == UNKNOWN:
             for side in range(4):
-                n = beside(cell, side, columns, cells.shape[0])
+                n = neighbour(cell, side, columns, cells.shape[0])
                 edge = edge or (n >= 0 and (region[n] != its or cells[n] != UNKNOWN))
         if edge:
             contour[edges] = cell
@@ -260,7 +248,7 @@ def measure_accessible(
         for side in range(5):
             c = frontiers[j]
             if side < 4:
-                c = beside(c, side, columns, cells.shape[0])
+                c = neighbour(c, side, columns, cells.shape[0])
                 if c < 0 or cells[c] != UNKNOWN or region[c] == NO_REGION:
                     continue
             elif inside[region[c]] > 0:

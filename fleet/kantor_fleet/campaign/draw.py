@@ -1,10 +1,10 @@
-"""What a seed stands for: a mission, its team, its radio, and what goes wrong in it.
+"""The scenario of a seed: a mission, its team, its radio, and its faults.
 
 Swarm-style (Groce et al., "Swarm testing", ISSTA 2012): every class of faults is in or out by a coin whose
 bias is drawn anew for each seed, so that some missions have one fault and some have all of them at once.
 
-A mission has two phases. Up to a moment that is drawn everything may go wrong (safety); after it nothing does,
-but that who is lost stays lost, and the team has to come to its end (liveness).
+A mission has two phases. Up to a moment that is drawn any fault may strike (safety); after it none does, but
+lost robots stay lost, and the team has to come to its end (liveness).
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -34,7 +34,7 @@ SORTS = {
     "map": 0.06,
 }
 """Sorts of missions and how often each is drawn: a transport ledger with claims and without, the minimum,
-multiscale coverage, samples that walk, a map that nobody knows."""
+multiscale coverage, samples that walk, an unknown map."""
 
 _MISSION, _TEAM, _RADIO, _CLOCK, _FAULTS, _PUBLISH, _LINGER = range(7)
 _A_CLASS = 16
@@ -43,9 +43,9 @@ _A_CLASS = 16
 _CENTRALIZED = 0.28
 _LINGER_PERIODS = 150
 _METRICS_EVERY = 20
-"""Nobody looks at the rows."""
+"""The rows are not read."""
 _TRIES = 6
-"""Faults that cannot be there together are drawn anew, so often."""
+"""So often faults that exclude each other are drawn again."""
 _LOST_SHARE = 0.5
 """Of the robots, at most, may be lost for good."""
 
@@ -82,7 +82,7 @@ def draw(seed: int) -> Scenario:
 
 
 def _lingering(seed: int, scenario: Scenario) -> Scenario:
-    """Half of the missions, where it is no long time, go on until news could be everywhere."""
+    """Half of the missions, where it takes no long time, go on until entries could be everywhere."""
     linger_ns = settling_ns(scenario, len(scenario.roster)) + 2 * scenario.period_ns
     if linger_ns > _LINGER_PERIODS * scenario.period_ns or not KeyedDraws(seed, _LINGER).coin():
         return scenario
@@ -210,7 +210,7 @@ def _publish(seed: int) -> Tree:
 
 
 def _radio(seed: int, tree: Tree) -> Tree:
-    """Ranges from nobody near to everybody; imperfections that stay when the faults are over."""
+    """Ranges that reach from no robot to all; imperfections that stay when the faults are over."""
     draws = KeyedDraws(seed, _RADIO)
     reach_m, period_s = tree.pop("reach_m"), tree["clock"]["period_s"]
     if tree["coordination"] == "centralized" and draws.coin(0.6):
@@ -236,16 +236,16 @@ def _radio(seed: int, tree: Tree) -> Tree:
 
 
 class Setting(NamedTuple):
-    """What faults are drawn for."""
+    """The mission for which faults are drawn."""
 
     scenario: Scenario
     calm_s: float
-    """All is over then."""
+    """All faults are over then."""
     draws: KeyedDraws
 
     @property
     def roster(self) -> tuple[ParticipantId, ...]:
-        """Everybody."""
+        """All participants."""
         return self.scenario.roster
 
     @property
@@ -261,7 +261,7 @@ class Setting(NamedTuple):
         return {"from_s": short(from_s), "until_s": short(min(from_s + length_s, calm_s))}
 
     def links(self) -> Tree:
-        """All links, or those of somebody."""
+        """All links, or those of some participants."""
         return {"robots": self.draws.some_of(self.roster)} if self.draws.coin(0.4) else {}
 
     def who(self, *others: ParticipantId) -> Tree:
@@ -382,7 +382,7 @@ _DRAWN: dict[str, Callable[[Setting], Tree]] = {
     "clock": _clock_fault,
     "impostor": lambda at: {"from_s": short(at.draws.unit() * at.calm_s), **at.who()},
 }
-"""What is drawn for each class. Whoever says nothing of a window gets one."""
+"""The fields drawn for each class. One that sets no window gets one."""
 
 _MANY = {"kill": 6, "pause": 4, "partition": 3, "clock": 3}
 """So often at most in one mission; any other class twice."""

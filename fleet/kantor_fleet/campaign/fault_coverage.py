@@ -1,4 +1,4 @@
-"""How often each class of faults struck, from the record of a mission."""
+"""Coverage: how often each class of faults struck, from the record of a mission."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -44,7 +44,7 @@ CLASSES: tuple[str, ...] = (
     "clock",
     "impostor",
 )
-"""All of them. A fault may count for several: a torn snapshot of the supervisor, say."""
+"""All classes. A fault may count for several, such as a kill of the supervisor with a torn log."""
 
 _STRIKES = frozenset({"kill", "pause", "fill", "slow", "skew", "pretend"})
 

@@ -1,4 +1,4 @@
-"""Keyed draws in the shapes that a scenario wants. Numbers are short, so that a person can read them."""
+"""Keyed draws in the shapes that a scenario takes. Numbers are short, so that a person can read them."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -14,7 +14,7 @@ def short(value: float) -> float:
 
 
 class KeyedDraws:
-    """Draws about one subject; what is drawn about one changes nothing about another."""
+    """Draws about one subject, which change no draw about another."""
 
     def __init__(self, seed: int, subject: int) -> None:
         self._seed, self._subject, self._drawn = seed, subject, 0
@@ -25,7 +25,7 @@ class KeyedDraws:
         return float(uniform(self._seed, Purpose.CAMPAIGN.value, self._subject, self._drawn, 0))
 
     def coin(self, probability: float = 0.5) -> bool:
-        """Heads."""
+        """True with a probability."""
         return self.unit() < probability
 
     def between(self, low: float, high: float) -> float:

@@ -1,4 +1,4 @@
-"""One mission of a campaign: in process, with every referee, and judged again from its record alone."""
+"""One mission of a campaign: in process, with every checker, and checked again from its record alone."""
 
 import tempfile
 import time
@@ -10,32 +10,37 @@ import msgspec
 
 from kantor_fleet.campaign.draw import sort_of
 from kantor_fleet.campaign.fault_coverage import FaultCoverage
+from kantor_fleet.campaign.invariants import Invariants
 from kantor_fleet.campaign.keyed_draws import KeyedDraws
-from kantor_fleet.campaign.merge_convergence import differing
+from kantor_fleet.campaign.merge_convergence import merge_shuffled
 from kantor_fleet.campaign.rare_events import RareEvents
 from kantor_fleet.execution.experiment import Case, Outcome, reason
-from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.execution.in_process_team import play, team
+from kantor_protocol.base.machine import WORLD_SIM
 from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.engine.event_loop import simulate
+from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.checker import Checker
 from kantor_worldsim.observers.checkers.liveness import LivenessChecker
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.observers.recording import Recording
-from kantor_worldsim.record.columnar import ColumnarDecoder
 from kantor_worldsim.record.journal import Digest, Journal, read
-from kantor_worldsim.record.records import Record, decode_record, encode_record
+from kantor_worldsim.record.records import Opening, Record, decode_record, encode_record
 from kantor_worldsim.record.run_folder import JOURNAL
 from kantor_worldsim.world.world import WorldSetup
 
 TWICE_EVERY = 20
 """One seed in so many is executed twice, for the same digest."""
 CUT_EVERY = 25
-"""One in so many has its journal cut anywhere, for a record that is still sound, and its messages learned in
+"""One in so many has its journal cut anywhere, for a record that is still sound, and its messages merged in
 another order."""
 _CUTS = 3
 _SUBJECT = 1000
 
 
 class Trial(Outcome, frozen=True, kw_only=True):
-    """What came of a mission."""
+    """The outcome of a mission."""
 
     sort: str = ""
     """See `draw.SORTS`."""
@@ -51,21 +56,21 @@ class Trial(Outcome, frozen=True, kw_only=True):
     """Of this machine, for the mission and all that was checked."""
     digest: str = ""
     complaints: tuple[str, ...] = ()
-    """What referees found, at most ten; `rule: when: who: what`."""
+    """The first ten violations; `rule: time: participant: text`."""
     struck: dict[str, int] = msgspec.field(default_factory=dict)
     """Copies or processes hit, by class of faults."""
     seen: dict[str, int] = msgspec.field(default_factory=dict)
-    """Rare situations; see `sightings`."""
+    """Rare situations; see `rare_events`."""
     twice: int = 0
     """1: executed twice."""
     cut: int = 0
     """How often its journal was cut."""
     joined: int = 0
-    """1: all that was said in it was learned in another order."""
+    """1: all its messages were merged in another order."""
 
     @property
     def violation(self) -> str | None:
-        """The first thing that is wrong, if anything is."""
+        """The first violation, or the crash, if there is one."""
         return self.failed or (self.complaints[0] if self.complaints else None)
 
     @property
@@ -75,20 +80,23 @@ class Trial(Outcome, frozen=True, kw_only=True):
 
 
 def rule_of(complaint: str) -> str:
-    """The rule that a complaint is about."""
+    """The rule that a violation is about."""
     return complaint.partition(":")[0]
 
 
-def attempt(case: Case) -> Trial:
-    """Run a case; whatever goes wrong is in the trial. It needs nothing but the case."""
+def attempt(case: Case, *, validate: bool = True) -> Trial:
+    """Run a case, and nothing but the case; a crash is in the trial too.
+
+    validate: participants and world-sim validate their state as well.
+    """
     started_s, cpu_s = time.monotonic(), time.process_time()
     try:
-        came = _attempt(case)
+        outcome = _attempt(case, validate=validate)
     except Exception as error:  # noqa: BLE001  a mission that crashes is a finding like any other
-        came = {"failed": reason(error)}
+        outcome = {"failed": reason(error)}
     scenario = case.scenario
     return Trial(
-        **came,
+        **outcome,
         sort=sort_of(scenario),
         planner=scenario.planner.name,
         centralized=scenario.centralized,
@@ -99,22 +107,46 @@ def attempt(case: Case) -> Trial:
 
 
 class Follower:
-    """All that follows a mission of a campaign. It stops the mission at the first violation."""
+    """Runs a mission of a campaign with all its observers, and stops it at the first violation."""
 
-    def __init__(self, scenario: Scenario, seed: int, folder: Path | None = None) -> None:
-        """folder: for the run's files, as `kantor run` leaves them; None keeps nothing."""
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int,
+        folder: Path | None = None,
+        *,
+        validate: bool = True,
+    ) -> None:
+        """folder: for the run's files, as `kantor run` leaves them; None keeps nothing.
+
+        validate: participants and world-sim validate their state as well.
+        """
         self.recording = Recording(scenario, seed, "in-process", folder)
         self.payloads: list[bytes] = []
-        self.struck, self.sightings = FaultCoverage(), RareEvents()
+        self.fault_coverage, self.rare_events = FaultCoverage(), RareEvents()
         self.judged: frozenset[str] = frozenset()
         """Rules of liveness that the record could have broken."""
+        self._scenario, self._seed = scenario, seed
+        self._invariants = Invariants() if validate else None
+
+    def run(self) -> str:
+        """Run the mission to its end, or to the first violation; why it ended."""
+        scenario, seed = self._scenario, self._seed
+        site = WorldSetup.of(scenario, seed)
+        machines = team(scenario, seed, site)
+        simulation = Simulation(scenario, seed, site, [self.observe])
+        if self._invariants is not None:
+            self._invariants.watch({**machines, WORLD_SIM: simulation})
+        exchange = InProcessExchange(machines)
+        return simulate(simulation, exchange, seed, lambda: self.broken, exchange)
 
     def observe(self, record: Record) -> None:
         """Follow one record."""
-        self.recording.observe(record)
-        self.payloads.append(self.recording.payload)
-        self.struck.observe(record)
-        self.sightings.observe(record)
+        self.payloads.append(self.recording.observe(record).payload)
+        self.fault_coverage.observe(record)
+        self.rare_events.observe(record)
+        if self._invariants is not None and not isinstance(record, Opening):
+            self._invariants.count(record.now_ns)
 
     @property
     def steps(self) -> int:
@@ -123,49 +155,49 @@ class Follower:
 
     @property
     def broken(self) -> bool:
-        """Whether a referee has complained."""
-        return self.recording.checker.count > 0
+        """Whether there is a violation so far."""
+        return self.recording.checker.count > 0 or bool(self._broken_invariants)
 
-    def complaints(self) -> tuple[str, ...]:
-        """What is wrong with the whole, once it is over: as it was seen, and from the record alone."""
-        seen = tuple(self.recording.checker.complaints[:10])
-        return seen or tuple(self._judged()[:10])
+    @property
+    def _broken_invariants(self) -> list[str]:
+        return self._invariants.violations if self._invariants is not None else []
 
-    def _judged(self) -> list[str]:
-        """What referees find who have nothing but the bytes of the record."""
-        decoder, liveness = ColumnarDecoder(), LivenessChecker()
-        checker = Checker(decoder)
+    def violations(self) -> tuple[str, ...]:
+        """The first violations of a mission that is over: as it ran, or by its record alone."""
+        seen = (*self.recording.checker.complaints[:10], *self._broken_invariants)
+        return seen[:10] or tuple(self._check_again()[:10])
+
+    def _check_again(self) -> list[str]:
+        """The violations that checkers find that have nothing but the bytes of the record."""
+        checker, liveness = Checker(), LivenessChecker()
+        pipeline = Pipeline(checker, liveness)
         for payload in self.payloads:
-            record = decode_record(payload)
-            decoder.read(record, payload)
-            checker.observe(record)
-            liveness.observe(record)
+            pipeline.observe(decode_record(payload), payload)
         self.judged = frozenset(liveness.judged)
         return checker.complaints or liveness.complaints
 
 
-def _attempt(case: Case) -> dict[str, Any]:
+def _attempt(case: Case, *, validate: bool) -> dict[str, Any]:
     scenario, seed = case.scenario, case.seed
-    site = WorldSetup.of(scenario, seed)
-    follower = Follower(scenario, seed)
-    ended = play(scenario, seed, site, [follower.observe], stopped=lambda: follower.broken)
+    follower = Follower(scenario, seed, validate=validate)
+    ended = follower.run()
     result = follower.recording.finish()
-    complaints = follower.complaints()
+    violations = follower.violations()
     twice, cut = seed % TWICE_EVERY == 0, seed % CUT_EVERY == 0
-    if twice and not complaints:
-        complaints = tuple(_differing(scenario, seed, result.digest))
-    if cut and not complaints:
-        complaints = tuple(_cut_open(seed, follower.payloads))
-    if cut and not complaints:
-        complaints = tuple(differing(scenario, seed, map(decode_record, follower.payloads)))
+    if twice and not violations:
+        violations = tuple(_run_again(scenario, seed, result.digest))
+    if cut and not violations:
+        violations = tuple(_cut_journal(seed, follower.payloads))
+    if cut and not violations:
+        violations = tuple(merge_shuffled(scenario, seed, map(decode_record, follower.payloads)))
     return {
         "ended": ended,
         "steps": follower.steps,
         "simulated_s": decode_record(follower.payloads[-1]).now_ns * 1e-9,  # type: ignore[union-attr]
         "digest": result.digest,
-        "complaints": complaints,
-        "struck": dict(follower.struck.counts),
-        "seen": follower.sightings.counts
+        "complaints": violations,
+        "struck": dict(follower.fault_coverage.counts),
+        "seen": follower.rare_events.counts
         | {f"{rule} judged": 1 for rule in sorted(follower.judged)},
         "twice": int(twice),
         "cut": _CUTS if cut else 0,
@@ -173,8 +205,8 @@ def _attempt(case: Case) -> dict[str, Any]:
     }
 
 
-def _differing(scenario: Scenario, seed: int, digest: str) -> Iterable[str]:
-    """The mission once more, from its scenario and seed."""
+def _run_again(scenario: Scenario, seed: int, digest: str) -> Iterable[str]:
+    """A violation if the mission, run again from its scenario and seed, has another digest."""
     again = Digest()
     site = WorldSetup.of(scenario, seed)
     play(scenario, seed, site, [lambda record: again.add(encode_record(record))])
@@ -182,8 +214,8 @@ def _differing(scenario: Scenario, seed: int, digest: str) -> Iterable[str]:
         yield f"digest: executed twice, and {again.hex} is not {digest}"
 
 
-def _cut_open(seed: int, payloads: list[bytes]) -> Iterable[str]:
-    """The journal as a killed recorder leaves it: every record up to the cut, and nothing wrong in them."""
+def _cut_journal(seed: int, payloads: list[bytes]) -> Iterable[str]:
+    """Violations in a journal as a killed recorder leaves it: it has every record up to the cut, and they are sound."""
     draws = KeyedDraws(seed, _SUBJECT)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / JOURNAL
@@ -197,9 +229,8 @@ def _cut_open(seed: int, payloads: list[bytes]) -> Iterable[str]:
             found = list(read(path))
             if [payload for payload, _ in found] != payloads[: len(found)]:
                 yield "prefix: what is left of a journal that was cut is not what was written"
-            decoder = ColumnarDecoder()
-            checker = Checker(decoder)
+            checker = Checker()
+            pipeline = Pipeline(checker)
             for payload, record in found:
-                decoder.read(record, payload)
-                checker.observe(record)
+                pipeline.observe(record, payload)
             yield from checker.complaints

@@ -1,8 +1,8 @@
-"""What a seed stands for on real processes: a team with a supervisor, and a storm of signals over it.
+"""The scenario of a seed on real processes: a team with a supervisor, and a storm of signals.
 
 Its times are drawn in real seconds, since what a process has to survive (a start, a lease) takes real time,
-and told to the scenario in simulated ones. How often each thing happens is not left to chance: a soak of a
-quarter of an hour must have seen enough of each.
+and converted to simulated ones for the scenario. The number of strikes of each kind is not left to chance: a
+soak of a quarter of an hour must have seen enough of each.
 """
 
 import math
@@ -26,11 +26,11 @@ from kantor_worldsim.observers.checkers.liveness import settling_ns
 Tree = dict[str, Any]
 
 STORM_S = 40.0
-"""Real time in which anything may go wrong."""
+"""Real time in which faults may strike."""
 SPEED = 8.0
 """Simulated seconds in a real one."""
 LOCKSTEP_EVERY = 6
-"""One mission in so many is run in lockstep, the others on the wall."""
+"""One mission in so many is run in lockstep, the others in real time."""
 _LONGER = 5.0
 """In lockstep, where no clock has to be waited for, a storm is so many times as long."""
 
@@ -46,15 +46,15 @@ _LOST = 0.2
 
 _CALM_START_S = 1.0
 _APART_S = 1.5
-"""From one fault of a process to its next: it is to be back from the first."""
+"""From one fault of a process to its next, so that it is back from the first."""
 _OUTAGE_MARGIN_S = 0.5
 _IMPOSTOR_S = 3.0
-"""While one is sent away, whom it would be must be there."""
+"""While an impostor is refused, the participant that it impersonates must run."""
 _TRIES = 60
 _REST_S = 90.0
 """After the storm a mission has so long to come to its end."""
 _SPENDING_SHARE = 0.8
-"""Of the storm robots have energy for; who was away has some left when it is over."""
+"""Of the storm robots have energy for; one that was down has some left when it is over."""
 _SUBJECT = 2000
 
 
@@ -121,7 +121,7 @@ def _team(seed: int, speed: float, pace: float, storm_s: float) -> Tree:
 
 
 def _lingering(scenario: Scenario, speed: float) -> Scenario:
-    """The mission goes on until news could be everywhere, and for a real second more."""
+    """The mission goes on until entries could be everywhere, and for a real second more."""
     linger_s = 1e-9 * settling_ns(scenario, len(scenario.roster)) + speed
     return msgspec.structs.replace(scenario, linger_s=short(linger_s))
 
@@ -133,7 +133,7 @@ def _of_links(at: Setting, kind: str) -> Iterator[Fault]:
 
 
 class _Timetable:
-    """When which process is hit. Times in here are real seconds since the start."""
+    """The times at which faults strike processes, in real seconds since the start."""
 
     def __init__(self, draws: KeyedDraws, scenario: Scenario, pace: float, storm_s: float) -> None:
         self._draws, self._scenario = draws, scenario
@@ -143,20 +143,20 @@ class _Timetable:
         self._faults: list[Fault] = []
 
     def draw(self) -> list[Fault]:
-        """Everything that befalls processes, what has the least room first."""
+        """All faults of processes, those with the least room first."""
         draws, robots = self._draws, self._scenario.robot_ids
-        self._times(_WORLD_SIM_KILLS, lambda: self._kill(WORLD_SIM))
-        self._times(_WORLD_SIM_PAUSES, lambda: self._pause(WORLD_SIM))
+        self._repeat(_WORLD_SIM_KILLS, lambda: self._kill(WORLD_SIM))
+        self._repeat(_WORLD_SIM_PAUSES, lambda: self._pause(WORLD_SIM))
         if draws.coin(_PROBABILITIES["late"]):
             self._late(draws.one_of(robots))
         for _ in range(self._some("impostor")):
             self._strike("impostor", draws.one_of(self._scenario.roster), None, _IMPOSTOR_S)
         if draws.coin(_LOST):
             self._lose(draws.one_of(robots))
-        self._times(_SUPERVISOR_KILLS, lambda: self._kill(SUPERVISOR))
-        self._times(_ROBOT_KILLS, lambda: self._kill(draws.one_of(robots)))
-        self._times(_SUPERVISOR_PAUSES, lambda: self._pause(SUPERVISOR))
-        self._times(_ROBOT_PAUSES, lambda: self._pause(draws.one_of(robots)))
+        self._repeat(_SUPERVISOR_KILLS, lambda: self._kill(SUPERVISOR))
+        self._repeat(_ROBOT_KILLS, lambda: self._kill(draws.one_of(robots)))
+        self._repeat(_SUPERVISOR_PAUSES, lambda: self._pause(SUPERVISOR))
+        self._repeat(_ROBOT_PAUSES, lambda: self._pause(draws.one_of(robots)))
         for _ in range(self._some("slow")):
             name, every = draws.one_of(self._scenario.roster), draws.whole(2, 5)
             self._strike("slow", name, draws.between(1.0, 4.0), every=every)
@@ -167,8 +167,8 @@ class _Timetable:
             self._clock(draws.one_of(self._scenario.roster))
         return self._faults
 
-    def _times(self, in_storm: float, strike: Callable[[], bool]) -> None:
-        """So often, in proportion to the storm; what is over a whole number is a chance."""
+    def _repeat(self, in_storm: float, strike: Callable[[], bool]) -> None:
+        """Strike so often, in proportion to the storm; a fraction is the probability of one more."""
         wanted = in_storm * self._storm_s / STORM_S
         times = max(1, math.floor(wanted + self._draws.unit())) if in_storm >= 1.0 else 0
         times = times or int(self._draws.coin(min(1.0, wanted)))
@@ -217,7 +217,7 @@ class _Timetable:
         stops: bool = True,
         **more: object,
     ) -> bool:
-        """Somewhere in the storm, if there is room. takes_s: real time that one without an end takes."""
+        """Strike somewhere in the storm, if there is room. takes_s: real time that a fault without an end takes."""
         length_s = None if length_s is None else min(length_s, self._storm_s / 3.0)
         room_s = length_s or takes_s
         for _ in range(_TRIES):
@@ -252,7 +252,7 @@ class _Timetable:
         more: Tree,
         takes_s: float | None = 0.0,
     ) -> bool:
-        """Note a fault, unless it cannot be there with the others."""
+        """Add a fault, unless the others exclude it."""
         tree: Tree = {"kind": kind, "who": [name], "from_s": short(from_s * self._pace)} | more
         if until_s is not None and until_s < math.inf:
             tree["until_s"] = short(until_s * self._pace)

@@ -1,7 +1,7 @@
 """`kantor campaign --processes`: missions on real processes over the bus, under storms of real signals.
 
-World-sim, robots and the supervisor are processes of their own. They are killed, frozen, starved and doubled
-as a seed says, world-sim too, and every mission has to come to its end with every rule kept: as it was seen,
+World-sim, robots and the supervisor are processes of their own. A seed decides when they are killed, paused,
+slowed and impersonated, world-sim too, and every mission has to come to its end with every rule kept: as it ran,
 and read again from its file alone.
 """
 
@@ -44,6 +44,7 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.transport.session import BusError
 from kantor_worldsim.engine.process_faults import schedule_of
 from kantor_worldsim.observers.checkers.liveness import LivenessChecker
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.journal import Digest, read
 from kantor_worldsim.record.records import Batch, ProcessEvent, Record, encode_record
 from kantor_worldsim.record.run_folder import JOURNAL, SCENARIO
@@ -68,7 +69,7 @@ class Terms(NamedTuple):
 
 
 class Soak(NamedTuple):
-    """A campaign on processes, and what is wanted of it."""
+    """The seeds of a campaign on processes, its folder and its terms."""
 
     seeds: Sequence[int]
     folder: Path
@@ -79,7 +80,7 @@ class Soak(NamedTuple):
 
 
 class ProcessMission(NamedTuple):
-    """What came of a mission."""
+    """The outcome of a mission."""
 
     seed: int
     exchange: str
@@ -89,18 +90,18 @@ class ProcessMission(NamedTuple):
     struck: Counter[str]
     """Processes, or copies of messages, by class of faults."""
     rejoined_s: tuple[float, ...] = ()
-    """Of participants: real time from the order to start to the first step that the world accepted."""
+    """Of participants: real time from the order to start to the first step that world-sim accepted."""
     resumed_s: tuple[float, ...] = ()
-    """Of world-sim: until anybody's step was accepted."""
+    """Of world-sim: until the first step of a participant was accepted."""
     steps: int = 0
     incarnations: int = 0
     judged: frozenset[str] = frozenset()
     """Rules of liveness that the record could have broken."""
-    grown: dict[str, Grown] = {}  # noqa: RUF012  nobody writes to it
+    grown: dict[str, Grown] = {}  # noqa: RUF012  it is only read
 
 
 def soak(config: Soak) -> Exit:
-    """Fly mission after mission, up to the first that breaks a rule; what to exit with."""
+    """Run mission after mission, up to the first that breaks a rule; the exit code."""
     started_s = time.monotonic()
     totals = Totals(config.rejoin_s)
     with Interrupts() as interrupts, _own_temporary_folder() as temporary:
@@ -111,12 +112,12 @@ def soak(config: Soak) -> Exit:
             if config.minutes is not None and spent_s >= 60.0 * config.minutes:
                 break
             place = config.folder / FOLDER / f"seed-{seed}"
-            flight = run_mission(seed, config.terms, place, interrupts, temporary)
+            mission = run_mission(seed, config.terms, place, interrupts, temporary)
             if interrupts():
                 break
-            totals.add(flight)
-            print(_line(flight, totals, time.monotonic() - started_s), flush=True)
-            if flight.complaints:
+            totals.add(mission)
+            print(_line(mission, totals, time.monotonic() - started_s), flush=True)
+            if mission.complaints:
                 break
             shutil.rmtree(place)
     for line in totals.lines(time.monotonic() - started_s):
@@ -127,24 +128,24 @@ def soak(config: Soak) -> Exit:
 
 
 def replay(seed: int, folder: Path, terms: Terms) -> Exit:
-    """Fly the mission of one seed, and leave its run folder."""
+    """Run the mission of one seed, and leave its run folder."""
     with Interrupts() as interrupts, _own_temporary_folder() as temporary:
         warm_up()
         place = folder / FOLDER / f"seed-{seed}"
-        flight = run_mission(seed, terms, place, interrupts, temporary)
+        mission = run_mission(seed, terms, place, interrupts, temporary)
     totals = Totals()
-    totals.add(flight)
-    print(_line(flight, totals, flight.wall_s))
-    for complaint in flight.complaints:
-        print(f"  VIOLATION  {printable(complaint)}")
+    totals.add(mission)
+    print(_line(mission, totals, mission.wall_s))
+    for violation in mission.complaints:
+        print(f"  VIOLATION  {printable(violation)}")
     print(f"  {place}/  ({', '.join(sorted(path.name for path in place.iterdir()))})")
-    return interrupts.code or (Exit.NOT_MET if flight.complaints else Exit.DONE)
+    return interrupts.code or (Exit.NOT_MET if mission.complaints else Exit.DONE)
 
 
 def run_mission(
     seed: int, terms: Terms, folder: Path, stopped: Interrupts, temporary: Path
 ) -> ProcessMission:
-    """One mission, judged. folder: for its files, made anew. temporary: where nothing may be left."""
+    """Run and check one mission. folder: for its files, emptied before. temporary: where nothing may be left."""
     started_s = time.monotonic()
     scenario = process_scenario(seed, terms.speed, terms.storm_s)
     shutil.rmtree(folder, ignore_errors=True)
@@ -157,23 +158,21 @@ def run_mission(
     failures += [f"leftover: {name} in {temporary}" for name in _entries(temporary) - before]
     if stopped():
         return ProcessMission(seed, exchange, "interrupted", 0.0, (), Counter())
-    return _judged_apart(config, failures)._replace(
-        wall_s=time.monotonic() - started_s, grown=grown
-    )
+    return _check_apart(config, failures)._replace(wall_s=time.monotonic() - started_s, grown=grown)
 
 
 def _run(config: FleetConfig, stopped: Interrupts) -> tuple[list[str], dict[str, Grown]]:
-    """Run the fleet to its end; what failed, and how it has grown."""
+    """Run the fleet to its end; its failures, and the growth of its processes."""
     scenario = config.scenario
     give_up_s = time.monotonic() + scenario.limit_ns * 1e-9 / config.speed + _GRACE_S
     failures: list[str] = []
     with local_fleet(config) as fleet:
-        watch = RssMonitor(fleet)
+        rss_monitor = RssMonitor(fleet)
         periods = 0
         try:
             for progress in watch_progress(fleet):
                 periods = progress.now_ns // scenario.period_ns if progress else periods
-                watch.look(periods)
+                rss_monitor.sample(periods)
                 failures += _newly_failed(fleet)
                 late = time.monotonic() >= give_up_s
                 if late or stopped():
@@ -186,7 +185,7 @@ def _run(config: FleetConfig, stopped: Interrupts) -> tuple[list[str], dict[str,
         failures += _newly_failed(fleet)
         if fleet.world_sim.exitcode:
             failures.append(f"process: world-sim ended with {fleet.world_sim.exitcode}")
-    return failures, watch.grown()
+    return failures, rss_monitor.grown()
 
 
 def _newly_failed(fleet: Fleet) -> list[str]:
@@ -204,15 +203,15 @@ def _orphans() -> list[int]:
     return left
 
 
-def _judged_apart(config: FleetConfig, failures: list[str]) -> ProcessMission:
-    """Judged in a process of its own: a whole record in memory would leave this one as large for ever."""
+def _check_apart(config: FleetConfig, failures: list[str]) -> ProcessMission:
+    """Check a mission in another process, since a whole record in memory would make this one larger for good."""
     context = multiprocessing.get_context("forkserver")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(_judged, config, failures).result()
+        return pool.submit(_check, config, failures).result()
 
 
-def _judged(config: FleetConfig, failures: list[str]) -> ProcessMission:
-    """A mission by what it has left on file."""
+def _check(config: FleetConfig, failures: list[str]) -> ProcessMission:
+    """Check a mission by its files."""
     folder, scenario = config.folder, config.scenario
     result = read_result(folder)
     if result is None:
@@ -222,20 +221,21 @@ def _judged(config: FleetConfig, failures: list[str]) -> ProcessMission:
         )
     journal = list(read(folder / JOURNAL))
     records = [record for _, record in journal]
-    struck, liveness = FaultCoverage(), LivenessChecker()
-    for record in records:
-        struck.observe(record)
-        liveness.observe(record)
-    complaints = [*failures, *result.complaints]
+    coverage, liveness = FaultCoverage(), LivenessChecker()
+    pipeline = Pipeline(liveness)
+    for payload, record in journal:
+        coverage.observe(record)
+        pipeline.observe(record, payload)
+    violations = [*failures, *result.complaints]
     if result.ended != "done" or result.record != "whole":
-        complaints.append(f"end: {result.ended}; record {result.record}")
-    complaints += [f"verify: {line}" for held, line in findings(folder, journal) if not held]
-    complaints += liveness.complaints
-    complaints += [f"{i.who}: let in" for i in _incidents(records) if i.kind == "let in"]
+        violations.append(f"end: {result.ended}; record {result.record}")
+    violations += [f"verify: {line}" for held, line in findings(folder, journal) if not held]
+    violations += liveness.complaints
+    violations += [f"{i.who}: let in" for i in _process_events(records) if i.kind == "let in"]
     rejoined_s: tuple[float, ...] = ()
     resumed_s: tuple[float, ...] = ()
     if config.exchange == "lockstep":
-        complaints += _differing(scenario, config.seed, result.digest)
+        violations += _run_again(scenario, config.seed, result.digest)
     else:
         rejoined_s, resumed_s = _back_s(scenario, records, config.speed)
     return ProcessMission(
@@ -243,8 +243,8 @@ def _judged(config: FleetConfig, failures: list[str]) -> ProcessMission:
         config.exchange,
         result.ended,
         0.0,
-        tuple(complaints[:10]),
-        struck.counts,
+        tuple(violations[:10]),
+        coverage.counts,
         rejoined_s,
         resumed_s,
         sum(
@@ -258,12 +258,12 @@ def _judged(config: FleetConfig, failures: list[str]) -> ProcessMission:
     )
 
 
-def _incidents(records: Sequence[Record]) -> list[ProcessEvent]:
+def _process_events(records: Sequence[Record]) -> list[ProcessEvent]:
     return [record for record in records if isinstance(record, ProcessEvent)]
 
 
-def _differing(scenario: Scenario, seed: int, digest: str) -> Iterator[str]:
-    """The mission of a lockstep run once more, in this process."""
+def _run_again(scenario: Scenario, seed: int, digest: str) -> Iterator[str]:
+    """A violation if the mission of a lockstep run has another digest in this process."""
     alone = Digest()
     play(
         scenario,
@@ -278,13 +278,15 @@ def _differing(scenario: Scenario, seed: int, digest: str) -> Iterator[str]:
 def _back_s(
     scenario: Scenario, records: Sequence[Record], speed: float
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """How long everybody who was started again took, in real seconds: participants, and world-sim.
+    """Real seconds from a restart to the first step that follows: of participants, and of world-sim.
 
-    Deeds are done one after the other, so a participant's start is ordered when it is due and the deed
-    before is done. Clocks of participants run on while world-sim is down, and it goes on by them.
+    Scheduled process faults are injected one after the other, so a participant's start is ordered when it is due
+    and the one before is done. Clocks of participants run on while world-sim is down, and it goes on by them.
     """
     due_ns = {
-        (deed.fault, deed.who): deed.at_ns for deed in schedule_of(scenario) if deed.kind == "start"
+        (scheduled.fault, scheduled.who): scheduled.at_ns
+        for scheduled in schedule_of(scenario)
+        if scheduled.kind == "start"
     }
     killed: set[ParticipantId] = set()
     ordered_ns: dict[ParticipantId, int] = {}
@@ -300,12 +302,12 @@ def _back_s(
                 ordered_ns[who] = due if who == WORLD_SIM else max(before_ns, due)
             before_ns = record.now_ns
         elif isinstance(record, Batch) and ordered_ns:
-            acted = {
+            stepped = {
                 step_record.name
                 for step_record in record.step_records
                 if step_record.outputs is not None
             }
-            for who in (acted | ({WORLD_SIM} if acted else set())) & ordered_ns.keys():
+            for who in (stepped | ({WORLD_SIM} if stepped else set())) & ordered_ns.keys():
                 waited_ns = record.now_ns - ordered_ns.pop(who)
                 back_s[who == WORLD_SIM].append(waited_ns * 1e-9 / speed)
     return tuple(back_s[False]), tuple(back_s[True])
@@ -318,7 +320,7 @@ class Totals:
         self._rejoin_s = rejoin_s
         self.broken: ProcessMission | None = None
         self.struck: Counter[str] = Counter()
-        """On the wall, and in lockstep where that is a signal as well."""
+        """In real time, and in lockstep where a fault is a signal as well."""
         self._missions: Counter[str] = Counter()
         self._judged: Counter[str] = Counter()
         self._rejoined_s: list[float] = []
@@ -327,26 +329,26 @@ class Totals:
         self._lasting = Lasting()
         self._steps = self._incarnations = 0
 
-    def add(self, flight: ProcessMission) -> None:
+    def add(self, mission: ProcessMission) -> None:
         """One more mission."""
-        self.broken = flight if flight.complaints else self.broken
-        real = dict(flight.struck)
-        if flight.exchange == "lockstep":  # nobody is stopped there, only left out
+        self.broken = mission if mission.complaints else self.broken
+        real = dict(mission.struck)
+        if mission.exchange == "lockstep":  # no process is stopped there, only left out
             real = {name: n for name, n in real.items() if not name.startswith(("pause", "slow"))}
         self.struck.update(real)
-        self._missions[flight.exchange] += 1
-        self._judged.update(flight.judged)
-        self._rejoined_s += flight.rejoined_s
-        self._resumed_s += flight.resumed_s
-        self._steps += flight.steps
-        self._incarnations += flight.incarnations
-        for kind, grown in flight.grown.items():
+        self._missions[mission.exchange] += 1
+        self._judged.update(mission.judged)
+        self._rejoined_s += mission.rejoined_s
+        self._resumed_s += mission.resumed_s
+        self._steps += mission.steps
+        self._incarnations += mission.incarnations
+        for kind, grown in mission.grown.items():
             self._grown[kind] = self._grown.get(kind, Grown()) + grown
-        self._lasting.look()
+        self._lasting.sample()
 
     @property
     def met(self) -> bool:
-        """No rule was broken, whoever was started again was back in time, and memory was flat."""
+        """No rule was broken, every restarted process was back in time, and memory was flat."""
         rejoined_s = _quantile(self._rejoined_s, 0.99)
         return self.broken is None and rejoined_s < self._rejoin_s and self._is_flat
 
@@ -357,7 +359,7 @@ class Totals:
         return flat and max(lasting) <= FLAT_LASTING_MB
 
     def signals(self) -> str:
-        """How often the four signals were sent that matter most."""
+        """How often processes were killed and paused."""
         robots, supervisor, world = (
             [self.struck[f"{kind}{who}"] for kind in ("kill", "pause")]
             for who in ("", " supervisor", " worldsim")
@@ -373,7 +375,7 @@ class Totals:
         """In words. wall_s: real time of this command."""
         missions, broken = self._missions.total(), int(self.broken is not None)
         yield (
-            f"{missions} missions ({self._missions['wall']} on the wall, "
+            f"{missions} missions ({self._missions['wall']} in real time, "
             f"{self._missions['lockstep']} in lockstep) in {wall_s / 60.0:.1f} min, "
             f"{broken} with violations; {self._steps} steps"
         )
@@ -389,8 +391,8 @@ class Totals:
             f"  disks      {', '.join(kinds)}, {self.struck['kill for good']} killed for good; "
             f"{self._incarnations} new incarnations"
         )
-        yield f"  rejoined   {_told(self._rejoined_s, self._rejoin_s)}"
-        yield f"  resumed    world-sim {_told(self._resumed_s)}"
+        yield f"  rejoined   {_quantiles(self._rejoined_s, REJOIN_S)}"
+        yield f"  resumed    world-sim {_quantiles(self._resumed_s)}"
         yield f"  liveness   {', '.join(f'{rule} judged {n}' for rule, n in sorted(self._judged.items()))}"
         yield from self._memory()
         yield "  left over  no process, no file" if not broken else "  left over  see the violation"
@@ -399,8 +401,8 @@ class Totals:
         for kind, grown in sorted(self._grown.items()):
             yield (
                 f"  memory     {kind}: {grown.mb_per_1000:+.2f} MB in 1000 periods "
-                f"({grown.lives} lives, {grown.periods:.0f} periods; at most {grown.most_mb:+.1f} MB in "
-                f"a life, peak {grown.peak_mb:.0f} MB)"
+                f"({grown.processes} processes, {grown.periods:.0f} periods; at most {grown.most_mb:+.1f} MB in "
+                f"one, peak {grown.peak_mb:.0f} MB)"
             )
         if (lasting := self._lasting.grown_mb) is not None:
             yield f"  memory     from the third mission on: campaign {lasting[0]:+.1f} MB, fork server {lasting[1]:+.1f} MB"
@@ -416,38 +418,38 @@ def _quantile(values: list[float], share: float) -> float:
     return ordered[-(-round(1000 * share) * len(ordered) // 1000) - 1] if ordered else 0.0
 
 
-def _told(times_s: list[float], bound_s: float | None = None) -> str:
+def _quantiles(times_s: list[float], bound_s: float | None = None) -> str:
     if not times_s:
-        return "nobody"
+        return "none"
     p50, p99 = (_quantile(times_s, share) for share in (0.5, 0.99))
-    told = f"{len(times_s)} times: p50 {p50:.2f} s, p99 {p99:.2f} s, at most {max(times_s):.2f} s"
+    text = f"{len(times_s)} times: p50 {p50:.2f} s, p99 {p99:.2f} s, at most {max(times_s):.2f} s"
     if bound_s is None:
-        return told
-    return f"{told}; {'below' if p99 < bound_s else 'NOT BELOW'} {bound_s:g} s"
+        return text
+    return f"{text}; {'below' if p99 < bound_s else 'NOT BELOW'} {bound_s:g} s"
 
 
-def _line(flight: ProcessMission, totals: Totals, spent_s: float) -> str:
-    """A mission in one line, and how far the campaign is."""
+def _line(mission: ProcessMission, totals: Totals, spent_s: float) -> str:
+    """A mission in one line, with the signals of the campaign so far."""
     minutes, seconds = divmod(round(spent_s), 60)
-    verdict = "all rules held" if not flight.complaints else "VIOLATION"
-    slowest_s = max(flight.rejoined_s, default=0.0)
+    verdict = "all rules held" if not mission.complaints else "VIOLATION"
+    slowest_s = max(mission.rejoined_s, default=0.0)
     return (
-        f"{minutes:2d}:{seconds:02d}  seed {flight.seed} ({flight.exchange}): {flight.ended} in "
-        f"{flight.wall_s:.0f} s, {verdict}; back in at most {slowest_s:.2f} s; so far {totals.signals()}"
+        f"{minutes:2d}:{seconds:02d}  seed {mission.seed} ({mission.exchange}): {mission.ended} in "
+        f"{mission.wall_s:.0f} s, {verdict}; back in at most {slowest_s:.2f} s; so far {totals.signals()}"
     )
 
 
-def _report(flight: ProcessMission, config: Soak) -> None:
-    """Everything that is needed to see it again."""
+def _report(mission: ProcessMission, config: Soak) -> None:
+    """Print all that is needed to repeat a violation."""
     terms = config.terms
-    place = config.folder / FOLDER / f"seed-{flight.seed}"
-    (place / SCENARIO).write_text(to_toml(process_scenario(flight.seed, *terms)), encoding="utf-8")
-    print(f"VIOLATION  seed {flight.seed} ({flight.exchange})")
-    for complaint in flight.complaints:
-        print(f"  {printable(complaint)}")
+    place = config.folder / FOLDER / f"seed-{mission.seed}"
+    (place / SCENARIO).write_text(to_toml(process_scenario(mission.seed, *terms)), encoding="utf-8")
+    print(f"VIOLATION  seed {mission.seed} ({mission.exchange})")
+    for violation in mission.complaints:
+        print(f"  {printable(violation)}")
     print(f"  commit     {commit()}, sources {code()[:16]}")
     print(
-        f"  replay     kantor campaign --processes --replay {flight.seed} "
+        f"  replay     kantor campaign --processes --replay {mission.seed} "
         f"--speed {terms.speed:g} --storm {terms.storm_s:g}"
     )
     print(f"  kept       {place}/")
@@ -455,7 +457,7 @@ def _report(flight: ProcessMission, config: Soak) -> None:
 
 @contextmanager
 def _own_temporary_folder() -> Iterator[Path]:
-    """Everything temporary of this process and its children is below it, and nobody else's."""
+    """A folder with everything temporary of this process and its children, and of no other."""
     get_temp_dir()  # what multiprocessing has of its own goes when this process does
     before = tempfile.tempdir, os.environ.get("TMPDIR")
     with tempfile.TemporaryDirectory(prefix="kantor-") as folder:
@@ -470,5 +472,5 @@ def _own_temporary_folder() -> Iterator[Path]:
 
 
 def _entries(folder: Path) -> set[str]:
-    """What is in a folder."""
+    """The names in a folder."""
     return {path.name for path in folder.iterdir()}

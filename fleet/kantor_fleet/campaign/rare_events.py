@@ -1,7 +1,7 @@
 """Rare situations, looked for in the record of a mission.
 
-A campaign in which nothing broke proves little unless what is hard has happened in it. So there is a list of
-what must have been seen, after the "sometimes" assertions of Antithesis and of FoundationDB's tests.
+A campaign without violations proves little unless difficult situations have happened in it. This is the list of
+those that must have been seen, after the "sometimes" assertions of Antithesis and of FoundationDB's tests.
 """
 
 from collections import Counter
@@ -21,14 +21,14 @@ from kantor_protocol.scenario.faults.links import FORGED_SEQUENCE_MIN, OneWay, P
 from kantor_protocol.scenario.faults.processes import ClockFault, Kill, Late
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
-from kantor_protocol.wire.version_vector import covered_ids, read_version_vector
+from kantor_worldsim.observers.metrics.gossip_reader import read_lengths
 from kantor_worldsim.radio.channel import DROPPED
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
 
 Pair = tuple[float, float]
 
 
-class _RareEvent:
+class _Detector:
     """Looks for situations of one subject, and counts them under their names."""
 
     names: ClassVar[tuple[str, ...]] = ()
@@ -38,22 +38,22 @@ class _RareEvent:
         self.seen: Counter[str] = Counter()
 
     @classmethod
-    def can_be(cls, _scenario: Scenario) -> bool:
-        """Whether there is anything to look for in a mission."""
+    def applies(cls, _scenario: Scenario) -> bool:
+        """Whether a mission can have these situations."""
         return True
 
     def step_record(self, step_record: StepRecord, outputs: Outputs) -> None:
-        """Somebody stepped."""
+        """Follow a step."""
 
     def batch(self, batch: Batch) -> None:
-        """After the acts of a batch."""
+        """Follow a batch, after its steps."""
 
-    def incident(self, incident: ProcessEvent) -> None:
-        """Something befell a process."""
+    def process_event(self, incident: ProcessEvent) -> None:
+        """Follow an event of a process."""
 
 
-class _Ears(_RareEvent):
-    """What comes twice, late, from the dead, or from nobody."""
+class _Deliveries(_Detector):
+    """Messages that arrive twice, late, from a former incarnation, or forged."""
 
     names = (
         "heard twice",
@@ -68,7 +68,7 @@ class _Ears(_RareEvent):
         self._newest: dict[ParticipantId, dict[ParticipantId, int]] = {
             name: {} for name in self.scenario.roster
         }
-        """For each hearer, by source."""
+        """The highest number heard, for each receiver by source."""
         self._missing: dict[tuple[ParticipantId, ParticipantId], set[int]] = {}
         """Numbers below the newest of a link that were not heard."""
         self._restarted: set[ParticipantId] = set()
@@ -109,7 +109,7 @@ class _Ears(_RareEvent):
         if sequence < newest and link[0] in self._restarted:
             self.seen["stale word after a restart"] += 1
 
-    def incident(self, incident: ProcessEvent) -> None:
+    def process_event(self, incident: ProcessEvent) -> None:
         if incident.kind == "start" and incident.step > 0:
             self._restarted.add(incident.who)
             self._refused[incident.who] = 0
@@ -117,8 +117,8 @@ class _Ears(_RareEvent):
                 self._born[incident.who] = incident.step
 
 
-class _Lives(_RareEvent):
-    """Deaths and births at awkward moments."""
+class _Restarts(_Detector):
+    """Kills and restarts at awkward moments."""
 
     names = (
         "death between note and answer",
@@ -145,7 +145,7 @@ class _Lives(_RareEvent):
                 by_supervisor = decision.source == SUPERVISOR
                 self._due_ns[by_supervisor] = max(self._due_ns[by_supervisor], decision.due_ns)
 
-    def incident(self, incident: ProcessEvent) -> None:
+    def process_event(self, incident: ProcessEvent) -> None:
         who, now_ns = incident.who, incident.now_ns
         if incident.kind == "kill":
             fault = self.scenario.faults[incident.fault]
@@ -163,18 +163,18 @@ class _Lives(_RareEvent):
                 self.seen["restart during a partition"] += 1
 
 
-class _Memory(_RareEvent):
-    """Who was away, or forgot all, and learns it from the others."""
+class _Recoveries(_Detector):
+    """Participants that were away, or lost all, and get it from the others."""
 
     names = ("late joiner knows all that was known", "log of a former incarnation came back")
 
     @classmethod
-    def can_be(cls, scenario: Scenario) -> bool:
+    def applies(cls, scenario: Scenario) -> bool:
         return any(isinstance(fault, Kill | Late) for fault in scenario.faults)
 
     def __init__(self, opening: Opening) -> None:
         super().__init__(opening)
-        self._bodies: dict[ParticipantId, bytes] = {}
+        self._last_bodies: dict[ParticipantId, bytes] = {}
         self._wanted: dict[ParticipantId, list[int]] = {}
         self._lost: dict[ParticipantId, int] = {}
         self._names = self.scenario.roster
@@ -183,7 +183,7 @@ class _Memory(_RareEvent):
         if not outputs.outbox:
             return
         name, body = step_record.name, outputs.outbox[-1].body
-        self._bodies[name] = body
+        self._last_bodies[name] = body
         if name in self._wanted and _covers(self._version_vector(body), self._wanted[name]):
             self.seen["late joiner knows all that was known"] += 1
             del self._wanted[name]
@@ -191,13 +191,15 @@ class _Memory(_RareEvent):
             self.seen["log of a former incarnation came back"] += 1
             del self._lost[name]
 
-    def incident(self, incident: ProcessEvent) -> None:
+    def process_event(self, incident: ProcessEvent) -> None:
         if incident.kind != "start":
             return
         who = incident.who
         if incident.fault >= 0 and isinstance(self.scenario.faults[incident.fault], Late):
             known = [
-                self._version_vector(body) for name, body in self._bodies.items() if name != who
+                self._version_vector(body)
+                for name, body in self._last_bodies.items()
+                if name != who
             ]
             width = max(map(len, known), default=0)
             most = [
@@ -206,27 +208,27 @@ class _Memory(_RareEvent):
             ]
             if any(most):
                 self._wanted[who] = most
-        elif incident.incarnation and who in self._bodies:
+        elif incident.incarnation and who in self._last_bodies:
             count = len(self._names)
             self._lost[who] = (incident.incarnation - 1) * count + self._names.index(who)
 
     def _version_vector(self, body: bytes) -> list[int]:
-        """How many entries of every log its sender says that it holds."""
+        """The log lengths that the sender of a message holds."""
         try:
             version_vector = decode_gossip(body).version_vector
         except RefusedError:
             return []
-        slots = covered_ids(version_vector, len(self._names), claims=self.scenario.claiming)
-        return (slots and read_version_vector(version_vector, slots)) or []
+        claims = self.scenario.claiming
+        return read_lengths(version_vector, len(self._names), claims=claims) or []
 
 
-class _Goals(_RareEvent):
-    """Goals that others take away."""
+class _Goals(_Detector):
+    """Goals that a message of another robot takes away."""
 
     names = ("merge that removes the current goal", "one goal of two, left to one by a claim")
 
     @classmethod
-    def can_be(cls, scenario: Scenario) -> bool:
+    def applies(cls, scenario: Scenario) -> bool:
         return scenario.planner.name == "transport" and scenario.samples.diffusion_m == 0.0
 
     def __init__(self, opening: Opening) -> None:
@@ -259,13 +261,13 @@ class _Goals(_RareEvent):
             yield from zip(pairs[0].tolist(), pairs[1].tolist(), strict=True)
 
 
-class _Sides(_RareEvent):
-    """What two sides of a partition did without knowing of each other."""
+class _Partitions(_Detector):
+    """Spending of two sides of a partition that did not know of each other."""
 
     names = ("partition healed after both sides consumed one sample",)
 
     @classmethod
-    def can_be(cls, scenario: Scenario) -> bool:
+    def applies(cls, scenario: Scenario) -> bool:
         return any(isinstance(fault, Partition) for fault in scenario.faults)
 
     def __init__(self, opening: Opening) -> None:
@@ -305,8 +307,8 @@ class _Sides(_RareEvent):
                 self.seen["partition healed after both sides consumed one sample"] += 1
 
 
-class _Ends(_RareEvent):
-    """Energy, clocks and a supervisor that come to an end."""
+class _Losses(_Detector):
+    """Energy that ends, clocks that jump back, and a supervisor that is lost."""
 
     names = (
         "energy ended in contact",
@@ -346,56 +348,59 @@ class _Ends(_RareEvent):
         self._read_ns[step_record.name] = read_ns
 
 
-_RARE_EVENTS = (_Goals, _Sides, _Lives, _Ears, _Memory, _Ends)
+_DETECTORS = (_Goals, _Partitions, _Restarts, _Deliveries, _Recoveries, _Losses)
 
 JUDGED = ("L1 judged", "L2 judged", "L3 judged", "I8 judged")
-"""Missions in which a rule of liveness could have been broken; see `kantor_worldsim.liveness`."""
+"""Missions in which a rule of liveness could have been broken; see `LivenessChecker`."""
 
-RARE_EVENTS: tuple[str, ...] = (*(name for sight in _RARE_EVENTS for name in sight.names), *JUDGED)
-"""What a campaign has to see."""
+RARE_EVENTS: tuple[str, ...] = (
+    *(name for detector in _DETECTORS for name in detector.names),
+    *JUDGED,
+)
+"""The situations that a campaign has to reach."""
 
 
 class RareEvents:
     """Follows the records of one mission."""
 
     def __init__(self) -> None:
-        self._sights: list[_RareEvent] = []
-        self._acting: list[Callable[[StepRecord, Outputs], None]] = []
-        self._batching: list[Callable[[Batch], None]] = []
+        self._detectors: list[_Detector] = []
+        self._on_step: list[Callable[[StepRecord, Outputs], None]] = []
+        self._on_batch: list[Callable[[Batch], None]] = []
 
     def observe(self, record: Record) -> None:
         """Follow one record."""
         if isinstance(record, Batch):
             for step_record in record.step_records:
                 if step_record.outputs is not None:
-                    for look in self._acting:
-                        look(step_record, step_record.outputs)
-            for follow in self._batching:
+                    for follow_step in self._on_step:
+                        follow_step(step_record, step_record.outputs)
+            for follow in self._on_batch:
                 follow(record)
         elif isinstance(record, ProcessEvent):
-            for sight in self._sights:
-                sight.incident(record)
+            for detector in self._detectors:
+                detector.process_event(record)
         elif isinstance(record, Opening):
-            self._sights = [
-                sight(record) for sight in _RARE_EVENTS if sight.can_be(record.scenario)
+            self._detectors = [
+                detector(record) for detector in _DETECTORS if detector.applies(record.scenario)
             ]
-            self._acting = [
-                s.step_record
-                for s in self._sights
-                if type(s).step_record is not _RareEvent.step_record
+            self._on_step = [
+                each.step_record
+                for each in self._detectors
+                if type(each).step_record is not _Detector.step_record
             ]
-            self._batching = [
-                s.batch for s in self._sights if type(s).batch is not _RareEvent.batch
+            self._on_batch = [
+                each.batch for each in self._detectors if type(each).batch is not _Detector.batch
             ]
 
     @property
     def counts(self) -> dict[str, int]:
         """How often each situation was seen; those that were not are left out."""
         return {
-            name: sight.seen[name]
-            for sight in self._sights
-            for name in sight.names
-            if sight.seen[name]
+            name: detector.seen[name]
+            for detector in self._detectors
+            for name in detector.names
+            if detector.seen[name]
         }
 
 

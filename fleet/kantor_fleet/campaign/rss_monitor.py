@@ -1,4 +1,4 @@
-"""What processes hold in memory while a campaign goes on, read from /proc once a second."""
+"""Memory of processes while a campaign runs, read from /proc once a second."""
 
 import os
 import time
@@ -10,15 +10,15 @@ from kantor_fleet.processes.local import Fleet
 from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM
 
 WARM_UP_PERIODS = 100
-"""A process's memory counts from then on in its life."""
+"""Periods after a process's start from which on its memory counts."""
 LONG_PERIODS = 150
-"""A life that goes on for so long then tells whether memory is flat."""
+"""Periods, after warming up, from which on a process shows whether its memory is flat."""
 FLAT_MB = 4.0
-"""So much may a kind of process grow over a thousand periods, all its lives together: its logs do."""
+"""The growth that a kind of process may have in a thousand periods, all its processes together: its logs grow."""
 SETTLED = 3
-"""Missions after which what outlives missions is warm."""
+"""Missions after which the processes that outlive missions are warm."""
 FLAT_LASTING_MB = 20.0
-"""So much may the campaign itself, or its fork server, grow from then on."""
+"""The growth that the campaign itself, or its fork server, may have from then on."""
 _EVERY_S = 1.0
 _MB = 1e6
 _PROC = Path("/proc")
@@ -27,21 +27,21 @@ _KINDS = {SUPERVISOR: "supervisor", WORLD_SIM: "world-sim"}
 
 
 class Grown(NamedTuple):
-    """How a kind of process has grown, over all long lives."""
+    """The growth of one kind of process, over all that ran for long."""
 
-    lives: int = 0
+    processes: int = 0
     periods: int = 0
-    """Of those lives, after warming up."""
+    """Of those processes, after warming up."""
     grown_mb: float = 0.0
-    """Of all lives together."""
+    """Of all processes together."""
     most_mb: float = 0.0
-    """In one life."""
+    """Of one process."""
     peak_mb: float = 0.0
-    """The largest there was."""
+    """The largest of any process."""
 
     def __add__(self, other: "Grown") -> "Grown":  # type: ignore[override]
         return Grown(
-            self.lives + other.lives,
+            self.processes + other.processes,
             self.periods + other.periods,
             self.grown_mb + other.grown_mb,
             max(self.most_mb, other.most_mb),
@@ -54,7 +54,7 @@ class Grown(NamedTuple):
         return 1000.0 * self.grown_mb / self.periods if self.periods else 0.0
 
 
-class _Life(NamedTuple):
+class _ProcessMemory(NamedTuple):
     kind: str
     since: int
     """Periods of the mission."""
@@ -71,13 +71,12 @@ class RssMonitor:
     """Samples the processes of one fleet."""
 
     def __init__(self, fleet: Fleet) -> None:
-        """Look at it now and then."""
         self._fleet = fleet
-        self._lives: dict[int, _Life] = {}
+        self._processes: dict[int, _ProcessMemory] = {}
         self._due_s = 0.0
 
-    def look(self, periods: int) -> None:
-        """Sample everybody, if it is time. periods: of the mission so far."""
+    def sample(self, periods: int) -> None:
+        """Sample every process, if it is time. periods: of the mission so far."""
         now_s = time.monotonic()
         if now_s < self._due_s:
             return
@@ -85,8 +84,10 @@ class RssMonitor:
         for name, pid in self._pids().items():
             mb = resident_mb(pid)
             if mb is not None:
-                life = self._lives.setdefault(pid, _Life(_KINDS.get(name, "robot"), periods, []))
-                life.samples.append((periods, mb))
+                memory = self._processes.setdefault(
+                    pid, _ProcessMemory(_KINDS.get(name, "robot"), periods, [])
+                )
+                memory.samples.append((periods, mb))
 
     def _pids(self) -> Mapping[str, int]:
         fleet = self._fleet
@@ -96,22 +97,22 @@ class RssMonitor:
     def grown(self) -> dict[str, Grown]:
         """By kind of process."""
         total: dict[str, Grown] = {}
-        for life in self._lives.values():
-            warm = life.warm
+        for memory in self._processes.values():
+            warm = memory.warm
             if warm and warm[-1][0] - warm[0][0] >= LONG_PERIODS:
                 grown_mb, peak_mb = warm[-1][1] - warm[0][1], max(mb for _, mb in warm)
                 one = Grown(1, warm[-1][0] - warm[0][0], grown_mb, grown_mb, peak_mb)
-                total[life.kind] = total.get(life.kind, Grown()) + one
+                total[memory.kind] = total.get(memory.kind, Grown()) + one
         return total
 
 
 class Lasting:
-    """What the processes that outlive missions hold: this one, and the fork server."""
+    """Samples the processes that outlive missions: this one, and the fork server."""
 
     def __init__(self) -> None:
         self._samples: list[tuple[float, float]] = []
 
-    def look(self) -> None:
+    def sample(self) -> None:
         """Sample them; once after each mission."""
         ours = resident_mb(os.getpid()) or 0.0
         children = [resident_mb(pid) or 0.0 for pid in children_of(os.getpid())]
@@ -135,7 +136,7 @@ def resident_mb(pid: int) -> float | None:
 
 
 def children_of(pid: int) -> Iterator[int]:
-    """Processes that a process has started, and are there yet."""
+    """Processes that a process has started and that still run."""
     for stat in _PROC.glob("[0-9]*/stat"):
         try:
             state, parent = stat.read_text().rpartition(")")[2].split()[:2]
@@ -146,5 +147,5 @@ def children_of(pid: int) -> Iterator[int]:
 
 
 def grandchildren() -> list[int]:
-    """Processes of fleets: what the fork server has started."""
+    """Processes of fleets, which the fork server has started."""
     return [pid for child in children_of(os.getpid()) for pid in children_of(child)]

@@ -1,4 +1,4 @@
-"""`kantor campaign`: seed by seed until one breaks a rule, and on from where it was left."""
+"""`kantor campaign`: seed by seed until one breaks a rule; the same command goes on where it stopped."""
 
 import functools
 import hashlib
@@ -15,7 +15,6 @@ from kantor_fleet.campaign.mission import Follower, Trial
 from kantor_fleet.campaign.shrink import shrink
 from kantor_fleet.campaign.totals import ENOUGH, Totals
 from kantor_fleet.execution.experiment import Case, Outcome, code
-from kantor_fleet.execution.in_process_team import play
 from kantor_fleet.execution.pools import Pool
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
@@ -25,7 +24,6 @@ from kantor_fleet.sweep.journal import RunsJournal
 from kantor_fleet.sweep.plan import RunKey, parse_seeds
 from kantor_protocol.scenario.dump import to_toml
 from kantor_protocol.scenario.schema import Scenario
-from kantor_worldsim.world.world import WorldSetup
 
 RUNS = "campaign.jsonl"
 SMALLEST = "smallest.toml"
@@ -33,7 +31,7 @@ _SHRINK_S = 60.0
 
 
 class CampaignConfig(NamedTuple):
-    """A campaign, and what is wanted of it."""
+    """The seeds of a campaign, its folder and its limit of time."""
 
     seeds: Sequence[int]
     folder: Path
@@ -54,7 +52,7 @@ def numbered(text: str) -> tuple[int, ...]:
 
 
 def campaign(config: CampaignConfig, start: Callable[[Iterable[Case]], Pool]) -> Exit:
-    """Run what is not yet done, up to the first violation; what to exit with.
+    """Run the missions that are not done yet, up to the first violation; the exit code.
 
     start: the pool, whose work is `attempt`. Raises SweepError, OSError.
     """
@@ -76,31 +74,25 @@ def campaign(config: CampaignConfig, start: Callable[[Iterable[Case]], Pool]) ->
 
 
 def replay(seed: int, folder: Path) -> Exit:
-    """Run the mission of one seed, leave its scenario and its record, and tell what is wrong with it."""
+    """Run the mission of one seed, leave its scenario and its record, and print its violations."""
     scenario = draw(seed)
     place = folder / f"seed-{seed}"
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
     follower = Follower(scenario, seed, place)
-    play(
-        scenario,
-        seed,
-        WorldSetup.of(scenario, seed),
-        [follower.observe],
-        stopped=lambda: follower.broken,
-    )
+    follower.run()
     result = follower.recording.finish()
     print(f"seed {seed}: {scenario.summary}; ended: {result.ended}; digest {result.digest[:16]}")
-    complaints = follower.complaints()
-    for complaint in complaints:
-        print(f"  VIOLATION  {complaint}")
+    violations = follower.violations()
+    for violation in violations:
+        print(f"  VIOLATION  {violation}")
     print(f"  {place}/  ({', '.join(sorted(path.name for path in place.iterdir()))})")
     print(f"  the same   {_command(place / 'scenario.toml', seed)}")
-    return Exit.NOT_MET if complaints else Exit.DONE
+    return Exit.NOT_MET if violations else Exit.DONE
 
 
 def _known(config: CampaignConfig, journal: RunsJournal, totals: Totals) -> Broken | None:
-    """Count what was run before; the first of it that broke."""
+    """Count the missions that were run before; the first of them with a violation."""
     first = None
     for seed in config.seeds:
         trial = journal.outcomes.get(_key(seed))
@@ -149,18 +141,18 @@ def _cases(seeds: Iterable[int], minutes: float | None) -> Iterator[Case]:
 
 
 def _trial(case: Case, outcome: Outcome) -> Trial:
-    """The outcome; a worker that died could tell no trial."""
+    """The outcome as a trial; a worker that died has returned none."""
     if isinstance(outcome, Trial):
         return outcome
     return Trial(failed=outcome.failed, sort=sort_of(case.scenario))
 
 
 def _report(folder: Path, broken: Broken) -> None:
-    """Everything that is needed to see it again, and the smallest scenario that shows it."""
+    """Print all that is needed to repeat a violation, and find the smallest scenario that shows it."""
     seed, trial = broken
     print(f"VIOLATION  seed {seed} ({trial.sort})")
-    for complaint in (trial.violation or "", *trial.complaints[1:]):
-        print(f"  {printable(complaint)}")
+    for violation in (trial.violation or "", *trial.complaints[1:]):
+        print(f"  {printable(violation)}")
     print(f"  commit     {commit()}, sources {code()[:16]}")
     print(f"  replay     kantor campaign --replay {seed}")
     case = Case(draw(seed), seed)
@@ -199,13 +191,13 @@ def _command(path: Path, seed: int) -> str:
 
 
 def _key(seed: int) -> RunKey:
-    """A mission is known by what draws and judges it, and by its seed."""
+    """The key of a mission: the code that draws and checks it, and its seed."""
     return RunKey(f"campaign {_draws()}", code(), seed, exact=False)
 
 
 @functools.cache
 def _draws() -> str:
-    """Digest of this package, which decides what a seed stands for."""
+    """Digest of this package, which decides on the scenario of a seed."""
     digest = hashlib.blake2b(digest_size=8)
     for path in sorted(Path(__file__).parent.glob("*.py")):
         digest.update(path.read_bytes())
@@ -213,14 +205,14 @@ def _draws() -> str:
 
 
 def commit() -> str:
-    """What git says of the sources, if they are under git."""
+    """The commit of the sources, if they are under git."""
     git = shutil.which("git")
     if git is None:
         return "unknown"
-    told = subprocess.run(
+    described = subprocess.run(
         [git, "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],
         capture_output=True,
         text=True,
         check=False,
     )
-    return told.stdout.strip() or "unknown"
+    return described.stdout.strip() or "unknown"

@@ -1,7 +1,7 @@
 """From a mission that breaks a rule to the smallest one found that still breaks it.
 
 Delta debugging (Zeller & Hildebrandt, 2002): leave something out, and keep what is left if the same rule still
-breaks. First faults, in ever smaller groups; then robots, whatever is not as it is by default, and length.
+breaks. First faults, in ever smaller groups; then robots, values that are not the default, and length.
 """
 
 import time
@@ -31,13 +31,13 @@ _DEFAULTS = (
     ("planner", ("horizon", "modes")),
     ("publish", ("weights_every", "keyframe_every")),
 )
-"""What a scenario can do without."""
+"""Values that a scenario can do without."""
 
 
 def shrink(case: Case, rule: str, most_s: float = 60.0) -> tuple[Scenario, Trial]:
-    """The smallest scenario found, and what comes of it with the same seed.
+    """The smallest scenario found, and its trial with the same seed.
 
-    rule: what the case breaks. most_s: of real time, that it may take.
+    rule: that the case breaks. most_s: real time that it may take.
     """
     until_s = time.monotonic() + most_s
     best, trial = case.scenario, attempt(case)
@@ -88,7 +88,7 @@ def _no_supervisor(tree: Tree) -> Iterator[Tree]:
 
 
 def _named_only(tree: Tree, gone: set[str]) -> Tree:
-    """Without faults of nobody but those who are gone."""
+    """Leave out the participants that are gone, and the faults that concerned no others."""
     faults = []
     for fault in tree["faults"]:
         kept = dict(fault)

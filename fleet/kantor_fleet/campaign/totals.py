@@ -1,4 +1,4 @@
-"""What a campaign has run, injected and seen."""
+"""Totals of a campaign: missions run, faults injected, rare situations seen."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from kantor_fleet.campaign.mission import Trial
 from kantor_fleet.campaign.rare_events import RARE_EVENTS
 
 ENOUGH = 500
-"""Missions after which every class of faults must have struck, and every rare situation been seen."""
+"""Missions after which each class of faults must have struck, and each rare situation have been seen."""
 
 
 class Totals:
@@ -63,7 +63,7 @@ class Totals:
         )
 
     def lines(self, wall_s: float) -> Iterator[str]:
-        """In words. wall_s: real time of this command."""
+        """The totals as text. wall_s: real time of this command."""
         cpu_s = max(self.cpu_s, 1e-9)
         on_links = sum(n for name, n in self.struck.items() if not is_of_processes(name))
         on_processes = sum(n for name, n in self.struck.items() if is_of_processes(name))
@@ -73,7 +73,7 @@ class Totals:
         yield (
             f"  simulated  {self.robot_hours:.1f} robot-hours, {self.steps} robot-steps; "
             f"{self.twice} missions executed twice, {self.cuts} journals cut, "
-            f"{self.joined} records learned in another order"
+            f"{self.joined} records merged in another order"
         )
         yield (
             f"  faults     {on_links} copies of messages touched, {on_processes} processes hit, "
@@ -86,7 +86,7 @@ class Totals:
         )
 
     def tables(self) -> Iterator[Table]:
-        """Classes of faults, and what was seen."""
+        """Classes of faults, and rare situations."""
         yield self._table("class of faults", "copies or processes", CLASSES, self.struck)
         yield self._table("sometimes", "times", RARE_EVENTS, self.seen)
 

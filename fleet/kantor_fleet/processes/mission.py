@@ -10,7 +10,7 @@ from kantor_fleet.exits import Exit, warn
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.processes.local import FleetConfig, local_fleet, watch_progress
 from kantor_fleet.report.progress import ProgressView
-from kantor_fleet.report.summary import conclude, read_result, verdict
+from kantor_fleet.report.summary import conclude, exit_code_of, read_result
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.transport.session import BusError
 from kantor_worldsim.observers.progress import progress
@@ -58,7 +58,7 @@ def _run_in_process(
 
         reason = play(scenario, seed, site, [recording.observe, show], stopped=interrupts)
         view.show(progress(recording.metrics, scenario, "over", reason))
-    return verdict(recording.finish())
+    return exit_code_of(recording.finish())
 
 
 def _run_processes(config: FleetConfig, interrupts: Interrupts) -> Exit:
@@ -90,7 +90,7 @@ def _run_processes(config: FleetConfig, interrupts: Interrupts) -> Exit:
     result = read_result(config.folder)
     if code or result is None:
         return Exit(code) if code in set(Exit) else Exit.PROCESS_FAILED
-    return Exit.PROCESS_FAILED if failed else verdict(result)
+    return Exit.PROCESS_FAILED if failed else exit_code_of(result)
 
 
 def _cause(code: int) -> str:

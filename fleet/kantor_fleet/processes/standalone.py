@@ -99,7 +99,7 @@ def go_on_standalone(state: Path, listen: str, secrets: Path, fleet: str | None)
 
     A mission that was not met is not run again: a container engine would restart it for ever.
     """
-    from kantor_fleet.report.summary import conclude, read_result, verdict  # noqa: PLC0415
+    from kantor_fleet.report.summary import conclude, exit_code_of, read_result  # noqa: PLC0415
     from kantor_worldsim.record.run_folder import REPORT, OverError, Past, ResumeError  # noqa: PLC0415
 
     folder = resume_pointer.run_in(state)
@@ -109,7 +109,7 @@ def go_on_standalone(state: Path, listen: str, secrets: Path, fleet: str | None)
         past = Past.of(folder)
     except OverError as over:
         result = read_result(folder)
-        code = Exit.PROCESS_FAILED if result is None else verdict(result)
+        code = Exit.PROCESS_FAILED if result is None else exit_code_of(result)
         if not (folder / REPORT).exists():  # world-sim was killed after the end of the mission
             conclude(folder)
             return code
@@ -142,7 +142,7 @@ def _host(
     """Host a mission. record: opens the run folder once the bus is up."""
     from kantor_fleet.execution.preload import warm_up  # noqa: PLC0415  standalone robots do not need these
     from kantor_fleet.report.progress import ProgressView  # noqa: PLC0415
-    from kantor_fleet.report.summary import conclude, read_result, verdict  # noqa: PLC0415
+    from kantor_fleet.report.summary import conclude, exit_code_of, read_result  # noqa: PLC0415
     from kantor_worldsim.exchange.main import run  # noqa: PLC0415
 
     scenario = plan.scenario
@@ -164,8 +164,8 @@ def _host(
         conclude(folder)
     result = read_result(folder)
     if result is not None and result.ended == "done":
-        return verdict(result)
-    return interrupts.code or (verdict(result) if result is not None else Exit.PROCESS_FAILED)
+        return exit_code_of(result)
+    return interrupts.code or (exit_code_of(result) if result is not None else Exit.PROCESS_FAILED)
 
 
 def _joining(name: ParticipantId, listen: str, secrets: Path) -> str:

@@ -1,4 +1,5 @@
-"""Reports: the picture of a run, and progress in a terminal.
+"""Reports for people: the picture of a run, its printed summary, and progress in a terminal.
 
-Everything is drawn from records and nothing else. Start with `report.py`.
+Everything is drawn from records and results; nothing here changes a run. `report.py` draws report.png from the
+`history.py` of a run. Start with `report.py`.
 """

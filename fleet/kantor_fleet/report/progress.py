@@ -1,4 +1,4 @@
-"""How a mission goes, on standard output: a panel in a terminal, plain lines anywhere else."""
+"""Progress of a mission on standard output: a panel in a terminal, plain lines elsewhere."""
 
 import math
 import sys
@@ -26,7 +26,7 @@ _PANEL_COLUMNS = 78
 
 
 class ProgressView:
-    """Shows progress as it comes, at a pace that a person, or a log, can take.
+    """Shows progress at a limited rate, so that a person or a log can follow.
 
     Used as a context manager. However fast the mission runs, the first and the last progress are
     shown.
@@ -38,13 +38,13 @@ class ProgressView:
         console: Console | None = None,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
-        """scenario: its name. monotonic: seconds of real time, for the pace alone."""
+        """scenario: its name. monotonic: seconds of real time, for the rate alone."""
         # rich would take forced colours (FORCE_COLOR) for a terminal; a panel needs a real one.
         self._console = console or Console(force_terminal=sys.stdout.isatty())
         self._scenario = scenario
         self._monotonic = monotonic
         self._due_s = -math.inf
-        self._unshown: Progress | None = None
+        self._pending: Progress | None = None
         self._over = False
         self._line = ""
         self._live: Live | None = None
@@ -60,29 +60,29 @@ class ProgressView:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._catch_up()
+        self._show_pending()
         if self._live is not None:
             self._live.stop()
 
     def show(self, progress: Progress) -> None:
-        """Take progress in; show it if it is due, the first, or the end of the mission."""
-        self._unshown = progress
+        """Show progress if it is due, the first, or the end of the mission; else keep it for later."""
+        self._pending = progress
         ends = progress.phase == "over" and not self._over
         self._over = progress.phase == "over"
         if ends or self._monotonic() >= self._due_s:
-            self._catch_up()
+            self._show_pending()
 
     def note(self, line: str) -> None:
         """Print a line, above the panel."""
         self._console.out(printable(line), highlight=False)
 
-    def _catch_up(self) -> None:
-        progress, self._unshown = self._unshown, None
+    def _show_pending(self) -> None:
+        progress, self._pending = self._pending, None
         if progress is None:
             return
         if self._live is not None:
             self._due_s = self._monotonic() + _PANEL_S
-            self._live.start()  # only now: before, there is nothing to show
+            self._live.start()  # not before the first progress, so that nothing empty is shown
             self._live.update(panel_of(self._scenario, progress), refresh=True)
             return
         self._due_s = self._monotonic() + _LINE_S
@@ -105,7 +105,7 @@ def line_of(progress: Progress) -> str:
 
 
 def panel_of(scenario: str, progress: Progress) -> RenderableType:
-    """Progress as a small panel: how far, how well, and what is going on."""
+    """Progress as a small panel: the share explored, the figures and the phase."""
     explored = Table.grid(padding=(0, 1), expand=True)
     explored.add_column()
     explored.add_column(ratio=1)
@@ -122,7 +122,7 @@ def panel_of(scenario: str, progress: Progress) -> RenderableType:
 
 
 def printable(text: str) -> str:
-    """Text with a question mark for what would steer a terminal: it may come from another process."""
+    """Text with a question mark for each control character: it may come from another process."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
@@ -130,12 +130,12 @@ _STYLES = {"waiting": "yellow", "running": "green", "over": "cyan"}
 
 
 def _explored(progress: Progress) -> str:
-    """Share of the mass that is used up, or of the map that somebody has seen."""
+    """Share of the mass that is used up, or of the map that any robot has seen."""
     return f"{100.0 * (1.0 - progress.mass_left):.0f} %"
 
 
 def _figures(progress: Progress) -> list[tuple[str, str]]:
-    """Names and values, in the order in which they are shown."""
+    """Names and values of the figures, in the order in which they are shown."""
     detected = [("detected", f"{progress.detected}/{progress.targets}")] if progress.targets else []
     if progress.distance_m is not None:  # a mission on a map has neither energy nor bound
         figures = [("distance", f"{progress.distance_m:.0f} m"), *detected]

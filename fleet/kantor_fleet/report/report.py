@@ -1,6 +1,6 @@
 """report.png: one picture of a run, drawn from its records and nothing else.
 
-Left the map as the run left it, right how it got there. Times are simulated seconds.
+On the left the map at the end of the run, on the right its measures over time. Times are simulated seconds.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,8 +16,8 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from kantor_fleet.report.picture import (
-    RunHistory,
+from kantor_fleet.report.history import RunHistory
+from kantor_fleet.report.map_drawing import (
     draw_bumps,
     draw_deaths,
     draw_domain,
@@ -54,14 +54,15 @@ from kantor_worldsim.record.records import Record
 SIZE_IN = (14.0, 8.0)
 DPI = 110
 _TITLE_LETTERS = 130
-"""What fits on a line of that size."""
+"""Letters that fit on the title line at its full size."""
 _GAP = "   ·   "
 _ENDED = {"done": "energy spent", "limit": "time limit", "cut": "record cut"}
-"""Why a run ended that did not finish."""
+"""Reasons why a run ended without finishing."""
 _ROWS_SHOWN = 4_000
 _ROWS_NAMED, _LINES_SHOWN = 8, 40
-"""Of processes that were away, by name; lines where somebody went away."""
-_DEADLY = {"kill", "leave"}
+"""Up to so many rows of outages have names; up to so many outages have vertical lines."""
+_DEATHS = {"kill", "leave"}
+"""Causes of outages that are drawn as deaths."""
 
 
 def draw(records: Iterable[Record], path: Path, exact: Sequence[tuple[float, float]] = ()) -> None:
@@ -86,14 +87,14 @@ def draw(records: Iterable[Record], path: Path, exact: Sequence[tuple[float, flo
 
 
 def _write_title(place: SubFigure, run: RunHistory) -> None:
-    """What was run, and what came of it, whatever exchange ran it."""
-    what = _what(run)
-    size = TITLE_PT * min(1.0, _TITLE_LETTERS / len(what))
-    place.text(0.012, 0.66, what, size=size, weight="bold", color=INK, va="center")
+    """Write the mission and its outcome; they do not depend on the exchange."""
+    mission = _mission(run)
+    size = TITLE_PT * min(1.0, _TITLE_LETTERS / len(mission))
+    place.text(0.012, 0.66, mission, size=size, weight="bold", color=INK, va="center")
     place.text(0.012, 0.16, _outcome(run), size=TITLE_PT - 1.5, color=INK, va="center")
 
 
-def _what(run: RunHistory) -> str:
+def _mission(run: RunHistory) -> str:
     scenario, robots = run.scenario, run.scenario.robots.count
     merge = f"{scenario.merge} merge {'with' if scenario.claiming else 'without'} claims"
     parts = (
@@ -129,7 +130,7 @@ def _outcome(run: RunHistory) -> str:
 
 
 def _draw_map(place: SubFigure, run: RunHistory) -> None:
-    """The map as the run left it. Every mark names itself for the legend."""
+    """Draw the map at the end of the run. Every mark has a label for the legend."""
     axes = place.subplots()
     if isinstance(run.metrics, MapMetrics):
         draw_known(axes, run.metrics.map_tracker, run.scenario.period_ns * 1e-9)
@@ -147,14 +148,14 @@ def _draw_map(place: SubFigure, run: RunHistory) -> None:
     axes.ticklabel_format(useOffset=False, style="plain")
     tidy(axes, "x, m", "y, m")
     handles, _ = axes.get_legend_handles_labels()
-    ways = [handle for handle in handles if isinstance(handle, LineCollection)]
-    if ways:
-        add_caption(axes, ways, columns=5)
-    add_legend(place, [handle for handle in handles if handle not in ways])
+    trails = [handle for handle in handles if isinstance(handle, LineCollection)]
+    if trails:
+        add_caption(axes, trails, columns=5)
+    add_legend(place, [handle for handle in handles if handle not in trails])
 
 
 def _draw_curves(place: SubFigure, run: RunHistory, exact: Sequence[tuple[float, float]]) -> None:
-    """What the run measured, over simulated time."""
+    """Draw the measures of a run on a density over simulated time."""
     bounds, progress, mass = place.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.2, 1.0))
     rows = run.metrics.rows
     rows = rows[:-1][thinned(len(rows) - 1, _ROWS_SHOWN)] + rows[-1:]
@@ -166,10 +167,10 @@ def _draw_curves(place: SubFigure, run: RunHistory, exact: Sequence[tuple[float,
 
 
 def _finish_curves(place: SubFigure, diagrams: Sequence[Axes], run: RunHistory) -> None:
-    """What all diagrams of a run share: the axis of time, and moments on it."""
+    """Draw what all diagrams of a run share: the axis of time and the moments on it."""
     diagrams[-1].set_xlabel("simulated time, s", size=TEXT_PT, color=INK)
     end_s = max(run.end_ns, run.scenario.period_ns) * 1e-9
-    diagrams[-1].set_xlim(0.0, 1.02 * end_s)  # so that what happens at the very end is seen
+    diagrams[-1].set_xlim(0.0, 1.02 * end_s)  # so that marks at the very end are visible
     moments = [*_mark_moments(diagrams, run), *_mark_cuts(diagrams, run, end_s)]
     moments += _mark_outages(diagrams, run, end_s)
     if moments:
@@ -177,7 +178,7 @@ def _finish_curves(place: SubFigure, diagrams: Sequence[Axes], run: RunHistory) 
 
 
 def _draw_exploration(place: SubFigure, run: RunHistory, exploration: MapMetrics) -> None:
-    """How a map became known, over simulated time."""
+    """Draw the exploration of a map over simulated time."""
     explored, wtv, epv = place.subplots(3, 1, sharex=True, height_ratios=(1.7, 1.0, 1.0))
     rows = exploration.rows
     thin = thinned(len(rows), _ROWS_SHOWN)
@@ -194,7 +195,7 @@ def _draw_exploration(place: SubFigure, run: RunHistory, exploration: MapMetrics
 
 
 def _draw_explored(axes: Axes, run: RunHistory, exploration: MapMetrics, thin: slice) -> None:
-    """What somebody has seen, tick by tick, and what each robot knows, row by row."""
+    """Draw the share that any robot has seen, tick by tick, and the share that each robot knows, row by row."""
     map_tracker, period_s = exploration.map_tracker, run.scenario.period_ns * 1e-9
     times_s = [row.time_s for row in exploration.rows[thin]]
     colours = team_colours(run.scenario.robots.count)
@@ -207,7 +208,7 @@ def _draw_explored(axes: Axes, run: RunHistory, exploration: MapMetrics, thin: s
     )
     end = run.end_ns * 1e-9
     ticks_s = np.append(np.arange(seen.shape[0]) * period_s, max(end, 0.0))
-    (union,) = axes.plot(ticks_s, np.append(seen, seen[-1]), color=FIRST, lw=2.0, label="anybody")
+    (union,) = axes.plot(ticks_s, np.append(seen, seen[-1]), color=FIRST, lw=2.0, label="any robot")
     handles = [union, axes.lines[0]]
     for share, tick, mark in ((95.0, map_tracker.t95_tick, "o"), (99.0, map_tracker.t99_tick, "s")):
         if tick is not None:
@@ -261,7 +262,7 @@ def _draw_mass(axes: Axes, rows: Sequence[DensityRow]) -> None:
 
 
 def _mark_moments(diagrams: Sequence[Axes], run: RunHistory) -> list[Line2D]:
-    """Vertical lines where something happened; one of each for the legend."""
+    """Draw vertical lines at the first contact and at the finish; the handles for the legend."""
     moments = (("first contact", run.contact_s, ":"), ("finished", run.finish_s, "--"))
     marks = []
     for name, at_s, style in moments:
@@ -273,7 +274,7 @@ def _mark_moments(diagrams: Sequence[Axes], run: RunHistory) -> list[Line2D]:
 
 
 def _mark_cuts(diagrams: Sequence[Axes], run: RunHistory, end_s: float) -> list[Patch]:
-    """Shade the times in which a fault cut links; one patch for the legend."""
+    """Shade the times in which a fault cut links; the patch for the legend."""
     cuts = [fault for fault in run.scenario.faults if isinstance(fault, Partition | OneWay)]
     cuts = [fault for fault in cuts if fault.from_s < end_s]
     for fault in cuts:
@@ -284,9 +285,9 @@ def _mark_cuts(diagrams: Sequence[Axes], run: RunHistory, end_s: float) -> list[
 
 
 def _mark_outages(diagrams: Sequence[Axes], run: RunHistory, end_s: float) -> list[Artist]:
-    """When processes did nothing: a bar for each over the upper edge of the first diagram, and thin lines.
+    """Draw outages: a row of bars for each process below the upper edge of the first diagram, and thin lines.
 
-    What the supervisor or world-sim misses concerns everybody, so it is shaded all the way down.
+    An outage of the supervisor or of world-sim affects all, so it is shaded over the whole height.
     """
     if not run.outages:
         return []
@@ -294,9 +295,9 @@ def _mark_outages(diagrams: Sequence[Axes], run: RunHistory, end_s: float) -> li
     rows = sorted({outage.who for outage in run.outages}, key=names.index)
     height = min(0.05, 0.5 / len(rows))
     top = diagrams[0]
-    for who, what, from_s, until_s in run.outages:
+    for who, cause, from_s, until_s in run.outages:
         last_s, row = (end_s if until_s is None else until_s), rows.index(who)
-        colour = KILLED if what in _DEADLY else FAINT
+        colour = KILLED if cause in _DEATHS else FAINT
         low, high = 1.0 - height * (row + 0.9), 1.0 - height * (row + 0.1)
         top.axvspan(from_s, last_s, low, high, color=colour, alpha=0.8, lw=0.0, zorder=1.2)
         if len(rows) <= _ROWS_NAMED:
@@ -306,7 +307,7 @@ def _mark_outages(diagrams: Sequence[Axes], run: RunHistory, end_s: float) -> li
             axes.axvspan(from_s, last_s, color=colour, alpha=0.1, lw=0.0, zorder=0.1)
         for axes in diagrams if len(run.outages) <= _LINES_SHOWN else ():
             axes.axvline(from_s, color=colour, lw=0.6, alpha=0.7, zorder=1.0)
-    kinds = {outage.what in _DEADLY for outage in run.outages}
+    kinds = {outage.cause in _DEATHS for outage in run.outages}
     marks = ((True, KILLED, "killed"), (False, FAINT, "paused or away"))
     return [Patch(color=c, alpha=0.8, lw=0.0, label=text) for k, c, text in marks if k in kinds]
 
@@ -319,7 +320,7 @@ def _add_line(
     colour: str,
     width: float = 1.4,
 ) -> None:
-    """A measurement over time; where it is no number, nothing. One row alone shows as a dot."""
+    """Draw a measure over time, with gaps where it has no value. A single row is drawn as a dot."""
     times_s = [row.time_s for row in rows]
     numbers = np.array(values, dtype=np.float64)
     if not np.isnan(numbers).all():

@@ -1,4 +1,4 @@
-"""How many runs are done, on standard output: a bar in a terminal, plain lines anywhere else."""
+"""Progress of many runs on standard output: a bar in a terminal, plain lines elsewhere."""
 
 import math
 import sys
@@ -27,15 +27,15 @@ _WIDTH = 160
 
 
 def table_console() -> Console:
-    """Where tables are printed: as wide as the terminal, if it is one."""
+    """The console for tables: as wide as the terminal, if it is one."""
     return Console(width=None if sys.stdout.isatty() else _WIDTH)
 
 
 class RunProgressView:
-    """Counts runs, tells of those that fail, and guesses when the last one will be done."""
+    """Counts finished runs, reports failures, and estimates the time left."""
 
     def __init__(self, runs: int, monotonic: Callable[[], float] = time.monotonic) -> None:
-        """runs: how many there are to do."""
+        """runs: the number of runs to do."""
         terminal = sys.stdout.isatty()
         self._console = Console(force_terminal=terminal)
         self._bar = Progress(
@@ -56,7 +56,7 @@ class RunProgressView:
         self._monotonic = monotonic
         self._started_s = monotonic()
         self._due_s = -math.inf
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -71,9 +71,9 @@ class RunProgressView:
         self._bar.stop()
 
     def count(self, failed: str | None = None) -> None:
-        """One more is done. failed: the reason; each is told once."""
-        if failed is not None and failed not in self._told:
-            self._told.add(failed)
+        """Count one more run. failed: the reason of a failure; each reason is printed once."""
+        if failed is not None and failed not in self._reported:
+            self._reported.add(failed)
             self.note(f"a run failed: {failed}")
         self._done += 1
         self._bar.advance(self._task)

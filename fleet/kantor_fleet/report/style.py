@@ -1,4 +1,4 @@
-"""How kantor's pictures look: quiet axes, few colours, words beside what they name."""
+"""The style of kantor's pictures: plain axes, few colours, labels beside the marks."""
 
 from collections.abc import Sequence
 
@@ -14,11 +14,11 @@ TEXT_PT, SMALL_PT, TITLE_PT = 9.5, 8.5, 12.5
 INK, FAINT, EMPTY = "#222222", "#8c8c8c", "#d9d9d9"
 FOUND, MISSED = "#00875a", "#111111"
 KILLED = "#c1121f"
-"""Where, and when, a process was killed."""
+"""The colour of places and times at which a process was killed."""
 CUT = "#9aa5b1"
-"""The time in which links were cut."""
+"""The colour of times in which links were cut."""
 FIRST, SECOND, THIRD = INK, "#3f90da", "#e76300"
-"""The lines of a diagram, in this order."""
+"""The colours of the lines of a diagram, in this order."""
 TEAM = (
     "#3f90da",
     "#ffa90e",
@@ -31,11 +31,11 @@ TEAM = (
     "#717581",
     "#94a4a2",
 )
-"""Petroff's ten colours, told apart with any colour vision; the greys last, for samples are grey."""
+"""Petroff's ten colours, distinct for any colour vision; the greys last, since samples are grey."""
 
 
 def tidy(axes: Axes, x_label: str, y_label: str) -> None:
-    """Quiet axes: two spines, small ticks."""
+    """Style axes: two spines, small ticks."""
     axes.set_xlabel(x_label, size=TEXT_PT, color=INK)
     axes.set_ylabel(y_label, size=TEXT_PT, color=INK)
     axes.tick_params(labelsize=SMALL_PT, labelcolor=INK, color=FAINT, which="both")
@@ -44,7 +44,7 @@ def tidy(axes: Axes, x_label: str, y_label: str) -> None:
 
 
 def add_caption(axes: Axes, handles: Sequence[Artist], columns: int = 3) -> None:
-    """The legend of a diagram, above it, where no line can run into it."""
+    """Add the legend of a diagram above it, where no line crosses it."""
     axes.legend(
         handles=handles,
         loc="lower left",
@@ -61,7 +61,7 @@ def add_caption(axes: Axes, handles: Sequence[Artist], columns: int = 3) -> None
 
 
 def add_legend(place: SubFigure, handles: Sequence[Artist], widest: int = 6) -> None:
-    """The legend of a part of the picture, below it, in one row of at most so many, or in two."""
+    """Add the legend of a part of the picture below it, in one row of at most `widest` entries, or in two."""
     legend = place.legend(
         handles=handles,
         loc="outside lower center",
@@ -73,12 +73,12 @@ def add_legend(place: SubFigure, handles: Sequence[Artist], widest: int = 6) -> 
         labelcolor=INK,
     )
     for handle in legend.legend_handles:
-        if isinstance(handle, PathCollection):  # a crowd's marks are too small to tell
+        if isinstance(handle, PathCollection):  # marks of many points are too small to recognise
             handle.set_sizes(np.maximum(handle.get_sizes(), 12.0))
 
 
 def team_colours(robots: int) -> list[str]:
-    """One colour each. Beyond ten they only tell neighbours apart, along a cyclic map."""
+    """A colour for each robot. Beyond ten robots only neighbours are clearly distinct, along a cyclic map."""
     if robots <= len(TEAM):
         return list(TEAM[:robots])
     golden = 0.6180339887498949  # its multiples fall evenly, and far from the one before

@@ -1,4 +1,4 @@
-"""The end of a run for a person: the picture is drawn, and a summary printed."""
+"""The end of a run: draws its picture, prints a summary, and gives the exit code."""
 
 import csv
 import sys
@@ -27,7 +27,7 @@ def conclude(folder: Path) -> None:
 
 
 def _exact_of(folder: Path) -> list[tuple[float, float]]:
-    """Times (s) and exact distances (m) in a run folder; they take long, so they are not redone."""
+    """Times (s) and exact distances (m) in a run folder; they take long and are not computed again."""
     with (folder / METRICS).open(encoding="utf-8", newline="") as file:
         rows = [row for row in csv.DictReader(file) if row.get("w1_exact")]
     return [(float(row["time_s"]), float(row["w1_exact"])) for row in rows]
@@ -41,14 +41,14 @@ def read_result(folder: Path) -> Result | None:
         return None
 
 
-def verdict(result: Result) -> Exit:
-    """What a result means as an exit code."""
+def exit_code_of(result: Result) -> Exit:
+    """The exit code of a result: DONE if the mission was met without a violation."""
     met = result.ended == "done" and result.violations == 0
     return Exit.DONE if met else Exit.NOT_MET
 
 
 def summary(result: Result) -> str:
-    """A few lines for a person."""
+    """A summary of a few lines."""
     finished = "-" if result.finished_tick is None else f"tick {result.finished_tick}"
     wire = result.bytes_per_robot_tick
     rules = "all rules held" if not result.violations else f"{result.violations} VIOLATIONS"
@@ -62,7 +62,7 @@ def summary(result: Result) -> str:
     )
     lines = [
         f"{result.scenario} (seed {result.seed}, {result.exchange}): {result.ended}",
-        *(_of_density(result) if result.map is None else _of_map(result, result.map)),
+        *([_detected(result)] if result.map is None else _of_map(result, result.map)),
         f"  finished  {finished}; {result.ticks} ticks, {result.wall_s:.1f} s",
         *(_of_mass(result) if result.map is None else ()),
         f"  radio     {radio}",
@@ -75,12 +75,12 @@ def summary(result: Result) -> str:
 
 
 def _of_faults(result: Result) -> list[str]:
-    """What each fault did, in a line of its own, and who came back."""
+    """A line for the effects of each fault, and one for restarts."""
     lines = []
     for name, counts in result.faults.items():
-        told = msgspec.structs.asdict(counts).items()
-        deeds = [f"{n} {deed.replace('_', ' ')}" for deed, n in told if n]
-        lines.append(f"  fault {name:<16} {', '.join(deeds) or 'never struck'}")
+        by_effect = msgspec.structs.asdict(counts).items()
+        effects = [f"{n} {effect.replace('_', ' ')}" for effect, n in by_effect if n]
+        lines.append(f"  fault {name:<16} {', '.join(effects) or 'no effect'}")
     if result.restarts:
         back = f"{_counted(result.restarts, 'restart')}, {_counted(result.incarnations, 'new incarnation')}"
         if (rejoin := result.rejoin_s) is not None:
@@ -89,19 +89,15 @@ def _of_faults(result: Result) -> list[str]:
     return lines
 
 
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+def _counted(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
-def _found(result: Result) -> str:
+def _detected(result: Result) -> str:
     found = f"{result.detected}/{result.targets} targets"
     if result.detection_rate is not None:
         found += f" ({100.0 * result.detection_rate:.1f} %)"
     return f"  detected  {found}"
-
-
-def _of_density(result: Result) -> list[str]:
-    return [_found(result)]
 
 
 def _of_mass(result: Result) -> list[str]:
@@ -133,6 +129,6 @@ def _of_map(result: Result, map_: MapResult) -> list[str]:
         f"overlap {100.0 * map_.overlap:.0f} %, {map_.bumps} bumps, {map_.switches} switches"
     )
     even = f"WTV {map_.wtv_mean.r8:.4g} (final {map_.wtv_final.r8:.4g}), EPV {map_.epv_mean.r8:.4g}"
-    found = [_found(result)] if result.targets else []
+    found = [_detected(result)] if result.targets else []
     lines = [f"  explored  {explored}", f"  distance  {distance}", f"  8 regions {even}"]
     return [*lines, *found]

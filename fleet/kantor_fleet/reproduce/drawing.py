@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from kantor_fleet.report.picture import (
-    RunHistory,
+from kantor_fleet.report.history import RunHistory
+from kantor_fleet.report.map_drawing import (
     draw_domain,
     draw_radio,
     draw_samples,

@@ -43,7 +43,7 @@ class PaperFigure(NamedTuple):
     """Finished runs are kept in the folder, so that the same command resumes from there."""
 
     def requests(self) -> RunRequests:
-        """What it needs run."""
+        """The runs that it needs."""
         if self.select is not None:
             return self.select(self.runs)
         claimed = (setting for claim in self.claims for setting in claim.settings)

@@ -1,4 +1,4 @@
-"""The packaged scenarios, and where a scenario's name leads."""
+"""The packaged scenarios, found by name, and scenarios in files."""
 
 from collections.abc import Iterable
 from importlib.resources import files

@@ -1,6 +1,6 @@
 """Counter-based keyed randomness: a draw is a pure function of a key and a counter.
 
-Nothing here has state, so a draw does not depend on who asks, in which order, or how often: every
+Nothing here has state, so a draw does not depend on the process that makes it, on order, or on repetition: every
 process evaluates the same number alone, and a lost message never shifts the draws that follow.
 
 The generator is Philox4x32-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC'11).
@@ -24,7 +24,7 @@ _TO_UNIT = 2.0**-53
 
 
 class Purpose(enum.IntEnum):
-    """What a draw is for; the first word of its counter, so that no two purposes share draws."""
+    """The purpose of a draw; the first word of its counter, so that no two purposes share draws."""
 
     SAMPLE_WALK = 1
     TARGET_WALK = 2

@@ -1,4 +1,4 @@
-"""Occupancy maps: how their cells lie in the world, and which cells a straight line crosses.
+"""Occupancy maps: the frame of their cells in the world, and the cells that a straight line crosses.
 
 A map is an array (rows, columns) of UNKNOWN, FREE or OCCUPIED; row 0 is lowest (y up), column 0 is
 leftmost. Where one number names a cell it is row * columns + column.
@@ -16,14 +16,14 @@ from kantor_protocol.base.kernels import kernel
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 
 CELLS_MAX = 16_000_000
-"""Of one map: 4000 x 4000."""
+"""The most cells of one map: 4000 x 4000."""
 
 NOWHERE = -1
 """Instead of a cell: outside the map."""
 
 
 class Frame(msgspec.Struct, frozen=True, array_like=True):
-    """How the cells of a map lie in the world."""
+    """The frame of a map: how its cells lie in the world."""
 
     resolution_m: Annotated[float, Meta(gt=0.0)]
     """The side of a cell."""
@@ -34,18 +34,18 @@ class Frame(msgspec.Struct, frozen=True, array_like=True):
 
     @property
     def cells(self) -> int:
-        """How many there are."""
+        """The number of cells."""
         return self.rows * self.columns
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """World frame: left, right, bottom, top, as matplotlib wants it."""
+        """World frame: left, right, bottom, top, in the order of matplotlib."""
         x, y = self.origin_m
         return x, x + self.columns * self.resolution_m, y, y + self.rows * self.resolution_m
 
     @property
     def diagonal_m(self) -> float:
-        """From corner to corner."""
+        """The distance from corner to corner."""
         return math.hypot(self.rows, self.columns) * self.resolution_m
 
     def uv(self, x_m: float, y_m: float) -> tuple[float, float]:
@@ -58,7 +58,7 @@ class Frame(msgspec.Struct, frozen=True, array_like=True):
     def cell_of(self, x_m: float, y_m: float) -> int:
         """The cell at a place in the world, or NOWHERE."""
         u, v = self.uv(x_m, y_m)
-        if 0.0 <= u < self.columns and 0.0 <= v < self.rows:  # not so for what is no number
+        if 0.0 <= u < self.columns and 0.0 <= v < self.rows:  # false for NaN
             return int(v) * self.columns + int(u)
         return NOWHERE
 
@@ -69,6 +69,21 @@ class Frame(msgspec.Struct, frozen=True, array_like=True):
             self.origin_m[0] + (column + 0.5) * self.resolution_m,
             self.origin_m[1] + (row + 0.5) * self.resolution_m,
         )
+
+
+@kernel
+def neighbour(cell: int, side: int, columns: int, cells: int) -> int:
+    """One of the four neighbours of a cell, or NOWHERE where the map ends.
+
+    side: 0 below, 1 left, 2 right, 3 above. cells: how many the map has.
+    """
+    if side == 0:
+        return cell - columns if cell >= columns else NOWHERE
+    if side == 1:
+        return cell - 1 if cell % columns > 0 else NOWHERE
+    if side == 2:
+        return cell + 1 if (cell + 1) % columns > 0 else NOWHERE
+    return cell + columns if cell + columns < cells else NOWHERE
 
 
 @kernel
@@ -111,7 +126,7 @@ def free_way(
 
     cells: (rows, columns). Coordinates in cells, column axis first; what lies outside is not passable.
     1.0: the way is free. At a corner both cells beside it must be passable; margin: how near a corner
-    counts, in cells, for whoever must not be a rounding error off.
+    counts, in cells, for callers that must not be off by a rounding error.
     """
     rows, columns = cells.shape
     column, row = math.floor(u), math.floor(v)

@@ -10,10 +10,10 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCach
 
 
 class _InTree(InTreeCacheLocator):  # type: ignore[misc]
-    """Beside the source, even where nothing can be written but kernels are, as in an image."""
+    """Keeps the cache beside the source, also where nothing can be written but cached kernels exist, as in an image."""
 
     def ensure_cache_path(self) -> None:
-        """Numba's own looks elsewhere then, and compiles anew."""
+        """Accept an unwritable path with cached kernels; numba's own locator would compile anew elsewhere."""
         try:
             super().ensure_cache_path()
         except OSError:
@@ -21,7 +21,7 @@ class _InTree(InTreeCacheLocator):  # type: ignore[misc]
                 raise
 
 
-class _Finding(CompileResultCacheImpl):  # type: ignore[misc]
+class _CacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
     _locator_classes = tuple(
         _InTree if locator is InTreeCacheLocator else locator
         for locator in CompileResultCacheImpl._locator_classes  # noqa: SLF001
@@ -29,10 +29,10 @@ class _Finding(CompileResultCacheImpl):  # type: ignore[misc]
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
-    _impl_class = _Finding
+    _impl_class = _CacheFiles
 
     def save_overload(self, signature: Any, data: Any) -> None:
-        """What cannot be kept is compiled again the next time."""
+        """Save a kernel; one that cannot be saved is compiled again the next time."""
         with contextlib.suppress(OSError):
             super().save_overload(signature, data)
 
@@ -49,8 +49,8 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 kernel = _compiled()
 """Compiles a function that allocates nothing. Numba then counts no references to its arrays, which
 would cost more than the work itself; at the border to Python an array costs 0.02 us. A NamedTuple of
-arrays costs a whole one there, so what is called in every step takes the fields one by one."""
+arrays costs a whole one there, so that a kernel that is called in every step takes the fields one by one."""
 
 sum_kernel = _compiled(fastmath={"reassoc"})
-"""For a long sum of which the last digits do not matter: its terms are added in whatever order the
+"""For a long sum of which the last digits do not matter: its terms are added in the order in which the
 processor is fastest, four times as fast as one by one."""

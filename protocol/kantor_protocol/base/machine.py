@@ -3,7 +3,7 @@
 Input is a value, output is a value, and the same machine with the same inputs gives the same
 outputs. Time is an argument (simulated integer nanoseconds); nothing else reaches a machine.
 
-The records are out of the garbage collector's sight (`gc=False`): frozen values hold no cycles.
+The garbage collector does not track the records (`gc=False`): frozen values hold no cycles.
 """
 
 import enum
@@ -17,19 +17,19 @@ ParticipantId = str
 """`r1`, `r2`, … for robots, `supervisor` for the supervisor."""
 
 EVERYBODY: ParticipantId = ""
-"""The target of an envelope for whoever is in range."""
+"""The target of an envelope for all participants in range."""
 
 SUPERVISOR: ParticipantId = "supervisor"
 
 WORLD_SIM: ParticipantId = "worldsim"
-"""The process that plays the world. It is no participant, but it can fail like one."""
+"""The process that simulates the world. It is no participant, but it can fail like one."""
 
 NEVER_NS = 2**63 - 1
 """A time after every other, in nanoseconds."""
 
 
 class State(enum.IntEnum):
-    """What a participant is doing. The last two are final."""
+    """The activity of a participant. The last two are final."""
 
     EXPLORING = 0
     FINISHED = 1
@@ -39,7 +39,7 @@ class State(enum.IntEnum):
 
 
 class Pose(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """Where a body is, in the world frame (x right, y up, heading counter-clockwise from x)."""
+    """The pose of a body in the world frame (x right, y up, heading counter-clockwise from x)."""
 
     x_m: float
     y_m: float
@@ -48,16 +48,16 @@ class Pose(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 class Body(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """What the world knows of a body when a process takes it over."""
+    """A body as world-sim knows it when a process takes it over."""
 
     pose: Pose
     step: int = 0
-    """The last step that the world has accepted; 0: it has not moved yet."""
+    """The last step that world-sim has accepted; 0: it has not moved yet."""
     energy_spent: int = 0
-    """Its gauge: points shipped, whoever drove it."""
+    """Points shipped, by all incarnations together."""
     incarnation: int = 0
-    """The incarnation that drove it last. Whoever cannot go on from its own snapshot begins the next
-    one: two writers must never share a log."""
+    """The incarnation that drove it last. A process that cannot go on from its write-ahead log begins the next one:
+    two writers must never share a log."""
 
 
 class Envelope(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -72,22 +72,22 @@ class Envelope(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 class Observation(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """What the world tells a participant about itself."""
+    """The part of a step's inputs that a participant learns from world-sim about itself."""
 
     step: int
-    """The participant's last step that the world has accepted; 0 before the first."""
+    """The participant's last step that world-sim has accepted; 0 before the first."""
     pose: Pose
     """Its true pose after that step."""
     detected: tuple[int, ...] = ()
     """Targets that its sensor found since the last observation."""
     scan: bytes = b""
-    """What its range finder measured from there, see `evidence.py`; empty without a map."""
+    """A range scan made from there, see `replication/occupancy_log.py`; empty without a map."""
     bumped: bool = False
-    """Whether the last step ended at a wall."""
+    """Whether the last step ended at an obstacle."""
 
 
 class Inputs(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """What reached a participant since its last step."""
+    """The inputs of one step: what reached a participant since its last one."""
 
     now_ns: Annotated[int, Meta(ge=-(2**62), le=2**62)]
     observation: Observation
@@ -96,19 +96,19 @@ class Inputs(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 class Outputs(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """What a participant did in one step."""
+    """The outputs of one step: what a participant did in it."""
 
     step: int
     """Counts from 1."""
     pose: Pose
     goal: tuple[float, float] | None = None
-    """World frame, metres; None when it heads nowhere."""
+    """World frame, metres; None without a goal."""
     spent: bytes = b""
     """Packed pairs (sample, units) that it consumed in this step, nearest first (Prop. 1)."""
     lowered: bytes = b""
     """Packed pairs (sample, units left): the entries of its weight vector that fell in this step."""
     weights: bytes = b""
-    """What it puts on its weights key in this step, if anything (`weights.py`)."""
+    """The message for its weights key in this step, if one is due (`wire/weights.py`)."""
     outbox: tuple[Envelope, ...] = ()
     energy_spent: int = 0
     """Robot points shipped since the start."""
@@ -121,7 +121,7 @@ class StateMachine(Protocol):
     """A participant: robot or supervisor."""
 
     def step(self, inputs: Inputs, /) -> Outputs:
-        """Take in what arrived, decide, act."""
+        """Make one step."""
         ...
 
 

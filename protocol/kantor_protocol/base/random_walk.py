@@ -1,4 +1,4 @@
-"""The random walk of samples and targets (Kabir & Lee, eq. 13-14), evaluated by anybody alone."""
+"""The random walk of samples and targets (Kabir & Lee, eq. 13-14), evaluated by every process alone."""
 
 import numpy as np
 import numpy.typing as npt

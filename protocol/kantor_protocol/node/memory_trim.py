@@ -1,4 +1,4 @@
-"""What a process need not keep in memory."""
+"""Release of file-backed memory that a process need not keep."""
 
 import contextlib
 import ctypes
@@ -12,10 +12,10 @@ _DONTNEED = 4
 
 
 def release_file_pages() -> None:
-    """Let go of what a file holds as well: most of all the compiler, 70 MB, once kernels are loaded.
+    """Release file-backed pages (madvise): most of all the compiler's, 70 MB, once kernels are loaded.
 
-    What is wanted again comes back by itself, from the page cache. Pages that are not as in their file, such as what the
-    loader has relocated, would not: they stay. Does nothing where there is no /proc.
+    Pages that are used again come back by themselves, from the page cache. Pages that differ from their file, such as
+    those that the loader has relocated, would not: they stay. Does nothing where there is no /proc.
     """
     with contextlib.suppress(OSError, AttributeError):
         madvise = ctypes.CDLL(None).madvise

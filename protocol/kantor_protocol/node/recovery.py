@@ -1,17 +1,16 @@
-"""A participant that outlives its process.
+"""A participant that survives the end of its process.
 
 Theory of operation
 -------------------
-1. What reaches a machine is noted in its *diary* before the machine steps, and a step is told to nobody
-   before it is noted. So spending is on record before it counts (write-ahead), and no crash makes a robot
-   spend twice.
-2. A machine is a pure function of its inputs. Whoever has the diary has the machine: it is built anew and
-   steps through the pages, to the last bit.
-3. A step is done once. Asked again for the step that it did last, because the answer was lost with a
-   process or on the way, a participant gives the same answer again.
-4. A diary that lacks a step that the world knows of (its end is torn, or all of it is lost) is no use:
-   others may hold entries that it has forgotten. Its owner goes on as a new *incarnation*, with a log of
-   its own; the log of the one before comes back from peers, as anybody's does.
+1. Inputs are written to the *write-ahead log* (WAL) before the machine steps, and outputs are sent only after that.
+   So spending is on record before it counts, and no crash makes a robot spend twice.
+2. A machine is a pure function of its inputs. The log therefore determines the machine: it is built anew and steps
+   through all entries, which restores it to the last bit.
+3. A step is done once. When the last step is requested again, because its report was lost with a process or on the
+   way, the participant answers with the same outputs.
+4. A log that lacks a step that world-sim knows (its end is torn, or all of it is lost) cannot be used: other
+   participants may hold log entries that it lacks. The participant then goes on as a new *incarnation*, with a log
+   of its own; the replicated log of the one before comes back from peers, as that of any other origin does.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,145 +22,151 @@ from kantor_protocol.base.machine import Body, Inputs, Outputs, StateMachine
 from kantor_protocol.scenario.faults.processes import Disk
 from kantor_protocol.wire.messages import decode_inputs, encode
 
-Build = Callable[[Body], StateMachine]
-"""Makes a participant's machine as it is when it takes a body over."""
+BuildMachine = Callable[[Body], StateMachine]
+"""Builds a participant's machine as it is when it takes a body over."""
 
 
 class WalContents(NamedTuple):
-    """What a diary holds."""
+    """The contents of a write-ahead log."""
 
     initial_state: Body
-    """What the machine took over when it was built."""
+    """The body that the machine took over when it was built."""
     inputs: Sequence[bytes]
     """Encoded Inputs of each of its steps, in order."""
 
 
 class WriteAheadLog(Protocol):
-    """Where a participant notes what reaches it."""
+    """The inputs of a participant, written before each step."""
 
     def read(self) -> WalContents | None:
-        """All that is sound from its beginning on; None if there is nothing."""
+        """The sound beginning of the log; None if there is none. Raises OSError."""
         ...
 
-    def begin(self, initial_state: Body) -> None:
-        """Throw away what there is, and begin anew. Raises OSError."""
+    def reset(self, initial_state: Body) -> None:
+        """Discard all entries and begin a new log. Raises OSError."""
         ...
 
-    def note(self, inputs: bytes) -> None:
-        """Add a page that outlives the process. Raises OSError, and then the page is not there."""
+    def append(self, inputs: bytes) -> None:
+        """Add an entry that outlives the process. Raises OSError, and then the entry is not there."""
         ...
 
 
 class RecoverableNode:
-    """A machine with its diary. `step` is its only entrance, also for what is encoded already."""
+    """A state machine with its write-ahead log. `step` is its only entrance, and `step_encoded` the same for bytes."""
 
-    def __init__(self, build: Build, wal: WriteAheadLog, body: Body) -> None:
-        """body: what the world knows of what it takes over. Raises OSError if nothing can be noted."""
+    def __init__(self, build: BuildMachine, wal: WriteAheadLog, body: Body) -> None:
+        """Recover from the log, or begin a new incarnation with a new log.
+
+        body: what world-sim knows of the body that is taken over. Raises OSError if the log cannot be written.
+        """
         self._wal = wal
-        self._told: Outputs | None = None
-        self._given: Inputs | None = None
-        entries = wal.read()
-        if entries is None or not _covers(entries, body):
-            entries = WalContents(_reincarnated(body), ())
-            wal.begin(entries.initial_state)
-        self.incarnation = entries.initial_state.incarnation
-        """Which incarnation it is."""
-        self._machine = build(entries.initial_state)
-        self.step_count = entries.initial_state.step
-        """Its last step."""
-        for entry in entries.inputs:
-            self._live(decode_inputs(entry))
+        self._last_inputs: Inputs | None = None
+        self._last_outputs: Outputs | None = None
+        contents = wal.read()
+        if contents is None or not _covers(contents, body):
+            contents = WalContents(_reincarnated(body), ())
+            wal.reset(contents.initial_state)
+        self.incarnation = contents.initial_state.incarnation
+        self._machine = build(contents.initial_state)
+        self.step_count = contents.initial_state.step
+        """The number of its last step."""
+        for entry in contents.inputs:
+            self._advance(decode_inputs(entry))
 
     @property
-    def unheard(self) -> tuple[Inputs, Outputs] | None:
-        """Its last step with what it was given, if it has made one."""
-        return (self._given, self._told) if self._given and self._told else None
+    def last_step(self) -> tuple[Inputs, Outputs] | None:
+        """Inputs and outputs of its last step, if it has made one."""
+        if self._last_inputs is None or self._last_outputs is None:
+            return None
+        return self._last_inputs, self._last_outputs
 
     def step(self, inputs: Inputs, /) -> Outputs:
-        """The next step, noted ahead; or the last one again. Raises OSError if it cannot be noted."""
+        """Make the next step, written ahead, or repeat the last outputs. Raises OSError if it cannot be written."""
         return self.step_encoded(encode(inputs))
 
     def step_encoded(self, entry: bytes, /) -> Outputs:
         """`step`, of encoded Inputs."""
         inputs = decode_inputs(entry)
-        if self._told is not None and inputs.observation.step < self.step_count:
-            return self._told
-        self._wal.note(entry)
-        return self._live(inputs)
+        if self._last_outputs is not None and inputs.observation.step < self.step_count:
+            return self._last_outputs
+        self._wal.append(entry)
+        return self._advance(inputs)
 
-    def _live(self, inputs: Inputs) -> Outputs:
-        self._given, self._told = inputs, self._machine.step(inputs)
-        self.step_count = self._told.step
-        return self._told
+    def _advance(self, inputs: Inputs) -> Outputs:
+        self._last_inputs, self._last_outputs = inputs, self._machine.step(inputs)
+        self.step_count = self._last_outputs.step
+        return self._last_outputs
 
 
 class InMemoryLog:
-    """A diary in memory: it outlives its owner, not the process that both are in."""
+    """A write-ahead log in memory: it outlives the node that writes it, not their process."""
 
     def __init__(self) -> None:
-        self._birth: Body | None = None
+        self._initial_state: Body | None = None
         self._inputs: list[bytes] = []
 
     def read(self) -> WalContents | None:
         """All of it."""
-        return None if self._birth is None else WalContents(self._birth, tuple(self._inputs))
+        if self._initial_state is None:
+            return None
+        return WalContents(self._initial_state, tuple(self._inputs))
 
-    def begin(self, initial_state: Body) -> None:
-        """Anew."""
-        self._birth, self._inputs = initial_state, []
+    def reset(self, initial_state: Body) -> None:
+        """Discard all entries and begin a new log."""
+        self._initial_state, self._inputs = initial_state, []
 
-    def note(self, inputs: bytes) -> None:
-        """One more page."""
+    def append(self, inputs: bytes) -> None:
+        """Add an entry."""
         self._inputs.append(inputs)
 
     def damage(self, disk: Disk, step: int) -> None:
-        """Lose all, or the end with the page of the last step that the world knows of."""
-        if self._birth is None or disk == "kept":
+        """Lose nothing, all, or the end with the entry of the last step that world-sim knows."""
+        if self._initial_state is None or disk == "kept":
             return
-        del self._inputs[max(0, step - self._birth.step - 1) :]
+        del self._inputs[max(0, step - self._initial_state.step - 1) :]
         if disk == "lost":
-            self._birth = None
+            self._initial_state = None
 
 
 class KillableNode:
-    """A participant in this process that can be killed; its diary is in memory."""
+    """A participant in this process that can be killed and started again; its write-ahead log is in memory."""
 
-    def __init__(self, build: Build, body: Body) -> None:
+    def __init__(self, build: BuildMachine, body: Body) -> None:
         """body: what it takes over at time 0."""
         self._build = build
         self._wal = InMemoryLog()
-        self._life: RecoverableNode | None = RecoverableNode(build, self._wal, body)
+        self._node: RecoverableNode | None = RecoverableNode(build, self._wal, body)
 
     def step(self, inputs: Inputs, /) -> Outputs:
-        """See `Life`. Nobody may ask the dead."""
+        """Make a step, see RecoverableNode. It must not be called while the participant is killed."""
         return self.step_encoded(encode(inputs))
 
     def step_encoded(self, entry: bytes, /) -> Outputs:
         """`step`, of encoded Inputs."""
-        assert self._life is not None
-        return self._life.step_encoded(entry)
+        assert self._node is not None
+        return self._node.step_encoded(entry)
 
     def kill(self) -> None:
-        """All is gone but the diary."""
-        self._life = None
+        """Discard everything but the write-ahead log."""
+        self._node = None
 
     def start(self, body: Body, disk: Disk) -> tuple[int, int]:
-        """Go on with what is left of the diary; the epoch, and the last step."""
+        """Recover from what is left of the write-ahead log; the incarnation, and the number of its last step."""
         self._wal.damage(disk, body.step)
-        self._life = RecoverableNode(self._build, self._wal, body)
-        return self._life.incarnation, self._life.step_count
+        self._node = RecoverableNode(self._build, self._wal, body)
+        return self._node.incarnation, self._node.step_count
 
 
-def _covers(entries: WalContents, body: Body) -> bool:
-    """Whether a diary goes as far as the world's knowledge, or farther."""
+def _covers(contents: WalContents, body: Body) -> bool:
+    """Whether a log goes as far as world-sim's knowledge, or farther."""
     return (
-        entries.initial_state.incarnation == body.incarnation
-        and entries.initial_state.step + len(entries.inputs) >= body.step
+        contents.initial_state.incarnation == body.incarnation
+        and contents.initial_state.step + len(contents.inputs) >= body.step
     )
 
 
 def _reincarnated(body: Body) -> Body:
-    """The body as a new incarnation takes it over; who has never acted needs none."""
+    """The body as a new incarnation takes it over; one that has made no step needs none."""
     return (
         body if body.step == 0 else msgspec.structs.replace(body, incarnation=body.incarnation + 1)
     )

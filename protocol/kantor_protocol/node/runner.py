@@ -1,12 +1,12 @@
 """The shell of a participant's process: it turns messages into steps and steps into messages.
 
-It makes no decision. In the lockstep exchange it steps when world-sim says so. In the wall exchange it
-steps when its own clock says so, with whatever has arrived by then, and waits for nobody; but only from where
-the world has accepted its last step. Until then it *holds*: it makes no move and spends nothing (the
-lost-link failsafe, which needs no peer), and says again now and then what it did last.
+It makes no decision. In the lockstep exchange it steps when world-sim requests a step. In the realtime exchange it
+steps when its own clock says so, with what has arrived by then, and waits for no other participant; but only once
+world-sim has accepted its last step. Until then it *holds*: it makes no move and spends nothing (the lost-link
+failsafe, which needs no peer), and repeats its last report now and then.
 
-It outlives its process (`life.py`): what it is given is noted in its diary ahead of each step. What cannot be
-noted is not done; it holds until it can be.
+It survives the end of its process (`recovery.py`): inputs are written to the write-ahead log ahead of each step.
+While the log cannot be written it makes no step; it holds until the log can be written again.
 """
 
 import contextlib
@@ -40,12 +40,12 @@ from kantor_protocol.wire.messages import (
     encode,
 )
 
-Build = Callable[[Mission, Body], StateMachine]
-"""Makes the machine for a mission as it is when it takes a body over."""
+BuildForMission = Callable[[Mission, Body], StateMachine]
+"""Builds the machine for a mission as it is when it takes a body over."""
 
 
 RETRY_S = 0.2
-"""After so long, what has not been heard is said again, and what could not be noted is tried again."""
+"""A report that is not acknowledged is repeated after so long, and a write that failed is tried again."""
 
 
 class RejectedError(RuntimeError):
@@ -53,27 +53,27 @@ class RejectedError(RuntimeError):
 
 
 class StateError(RuntimeError):
-    """There is nowhere to keep a diary; the message is one line with the remedy."""
+    """No write-ahead log can be kept; the message is one line with the remedy."""
 
 
 def participate(
     connect: str,
     identity: Identity,
-    build: Build,
-    patience_s: float,
-    say: Callable[[str], None],
+    build: BuildForMission,
+    connect_timeout_s: float,
+    notify: Callable[[str], None],
     state: Path,
 ) -> str:
-    """Take part in missions until world-sim says stop; the reason it gave.
+    """Take part in missions until world-sim sends Stop; the reason in it.
 
-    say: takes one line of news for a person. state: folder of the diary. Raises BusError, NotWantedError,
-    StateError.
+    connect_timeout_s: how long to wait for world-sim. notify: takes one line of text for the operator. state: folder
+    of the write-ahead log. Raises BusError, RejectedError, StateError.
     """
     _check_writable(state)
     nonce = secrets.token_hex(8)
-    with participant_session(connect, identity, nonce, patience_s) as line:
-        say(f"{identity.user}: on the bus at {connect}, waiting for a mission")
-        return _Node(line, identity, build, say, state).run()
+    with participant_session(connect, identity, nonce, connect_timeout_s) as session:
+        notify(f"{identity.user}: on the bus at {connect}, waiting for a mission")
+        return _Runner(session, identity, build, notify, state).run()
 
 
 def _check_writable(state: Path) -> None:
@@ -83,56 +83,57 @@ def _check_writable(state: Path) -> None:
     except OSError as error:
         reason = error.strerror or error
         raise StateError(
-            f"{state}: no diary can be kept there ({reason}); choose another --state"
+            f"{state}: no write-ahead log can be kept there ({reason}); choose another --state"
         ) from None
 
 
-class _Node:
+class _Runner:
     def __init__(
         self,
-        line: ParticipantSession,
+        session: ParticipantSession,
         identity: Identity,
-        build: Build,
-        say: Callable[[str], None],
+        build: BuildForMission,
+        notify: Callable[[str], None],
         state: Path,
     ) -> None:
-        self._line = line
+        self._session = session
         self._me = identity.user
         self._build = build
-        self._say = say
+        self._notify = notify
         self._path = state / f"{identity.user}.diary"
         self._mission: Mission | None = None
         self._wal: WalFile | None = None
-        self._life: RecoverableNode | None = None
-        self._owed: Inputs | None = None
-        """Lockstep: the turn that has not been answered."""
-        self._wall: WallClock | None = None
-        self._cannot = False
-        """The diary could not be written when that was last tried."""
-        self._shown = 0
+        self._node: RecoverableNode | None = None
+        self._requested: Inputs | None = None
+        """Lockstep: the inputs of the step request that has not been answered."""
+        self._clock: WallClock | None = None
+        """Realtime: the own clock, once it is started."""
+        self._unwritable = False
+        """The write-ahead log could not be written when that was last tried."""
+        self._published = 0
         """Steps of this process."""
         self.refused = 0
-        """Messages from world-sim that could not be read."""
+        """Messages from world-sim that could not be decoded."""
 
     def run(self) -> str:
         while True:
-            message = self._next()
+            message = self._next_message()
             if isinstance(message, Stop):
                 return message.reason
             if message is not None:
                 self._handle(message)
             try:
-                self._act()
+                self._make_due_step()
             except OSError as error:
-                self._hold(error)
+                self._report_unwritable(error)
 
-    def _next(self) -> ToParticipant | None:
-        timeout_s = RETRY_S if self._cannot else None
-        if self._wall is not None:
-            until_due_s = self._wall.until_due_s()
+    def _next_message(self) -> ToParticipant | None:
+        timeout_s = RETRY_S if self._unwritable else None
+        if self._clock is not None:
+            until_due_s = self._clock.until_due_s()
             timeout_s = until_due_s if timeout_s is None else min(timeout_s, until_due_s)
-            timeout_s = min(timeout_s, RETRY_S) if self._unheard else timeout_s
-        payload = self._line.next(timeout_s)
+            timeout_s = min(timeout_s, RETRY_S) if self._unacknowledged else timeout_s
+        payload = self._session.next(timeout_s)
         if payload is None:
             return None
         try:
@@ -143,137 +144,137 @@ class _Node:
 
     def _handle(self, message: ToParticipant) -> None:
         if isinstance(message, StepRequest):
-            if self._wall is not None:
-                self._wall.enqueue(message.inputs)
+            if self._clock is not None:
+                self._clock.enqueue(message.inputs)
             else:
-                self._owed = message.inputs
-        elif isinstance(message, Stop) or message.nonce != self._line.nonce:
+                self._requested = message.inputs
+        elif isinstance(message, Stop) or message.nonce != self._session.nonce:
             return
         elif isinstance(message, Refusal):
             raise RejectedError(f"{self._me}: {message.reason}")
         elif isinstance(message, Mission):
-            self._prepare(message)
-        elif self._mission is not None and self._life is not None:
-            self._go(message, self._mission)
+            self._accept_mission(message)
+        elif self._mission is not None and self._node is not None:
+            self._set_clock(message, self._mission)
 
-    def _prepare(self, mission: Mission) -> None:
-        """Get ready for a mission; for the one that it has already, say so."""
+    def _accept_mission(self, mission: Mission) -> None:
+        """Prepare for a mission; for the one that it has already, answer that it is ready."""
         ours = self._mission
-        if ours is not None and ours.run == mission.run and self._goes_as_far_as(mission.body):
-            self._tell_ready()
+        if ours is not None and ours.run == mission.run and self._covers(mission.body):
+            self._send_ready()
             return
-        self._mission, self._life, self._wall, self._owed = mission, None, None, None
-        self._say(f"{self._me}: mission {mission.scenario.name}, seed {mission.seed}")
+        self._mission, self._node, self._clock, self._requested = mission, None, None, None
+        self._notify(f"{self._me}: mission {mission.scenario.name}, seed {mission.seed}")
 
-    def _goes_as_far_as(self, body: Body) -> bool:
-        life = self._life
-        return life is not None and (life.incarnation, life.step_count) >= (
+    def _covers(self, body: Body) -> bool:
+        """Whether the node is as far as world-sim's knowledge, or farther."""
+        node = self._node
+        return node is not None and (node.incarnation, node.step_count) >= (
             body.incarnation,
             body.step,
         )
 
-    def _act(self) -> None:
-        """Do what is due. Raises OSError if it cannot be noted."""
+    def _make_due_step(self) -> None:
+        """Recover if that is due, and make the step that is. Raises OSError if it cannot be written ahead."""
         if self._mission is None:
             return
-        if self._life is None:
-            self._live(self._mission)
-        if self._owed is not None and self._life is not None:
-            outputs, now_ns = self._life.step(self._owed), self._owed.now_ns
-            self._owed = None
-            self._line.send(encode(Report(VERSION, self._line.nonce, outputs)), patiently=True)
-            self._show(outputs, now_ns)
-        if self._wall is not None:
-            self._act_by_own_clock(self._wall)
-        self._cannot = False
+        if self._node is None:
+            self._recover(self._mission)
+        if self._requested is not None and self._node is not None:
+            outputs, now_ns = self._node.step(self._requested), self._requested.now_ns
+            self._requested = None
+            self._session.send(encode(Report(VERSION, self._session.nonce, outputs)), blocking=True)
+            self._publish(outputs, now_ns)
+        if self._clock is not None:
+            self._step_by_own_clock(self._clock)
+        self._unwritable = False
 
-    def _hold(self, error: OSError) -> None:
-        if not self._cannot:
-            with contextlib.suppress(OSError):  # the log may be on the same disk
-                self._say(f"{self._me}: holds, its diary cannot be written: {error.strerror}")
-        self._cannot = True
+    def _report_unwritable(self, error: OSError) -> None:
+        if not self._unwritable:
+            with contextlib.suppress(OSError):  # the output may be on the same disk
+                self._notify(
+                    f"{self._me}: holds, its write-ahead log cannot be written: {error.strerror}"
+                )
+        self._unwritable = True
 
-    def _live(self, mission: Mission) -> None:
-        """Go on from the diary, or begin one."""
+    def _recover(self, mission: Mission) -> None:
+        """Go on from the write-ahead log, or begin a new one."""
         if self._wal is not None:
             self._wal.close()
         self._wal = WalFile(self._path, mission.run)
-        self._life = RecoverableNode(partial(self._build, mission), self._wal, mission.body)
-        if self._life.step_count:
-            came = (
-                "new incarnation"
-                if self._life.incarnation > mission.body.incarnation
-                else "goes on"
+        node = RecoverableNode(partial(self._build, mission), self._wal, mission.body)
+        self._node = node
+        if node.step_count:
+            how = "begins" if node.incarnation > mission.body.incarnation else "goes on as"
+            self._notify(
+                f"{self._me}: {how} incarnation {node.incarnation}, from step {node.step_count}"
             )
-            self._say(
-                f"{self._me}: {came}, epoch {self._life.incarnation}, step {self._life.step_count}"
-            )
-        self._tell_ready()
+        self._send_ready()
 
-    def _tell_ready(self) -> None:
-        life = self._life
-        if life is not None:
-            now_ns = 0 if self._wall is None else self._wall.now_ns
-            ready = Ready(VERSION, self._line.nonce, life.incarnation, life.step_count, now_ns)
-            self._line.send(encode(ready), patiently=True)
+    def _send_ready(self) -> None:
+        node = self._node
+        if node is not None:
+            now_ns = 0 if self._clock is None else self._clock.now_ns
+            ready = Ready(VERSION, self._session.nonce, node.incarnation, node.step_count, now_ns)
+            self._session.send(encode(ready), blocking=True)
 
-    # Wall: the own clock.
+    # Realtime: steps by the own clock.
 
-    def _go(self, go: StartClock, mission: Mission) -> None:
+    def _set_clock(self, message: StartClock, mission: Mission) -> None:
         """Start the clock; or, if it runs, set the one that the machine reads."""
-        if self._wall is None and go.observation is not None:
-            self._wall = WallClock(mission, self._me, go)
-        elif self._wall is not None:
-            self._wall.skew_ns = go.skew_ns
-            if go.observation is not None:
-                self._wall.enqueue(Inputs(go.now_ns, go.observation))
-            self._wall.said_ns = 0
+        if self._clock is None and message.observation is not None:
+            self._clock = WallClock(mission, self._me, message)
+        elif self._clock is not None:
+            self._clock.skew_ns = message.skew_ns
+            if message.observation is not None:
+                self._clock.enqueue(Inputs(message.now_ns, message.observation))
+            self._clock.reported_ns = 0
 
     @property
-    def _unheard(self) -> bool:
-        life, wall = self._life, self._wall
-        return life is not None and wall is not None and life.step_count > wall.accepted
+    def _unacknowledged(self) -> bool:
+        """Whether world-sim has not yet accepted the last step, as far as is known."""
+        node, clock = self._node, self._clock
+        return node is not None and clock is not None and node.step_count > clock.accepted_step
 
-    def _act_by_own_clock(self, wall: "WallClock") -> None:
-        life, wal = self._life, self._wal
-        if life is None or wal is None:
+    def _step_by_own_clock(self, clock: WallClock) -> None:
+        node, wal = self._node, self._wal
+        if node is None or wal is None:
             return
-        now_ns = wall.now_ns
-        if wall.is_due(now_ns) and wall.accepted == life.step_count:
-            wal.skew_ns = wall.skew_ns
-            inputs = wall.inputs(now_ns)
-            outputs = life.step(inputs)
-            wall.inbox.clear()
-            self._report(wal.skew_ns, wall)
-            self._show(outputs, now_ns)
-        elif self._unheard and wall.silent_s >= RETRY_S:
-            self._report(wal.skew_ns, wall)
+        now_ns = clock.now_ns
+        if clock.is_due(now_ns) and clock.accepted_step == node.step_count:
+            wal.skew_ns = clock.skew_ns
+            outputs = node.step(clock.inputs(now_ns))
+            clock.inbox.clear()
+            self._report_last_step(wal.skew_ns, clock)
+            self._publish(outputs, now_ns)
+        elif self._unacknowledged and clock.since_report_s >= RETRY_S:
+            self._report_last_step(wal.skew_ns, clock)
 
-    def _report(self, skew_ns: int, wall: "WallClock") -> None:
-        """Say what it did last. skew_ns: of its clock when it did."""
-        if self._life is None or self._life.unheard is None:
+    def _report_last_step(self, skew_ns: int, clock: WallClock) -> None:
+        """Send the report of the last step. skew_ns: of the clock when it was made."""
+        if self._node is None or self._node.last_step is None:
             return
-        inputs, outputs = self._life.unheard
-        heard = tuple((envelope.source, envelope.sequence) for envelope in inputs.inbox)
+        inputs, outputs = self._node.last_step
+        received = tuple((envelope.source, envelope.sequence) for envelope in inputs.inbox)
         report = Report(
             VERSION,
-            self._line.nonce,
+            self._session.nonce,
             outputs,
             inputs.now_ns - skew_ns,
-            heard,
+            received,
             inputs.observation.step,
             skew_ns,
         )
-        # It is said again until it is heard, so it need not wait for a world that is slow to listen.
-        self._line.send(encode(report), patiently=False)
-        wall.said_ns = time.monotonic_ns()
+        # It is repeated until it is acknowledged, so it need not wait for a world-sim that is slow to receive.
+        self._session.send(encode(report), blocking=False)
+        clock.reported_ns = time.monotonic_ns()
 
-    def _show(self, outputs: Outputs, now_ns: int) -> None:
-        """Tell observers."""
-        self._line.publish_pose(encode(PoseMessage(VERSION, outputs.step, now_ns, outputs.pose)))
+    def _publish(self, outputs: Outputs, now_ns: int) -> None:
+        """Publish pose and weights for observers."""
+        self._session.publish_pose(encode(PoseMessage(VERSION, outputs.step, now_ns, outputs.pose)))
         if outputs.weights:
-            self._line.publish_weights(outputs.weights)
-        self._shown += 1
+            self._session.publish_weights(outputs.weights)
+        self._published += 1
         # Kernels are loaded by the first steps, and now and then by a later one.
-        if self._shown.bit_count() == 1:
+        if self._published.bit_count() == 1:
             memory_trim.release_file_pages()

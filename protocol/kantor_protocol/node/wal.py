@@ -1,13 +1,13 @@
-"""A participant's diary on disk: one append-only file, see `life.py`.
+"""A participant's write-ahead log on disk: one append-only file (`.diary`), see `recovery.py`.
 
-The file is a magic, then frames: length, CRC32 of everything so far, content. The first frame is the
-header (run, birth), every other one a page. A page goes to the operating system in one write before the step
-is made, so it outlives the process; after a power cut the tail may be missing or wrong, and what is
-sound from the beginning on is what counts. A file of another run, or of none, is no diary.
+The file is a magic, then frames: length, CRC32 of everything so far, content. The first frame is the header (run,
+initial state), every other one an entry: the skew of the clock (int64, ns), then encoded Inputs. An entry is handed
+to the operating system in one write before the step is made, so that it outlives the process. After a power cut the
+tail may be missing or wrong; the sound beginning counts. A file of another run, or of none, counts as no log.
 
-A diary has one writer. Whoever opens it while another process has it (a frozen predecessor, say) does not
-go on from it: it begins one of its own under the same name, and the other writes to a file that nobody
-reads any more.
+A log has one writer. A process that opens it while another process has it (a frozen predecessor, say) does not
+continue it: it begins a new one under the same name, and the other process writes to a file that is not read any
+more.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ _MAGIC = b"kantor diary 1\n"
 _HEAD = struct.Struct("<II")
 _SKEW = struct.Struct("<q")
 _LOCK_S = 0.5
-"""A process that was killed a moment ago may still have the file."""
+"""How long to wait for the lock: a process that was killed a moment ago may still hold it."""
 
 
 class _Header(msgspec.Struct, frozen=True, array_like=True):
@@ -39,56 +39,56 @@ class _Header(msgspec.Struct, frozen=True, array_like=True):
 
 
 class _SoundPrefix(NamedTuple):
-    """What is sound of a file."""
+    """The sound beginning of a file."""
 
     header: _Header
     entries: list[bytes]
     """Encoded inputs."""
     skew_ns: int
-    """Of the last page."""
+    """Of the last entry."""
     ends: list[int]
-    """Where the header ends, and each page."""
+    """Positions in the file at which the header and each entry end."""
     crc: int
 
 
 class WalFile:
-    """The diary of a participant in one run."""
+    """The write-ahead log of a participant in one run."""
 
     def __init__(self, path: Path, run: str) -> None:
-        """path: the file, in a folder that is there. Raises OSError."""
+        """path: the file, in a folder that exists."""
         self._path = path
         self._run = run
         self._file = -1
         self._end = 0
         self._crc = 0
         self.skew_ns = 0
-        """How far ahead the clock is that the next page was read by; after `read`, that of the last one."""
+        """How far ahead the clock is by which the next entry was read; after `read`, that of the last entry."""
 
     def read(self) -> WalContents | None:
-        """All that is sound from its beginning on, None if there is nothing. Raises OSError."""
+        """The sound beginning of the log; None if there is none, or another process holds it. Raises OSError."""
         self.close()
         try:
             self._file = os.open(self._path, os.O_RDWR)
         except FileNotFoundError:
             return None
-        if not _owned(self._file):
+        if not _acquired(self._file):
             self.close()
             return None
         with open(self._file, "rb", closefd=False) as file:
-            sound = _sound_prefix(file.read())
-        if sound is None or sound.header.run != self._run:
+            prefix = _sound_prefix(file.read())
+        if prefix is None or prefix.header.run != self._run:
             self.close()
             return None
-        self._end, self._crc, self.skew_ns = sound.ends[-1], sound.crc, sound.skew_ns
+        self._end, self._crc, self.skew_ns = prefix.ends[-1], prefix.crc, prefix.skew_ns
         os.ftruncate(self._file, self._end)
-        return WalContents(sound.header.initial_state, sound.entries)
+        return WalContents(prefix.header.initial_state, prefix.entries)
 
-    def begin(self, initial_state: Body) -> None:
-        """Throw away what there is, and begin anew. Raises OSError, and then the old file is still there."""
+    def reset(self, initial_state: Body) -> None:
+        """Discard all entries and begin a new log. Raises OSError, and then the old file is still there."""
         draft = self._path.with_name(f".{self._path.name}.{os.getpid()}")
         file = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
         try:
-            _owned(file)
+            _acquired(file)
             content = msgspec.msgpack.encode(_Header(self._run, initial_state))
             crc = zlib.crc32(_MAGIC)
             frame, crc = _frame(content, crc)
@@ -101,31 +101,31 @@ class WalFile:
         self.close()
         self._file, self._end, self._crc = file, len(_MAGIC) + len(frame), crc
 
-    def note(self, inputs: bytes) -> None:
-        """Add a page that outlives the process. Raises OSError, and then the page is not there."""
+    def append(self, inputs: bytes) -> None:
+        """Add an entry that outlives the process. Raises OSError, and then the entry is not there."""
         frame, crc = _frame(_SKEW.pack(self.skew_ns) + inputs, self._crc)
         _write(self._file, frame, self._end)
         self._end += len(frame)
         self._crc = crc
 
     def close(self) -> None:
-        """Let the file go."""
+        """Close the file."""
         file, self._file = self._file, -1
         if file >= 0:
             os.close(file)
 
 
 def tear(path: Path, step: int) -> None:
-    """Cut a diary in the middle of a page, as a power cut may, so that it lacks the given step.
+    """Cut a log in the middle of an entry, as a power cut may, so that it lacks the given step.
 
-    If there is no such page nothing is cut. Raises OSError.
+    If there is no such entry nothing is cut. Raises OSError.
     """
-    sound = _sound_prefix(path.read_bytes())
-    if sound is None:
+    prefix = _sound_prefix(path.read_bytes())
+    if prefix is None:
         return
-    kept = max(0, step - sound.header.initial_state.step - 1)
-    if kept < len(sound.entries):
-        os.truncate(path, (sound.ends[kept] + sound.ends[kept + 1]) // 2)
+    kept = max(0, step - prefix.header.initial_state.step - 1)
+    if kept < len(prefix.entries):
+        os.truncate(path, (prefix.ends[kept] + prefix.ends[kept + 1]) // 2)
 
 
 def _frame(content: bytes, crc: int) -> tuple[bytes, int]:
@@ -134,7 +134,7 @@ def _frame(content: bytes, crc: int) -> tuple[bytes, int]:
 
 
 def _write(file: int, frame: bytes, place: int) -> None:
-    """All of it, in one write if there is room, or nothing. Raises OSError."""
+    """Write all of it, in one call if there is room, or nothing. Raises OSError."""
     written = 0
     try:
         while written < len(frame):
@@ -145,8 +145,8 @@ def _write(file: int, frame: bytes, place: int) -> None:
         raise
 
 
-def _owned(file: int) -> bool:
-    """Have the file for this process alone; False if another has it and keeps it. Raises OSError."""
+def _acquired(file: int) -> bool:
+    """Lock the file for this process; False if another process holds the lock for too long. Raises OSError."""
     give_up = time.monotonic() + _LOCK_S
     while True:
         try:
@@ -160,7 +160,7 @@ def _owned(file: int) -> bool:
 
 
 def _sound_prefix(content: bytes) -> _SoundPrefix | None:
-    """The sound beginning of a file; None if not even the header is."""
+    """The sound beginning of a file; None if not even the header is sound."""
     if not content.startswith(_MAGIC):
         return None
     frames = _frames(content)
@@ -183,16 +183,16 @@ def _sound_prefix(content: bytes) -> _SoundPrefix | None:
 
 
 def _frames(content: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Content of each sound frame, where it ends, and the CRC up to there."""
+    """Content of each sound frame, the position of its end, and the CRC up to there."""
     place, crc = len(_MAGIC), zlib.crc32(_MAGIC)
     while place + _HEAD.size <= len(content):
-        length, told = _HEAD.unpack_from(content, place)
+        length, expected = _HEAD.unpack_from(content, place)
         end = place + _HEAD.size + length
         if length > MESSAGE_BYTES_MAX or end > len(content):
             return
         frame = content[place + _HEAD.size : end]
         crc = zlib.crc32(frame, zlib.crc32(length.to_bytes(4, "little"), crc))
-        if crc != told:
+        if crc != expected:
             return
         yield frame, end, crc
         place = end

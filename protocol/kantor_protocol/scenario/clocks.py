@@ -32,10 +32,10 @@ class StepClock(msgspec.Struct, frozen=True):
 
 
 def step_clocks(scenario: Scenario, seed: int) -> dict[ParticipantId, StepClock]:
-    """The clocks of everybody in the roster.
+    """The clocks of all participants in the roster.
 
     Robots have equal phases, or phases spread over the period when they act in turn. The supervisor
-    steps half-way between two robots' steps, so that its word is in time for the next.
+    steps half-way between two robots' steps, so that its message is in time for the next.
     """
     period_ns, count = scenario.period_ns, scenario.robots.count
     turns = count if scenario.clock.order == "turn" else 1

@@ -9,7 +9,7 @@ from kantor_protocol.scenario.types import ScenarioTable
 
 
 def to_tree(scenario: ScenarioTable) -> dict[str, Any]:
-    """A scenario, or another table, as plain ones, without what is not set."""
+    """A scenario, or another table, as plain dictionaries and lists, without keys that are None."""
 
     def without_none(value: Any) -> Any:
         if isinstance(value, dict):
@@ -25,7 +25,7 @@ def to_tree(scenario: ScenarioTable) -> dict[str, Any]:
 def to_toml(scenario: Scenario, *, brief: bool = False) -> str:
     """The scenario as TOML text that `parse` reads back as an equal one.
 
-    brief: without what is as it is by default.
+    brief: without keys that have their default.
     """
 
     def literal(value: Any) -> str:
@@ -53,7 +53,7 @@ def to_toml(scenario: Scenario, *, brief: bool = False) -> str:
 
 
 def _without_defaults(table: ScenarioTable) -> dict[str, Any]:
-    """A table as plain ones, as briefly as `from_tree` understands it."""
+    """A table as plain dictionaries and lists, without keys that have their default."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, ScenarioTable):

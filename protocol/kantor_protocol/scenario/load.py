@@ -1,7 +1,6 @@
-"""Scenarios from TOML, with overrides.
+"""Scenarios and schedules of faults from TOML, with overrides.
 
-A key that does not exist, a value of the wrong type or out of bounds is
-refused with one line that names it.
+A key that does not exist, a value of the wrong type or out of bounds is refused with one line that names it.
 """
 
 import difflib
@@ -10,7 +9,7 @@ import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -22,48 +21,33 @@ from kantor_protocol.scenario.types import ScenarioTable
 from kantor_protocol.scenario.validate import complaints, not_finite
 from kantor_protocol.scenario.validate_faults import complaints_of_faults
 
+Table = TypeVar("Table", bound=ScenarioTable)
+
 
 def parse(text: str, origin: str, overrides: Iterable[str] = ()) -> Scenario:
     """A checked scenario from TOML text and `key.sub=value` overrides.
 
     `origin` names the text in messages. Raises ScenarioError.
     """
-    try:
-        tree = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ScenarioError(f"{origin}: not valid TOML: {error}") from None
+    tree = _tree_of(text, origin)
     for override in overrides:
         _override(tree, override)
     return from_tree(tree, origin)
 
 
 def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
-    """A checked scenario from a TOML file; relative files in it are relative to its folder."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ScenarioError(
-            f"{path}: no such scenario file; `kantor scenarios` lists the packaged ones"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise ScenarioError(f"{path}: cannot be read: {error}") from None
+    """A checked scenario from a TOML file; relative files in it are relative to its folder.
+
+    Raises ScenarioError.
+    """
+    text = _read(path, "no such scenario file; `kantor scenarios` lists the packaged ones")
     return rooted(parse(text, str(path), overrides), path.parent)
 
 
 def with_chaos(scenario: Scenario, path: Path) -> Scenario:
-    """The scenario with the faults of a TOML file behind its own. Raises ScenarioError."""
-    try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ScenarioError(f"{path}: no such file of faults") from None
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error}") from None
-    except (ValueError, RecursionError) as error:
-        raise ScenarioError(f"{path}: not valid TOML: {error}") from None
-    try:
-        chaos = msgspec.convert(tree, Chaos)
-    except msgspec.ValidationError as error:
-        raise ScenarioError(f"{path}: {_readable(str(error), tree, Chaos)}") from None
+    """The scenario with the faults of a TOML file after its own. Raises ScenarioError."""
+    tree = _tree_of(_read(path, "no such file of faults"), str(path))
+    chaos = _converted(tree, Chaos, str(path))
     faults = (*scenario.faults, *chaos.faults)
     if len(faults) > FAULTS_MAX:
         raise ScenarioError(f"{path}: faults: with the scenario's own more than {FAULTS_MAX}")
@@ -78,15 +62,15 @@ def with_chaos(scenario: Scenario, path: Path) -> Scenario:
 def rooted(scenario: Scenario, folder: Path) -> Scenario:
     """The scenario with its relative file names turned into absolute ones below `folder`.
 
-    A name that exists from the current folder is taken as it is, so that `--set samples.file=…`
-    means what a shell user expects.
+    A name that exists in the current folder stays relative to it, so that `--set samples.file=…` means what a
+    shell user expects.
     """
 
     def place(name: str | None) -> str | None:
         if name is None or Path(name).is_absolute():
             return name
         try:
-            Path(name).stat()  # unlike `exists`, it tells of a name that no file can have
+            Path(name).stat()  # unlike `exists`, it raises for a name that no file can have
         except (FileNotFoundError, NotADirectoryError):
             return str((folder / name).resolve())
         except (OSError, ValueError) as error:
@@ -103,15 +87,40 @@ def rooted(scenario: Scenario, folder: Path) -> Scenario:
 
 def from_tree(tree: dict[str, Any], origin: str) -> Scenario:
     """A checked scenario from parsed TOML. Raises ScenarioError."""
-    try:
-        scenario = msgspec.convert(tree, Scenario)
-    except msgspec.ValidationError as error:
-        raise ScenarioError(f"{origin}: {_readable(str(error), tree)}") from None
-    except UnicodeEncodeError:  # a shell passes on whatever bytes it is given
-        raise ScenarioError(f"{origin}: a text in it is not UTF-8; write it so") from None
+    scenario = _converted(tree, Scenario, origin)
     for complaint in complaints(scenario):
         raise ScenarioError(f"{origin}: {complaint}")
     return scenario
+
+
+def _read(path: Path, missing: str) -> str:
+    """The text of a TOML file. missing: the message if there is no such file. Raises ScenarioError."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ScenarioError(f"{path}: {missing}") from None
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{path}: not valid TOML: {error}") from None
+    except (OSError, ValueError) as error:
+        raise ScenarioError(f"{path}: cannot be read: {error}") from None
+
+
+def _tree_of(text: str, origin: str) -> dict[str, Any]:
+    """Parsed TOML. Raises ScenarioError."""
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ScenarioError(f"{origin}: not valid TOML: {error}") from None
+
+
+def _converted(tree: dict[str, Any], whole: type[Table], origin: str) -> Table:
+    """Parsed TOML as a table of a kind. Raises ScenarioError."""
+    try:
+        return msgspec.convert(tree, whole)
+    except msgspec.ValidationError as error:
+        raise ScenarioError(f"{origin}: {_readable(str(error), tree, whole)}") from None
+    except UnicodeEncodeError:  # a shell passes on any bytes
+        raise ScenarioError(f"{origin}: a text in it is not UTF-8; write it so") from None
 
 
 def _override(tree: dict[str, Any], override: str) -> None:
@@ -124,7 +133,7 @@ def _override(tree: dict[str, Any], override: str) -> None:
     except (ValueError, RecursionError):
         value = text.strip()
     if isinstance(value, str) and ".".join(path) in _NAMED:
-        path.append("name")  # planner=spectral says which planner
+        path.append("name")  # planner=spectral names the planner
     table = tree
     for i, part in enumerate(path[:-1]):
         table = table.setdefault(part, {})
@@ -134,13 +143,13 @@ def _override(tree: dict[str, Any], override: str) -> None:
 
 
 _NAMED = frozenset({"planner", "vehicle"})
-"""Tables that a name may stand for."""
+"""Tables for which a name alone may be given."""
 
 
-def _readable(message: str, tree: Any, whole: type[ScenarioTable] = Scenario) -> str:
-    """Msgspec's complaint with the key first and, for an unknown key, the nearest known one.
+def _readable(message: str, tree: Any, whole: type[ScenarioTable]) -> str:
+    """Msgspec's message with the key first and, for an unknown key, the nearest known one.
 
-    tree: what msgspec was to make a `whole` of.
+    tree: the parsed TOML that msgspec could not convert to a `whole`.
     """
     problem, _, place = message.partition(" - at ")
     place = place.strip("`").removeprefix("$").removeprefix(".")
@@ -160,7 +169,7 @@ def _readable(message: str, tree: Any, whole: type[ScenarioTable] = Scenario) ->
 
 
 def _table_at(place: str, tree: Any, whole: type[ScenarioTable]) -> type[ScenarioTable]:
-    """What kind of table a place such as `radio` or `faults[2]` is."""
+    """The class of the table at a place such as `radio` or `faults[2]`."""
     kind: Any = whole
     if fault := re.match(r"faults\[(\d+)\]", place):
         return KINDS[tree["faults"][int(fault[1])]["kind"]]
@@ -179,7 +188,7 @@ def _choices(place: str, tree: Any, whole: type[ScenarioTable]) -> str:
 
 
 def _plain(kind: Any) -> Any:
-    """A type without what makes it optional, or many."""
+    """A type without its optional or repeated form."""
     if get_origin(kind) in {Union, UnionType, tuple}:
         return get_args(kind)[0]
     return kind

@@ -45,18 +45,18 @@ class Domain(ScenarioTable, frozen=True, kw_only=True):
 
 
 class MapOptions(ScenarioTable, frozen=True, kw_only=True):
-    """The world of walls that the robots do not know and explore."""
+    """The map that the robots explore and do not know."""
 
     file: str | None = None
     """Nav2 map_server YAML, MovingAI .map, or an image: white is free, black is occupied."""
     layout: LayoutName | None = None
-    """Or one that is generated."""
+    """Or a generated one."""
     resolution_m: Positive | None = None
-    """The side of a cell; by default what the file says, or the layout's own."""
+    """The side of a cell; by default that of the file, or the layout's own."""
     size_m: tuple[Positive, Positive] | None = None
     """Width and height of a layout; by default the layout's own."""
     seed: Annotated[int, Meta(ge=0)] = 0
-    """Of the layout, so that runs of many seeds share one map."""
+    """Seed of the layout, so that runs of many seeds share one map."""
 
 
 class Robots(ScenarioTable, frozen=True, kw_only=True):
@@ -69,18 +69,18 @@ class Starts(ScenarioTable, frozen=True, kw_only=True):
     """Where robots stand at time 0."""
 
     random: bool = False
-    """Drawn uniformly in the domain, or from the free cells of the map, by the seed."""
+    """Starts are drawn uniformly in the domain, or from the free cells of the map, by the seed."""
     poses_m: tuple[Point, ...] = ()
     """One for each robot, unless random."""
     spread: Literal["separate", "together"] = "separate"
-    """On a map, random: each robot for itself, or side by side around one place."""
+    """On a map, random: each robot alone, or side by side around one place."""
     spots: Annotated[int, Meta(ge=0, le=10_000)] = 0
     """On a map, random: draw from so many places spread over it, the same for every seed; 0: anywhere.
     Together, a run takes the spot number seed mod spots."""
 
 
 class VehicleOptions(ScenarioTable, frozen=True, kw_only=True):
-    """How a robot moves. A planner never knows."""
+    """How a robot moves. Planners do not depend on it."""
 
     name: VehicleName = "first-order"
     speed_m_s: Positive = 100.0
@@ -92,11 +92,11 @@ class VehicleOptions(ScenarioTable, frozen=True, kw_only=True):
     turn_radius_m: Positive = 15.0
     """dubins: the tightest circle."""
     radius_m: NotNegative = 0.0
-    """On a map: of its body. Robots on the way to the same target keep two radii apart; 0: points."""
+    """On a map: radius of its body. Robots on the way to the same target keep two radii apart; 0: points."""
 
 
 class ClockOptions(ScenarioTable, frozen=True, kw_only=True):
-    """When robots step."""
+    """The times of steps."""
 
     period_s: Annotated[float, Meta(ge=1e-6, le=1e6)] = 0.1
     """Nominal time between two steps; also the step of walking samples and targets."""
@@ -111,7 +111,7 @@ class ClockOptions(ScenarioTable, frozen=True, kw_only=True):
 
 
 class Energy(ScenarioTable, frozen=True, kw_only=True):
-    """The budget, eq. 7."""
+    """The energy budget, eq. 7."""
 
     points: Annotated[int, Meta(ge=0, le=2_000_000_000)] = 0
     """M: robot points of the whole team; each ships 1/M of the mass. 0 in a mission with a map."""
@@ -140,7 +140,7 @@ class Samples(ScenarioTable, frozen=True, kw_only=True):
 
 
 class Targets(ScenarioTable, frozen=True, kw_only=True):
-    """What is to be found."""
+    """The targets to be found."""
 
     count: Annotated[int, Meta(ge=0, le=10_000_000)] = 0
     """Drawn from the same density as the samples."""
@@ -155,7 +155,7 @@ class SensorOptions(ScenarioTable, frozen=True, kw_only=True):
 
     range_m: Positive = 15.0
     beams: Annotated[int, Meta(ge=1, le=10_000)] = 360
-    """Of one scan, evenly over the field of view."""
+    """Beams of one scan, evenly over the field of view."""
     field_of_view_deg: Annotated[float, Meta(gt=0.0, le=360.0)] = 360.0
     """Centred on the heading."""
     noise_m: NotNegative = 0.0
@@ -163,34 +163,34 @@ class SensorOptions(ScenarioTable, frozen=True, kw_only=True):
 
 
 class RadioOptions(ScenarioTable, frozen=True, kw_only=True):
-    """The channel, played by world-sim."""
+    """The radio channel, simulated by world-sim."""
 
     range_m: NotNegative = math.inf
     """Between true poses at the time of sending; the bound itself is in range."""
     drop: Probability = 0.0
-    """Per receiver."""
+    """Probability of a loss, for each receiver."""
     delay_s: Seconds = 0.0
     jitter_s: Seconds = 0.0
     """Each delivery takes delay_s plus up to this."""
     duplicate: Probability = 0.0
-    """A second copy arrives, with its own delay."""
+    """Probability of a second copy, with its own delay."""
     reorder: Probability = 0.0
-    """A delivery is held back by up to reorder_s, so that later ones overtake it."""
+    """Probability that a delivery is held back by up to reorder_s, so that later ones overtake it."""
     reorder_s: Seconds = 0.3
     line_of_sight: bool = False
     """On a map: no wall may stand between."""
     wall_loss_m: NotNegative = 0.0
     """On a map: each wall between shortens the range by so much."""
     beacon: Literal["versions", "state"] = "versions"
-    """What a robot sends while it hears nobody: which versions it holds, or all that it knows.
-    With state one message is enough to inform whoever comes into range, as Algorithm 3 presupposes."""
+    """What a robot sends while it hears no other robot: its version vector, or all that it knows.
+    With `state` one message is enough to inform a robot that comes into range, as Algorithm 3 presupposes."""
 
 
 class SupervisorOptions(ScenarioTable, frozen=True, kw_only=True):
     """The supervisor of the centralized variant."""
 
     pose_m: Point | None = None
-    """Its place; the middle of the domain by default."""
+    """Its place, world frame; the middle of the domain by default."""
     range_m: NotNegative = math.inf
     """Radio range between it and any robot."""
 
@@ -216,11 +216,11 @@ class PlannerOptions(ScenarioTable, frozen=True, kw_only=True):
     """map: robots get new targets when one arrives or its target is no frontier any more, or only when
     one arrives."""
     replan_whose: Literal["team", "own"] = "team"
-    """map: all of them, or only the robot that it happens to."""
+    """map: all robots, or only the one concerned."""
     replan_gap: Annotated[int, Meta(ge=1, le=10_000)] = 3
     """map: steps from one assignment to the next, at least."""
     remember_s: Seconds = 60.0
-    """map, decentralized: how long the target of a robot that is not heard counts as taken."""
+    """map, decentralized: how long the target of a robot counts as assigned when no message of it is received."""
     patience: Annotated[int, Meta(ge=1)] = 60
     """map: steps without progress after which a target counts as inaccessible."""
     coordinated: bool = True
@@ -242,16 +242,16 @@ class PlannerOptions(ScenarioTable, frozen=True, kw_only=True):
 
 
 class PublishOptions(ScenarioTable, frozen=True, kw_only=True):
-    """What robots tell observers on their weights key."""
+    """What robots publish for observers on their weights key."""
 
     weights_every: Annotated[int, Meta(ge=1)] = 10
-    """Steps that one weights message gathers."""
+    """Steps from one weights message to the next."""
     keyframe_every: Annotated[int, Meta(ge=1)] = 20
     """Weights messages from one whole vector to the next."""
 
 
 class MetricsOptions(ScenarioTable, frozen=True, kw_only=True):
-    """What the record measures."""
+    """How often metrics are computed."""
 
     every: Annotated[int, Meta(ge=0)] = 0
     """Periods from one row to the next; 0 chooses by size, 1 for the paper's scenarios."""
@@ -263,15 +263,15 @@ class Scenario(ScenarioTable, frozen=True, kw_only=True):
     name: Annotated[str, Meta(pattern=r"^[a-z0-9][a-z0-9-]{0,63}$")]
     summary: str = ""
     coordination: Literal["centralized", "decentralized"] = "decentralized"
-    """centralized: robots talk to the supervisor only. decentralized: to whoever is in range."""
+    """centralized: robots talk to the supervisor only. decentralized: to all robots in range."""
     merge: Literal["min", "ledger"] = "ledger"
-    """min: elementwise minimum, as in the paper. ledger: everybody's spending, counted once."""
+    """min: elementwise minimum, as in the paper. ledger: the spending of all participants, each counted once."""
     claims: bool = True
     """Robots claim the sample they head for, if their planner heads for samples."""
     limit_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     """Simulated time after which the mission is cut; by default 1.5 times the energy's."""
     linger_s: Seconds = 0.0
-    """Simulated time that it goes on once every robot rests and no fault is left, so that news gets around."""
+    """Simulated time that it goes on once every robot rests and no fault is left, so that all logs reach all robots."""
     domain: Domain = Domain(min_m=(0.0, 0.0), max_m=(0.0, 0.0))
     map: MapOptions | None = None
     """Given one, the robots explore it; they then need no domain, energy, samples or density."""
@@ -290,7 +290,7 @@ class Scenario(ScenarioTable, frozen=True, kw_only=True):
     publish: PublishOptions = PublishOptions()
     metrics: MetricsOptions = MetricsOptions()
     faults: Annotated[tuple[AnyFault, ...], Meta(max_length=FAULTS_MAX)] = ()
-    """What goes wrong, and when; see `faults`. Over the bus participants are not told."""
+    """Faults to inject, and when; see `faults`. Missions on the bus do not contain them."""
 
     @property
     def robot_ids(self) -> tuple[ParticipantId, ...]:
@@ -319,7 +319,7 @@ class Scenario(ScenarioTable, frozen=True, kw_only=True):
 
     @property
     def learns_ranges(self) -> bool:
-        """Whether robots tell one another some of the ranges that they measure."""
+        """Whether robots share some of the ranges that they measure."""
         return self.planner.name == "burgard" and self.planner.coverage == "histogram"
 
     @property
@@ -351,7 +351,7 @@ class Scenario(ScenarioTable, frozen=True, kw_only=True):
 
     @property
     def supervisor_m(self) -> Point:
-        """Where the supervisor stands."""
+        """The place of the supervisor, world frame."""
         if self.supervisor.pose_m is not None:
             return self.supervisor.pose_m
         (x_min, y_min), (x_max, y_max) = self.domain.min_m, self.domain.max_m

@@ -1,4 +1,4 @@
-"""What the tables of a scenario are made of."""
+"""The types of values in the tables of a scenario."""
 
 from typing import Annotated
 

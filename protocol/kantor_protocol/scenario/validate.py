@@ -1,4 +1,4 @@
-"""Reasons why a scenario cannot be run that its types alone cannot say."""
+"""Reasons why a scenario cannot be run, beyond what its types express."""
 
 import math
 from collections.abc import Iterable
@@ -10,11 +10,11 @@ from kantor_protocol.scenario.schema import MAP_PLANNERS, Domain, Scenario
 from kantor_protocol.scenario.validate_faults import complaints_of_faults
 
 _PERIODS_UNDER_WAY = 1000
-"""Robots remember what they sent for as long as an answer may take."""
+"""Replicas keep log lengths for as long as an acknowledgement may take."""
 
 
 def complaints(scenario: Scenario) -> Iterable[str]:
-    """What types alone cannot say. The first one is reported."""
+    """Reasons why a scenario cannot be run: `key: what, and the remedy`. The first one is reported."""
     yield from not_finite(to_tree(scenario))
     yield from _complaints_of_map(scenario) if scenario.map else _complaints_of_density(scenario)
     yield from complaints_of_faults(scenario.faults, scenario)
@@ -85,7 +85,7 @@ def _starts_given(scenario: Scenario) -> str:
 
 
 def not_finite(tree: Any, path: str = "") -> Iterable[str]:
-    """Numbers that are no numbers. Only a radio range may be infinite."""
+    """Reasons for numbers that are not finite. Only a radio range may be infinite."""
     if isinstance(tree, dict):
         for key, value in tree.items():
             yield from not_finite(value, f"{path}.{key}".lstrip("."))

@@ -32,7 +32,7 @@ from kantor_protocol.scenario.schema import Scenario
 def complaints_of_faults(
     faults: Sequence[Fault], scenario: Scenario, earlier: Sequence[Fault] = ()
 ) -> Iterable[str]:
-    """Why a list of faults cannot apply to a scenario; `faults[i].key: what, and the remedy`.
+    """Reasons why a list of faults cannot apply to a scenario; `faults[i].key: what, and the remedy`.
 
     earlier: those that the scenario has already, which are in order.
     """
@@ -50,7 +50,7 @@ def complaints_of_faults(
 
 
 def _overlapping(there: str, one: OnProcesses, here: str, other: OnProcesses) -> Iterable[str]:
-    """Two faults that both stop a process; the second in the list is blamed."""
+    """Reasons for two faults that stop a process at the same time; they name the second in the list."""
     if not (one.stops and other.stops and (one.holds(other.from_ns) or other.holds(one.from_ns))):
         return
     for name in one.who:
@@ -62,7 +62,7 @@ def _overlapping(there: str, one: OnProcesses, here: str, other: OnProcesses) ->
 
 
 def _unseen(there: str, outage: OnProcesses, here: str, kill: OnProcesses) -> Iterable[str]:
-    """Somebody who dies, or comes back, while world-sim is down."""
+    """Reasons for a process that is killed, or started again, while world-sim is down."""
     if WORLD_SIM not in outage.who or WORLD_SIM in kill.who or not isinstance(kill, Kill):
         return
     for key, moment_ns in (("from_s", kill.from_ns), ("until_s", kill.until_ns)):
@@ -71,19 +71,19 @@ def _unseen(there: str, outage: OnProcesses, here: str, kill: OnProcesses) -> It
 
 
 def _let_in(there: str, impostor: OnProcesses, here: str, absence: OnProcesses) -> Iterable[str]:
-    """An impostor of somebody who is away."""
+    """Reasons for an impostor of a participant that is away."""
     if not isinstance(impostor, Impostor) or not isinstance(absence, (Kill, Late)):
         return
     for name in impostor.who:
         if name in absence.who and absence.holds(impostor.from_ns):
             yield (
-                f"{here}: {name} is away when its impostor comes, who would be let in, "
+                f"{here}: {name} is away when its impostor joins, which would be admitted, "
                 f"see {there}; move it"
             )
 
 
 def _complaints_of_fault(fault: Fault, scenario: Scenario) -> Iterable[str]:
-    """Complaints of one fault, those that all faults share first: `key: what, and the remedy`."""
+    """Reasons for one fault, those that all faults share first: `key: what, and the remedy`."""
     for kind in reversed(type(fault).__mro__):
         if kind in _CHECKS:
             yield from _CHECKS[kind](fault, scenario)
@@ -98,7 +98,7 @@ def _of_window(fault: Fault, scenario: Scenario) -> Iterable[str]:
 
 
 def _of_names(key: str, names: Names, scenario: Scenario) -> Iterable[str]:
-    """Names that are not in the team, or that are listed twice."""
+    """Reasons for names that are not in the team, or that are listed twice."""
     roster = scenario.roster
     for name in names:
         if name not in roster:
@@ -135,7 +135,7 @@ def _of_partition(fault: Partition, scenario: Scenario) -> Iterable[str]:
     yield from _of_names("robots", fault.robots, scenario)
     for i, group in enumerate(fault.groups):
         yield from _of_names(f"groups[{i}]", group, scenario)
-        yield from () if group else (f"groups[{i}]: nobody is in it; name somebody",)
+        yield from () if group else (f"groups[{i}]: empty; name a participant",)
     yield from _of_names("groups", sum(fault.groups, ()), scenario)
     if fault.flap_share is not None and fault.flap_s is None:
         yield "flap_share: only with flap_s; set it"
@@ -190,7 +190,7 @@ def _of_late(fault: Late, scenario: Scenario) -> Iterable[str]:
     if fault.from_s > 0.0:
         yield "from_s: a late joiner is missing from the start; leave it out"
     if set(scenario.robot_ids) <= set(fault.who):
-        yield "who: nobody would be there at the start; leave out a robot"
+        yield "who: no robot would be there at the start; leave one out"
 
 
 def _of_clock(fault: ClockFault, _scenario: Scenario) -> Iterable[str]:
@@ -219,7 +219,7 @@ _CHECKS: dict[type, Callable[[Any, Scenario], Iterable[str]]] = {
     ClockFault: _of_clock,
     Impostor: _of_impostor,
 }
-"""What each class of faults adds to the checks of the classes that it is derived from."""
+"""The checks of each class of faults, beyond those of its base classes."""
 
 
 def _cuts_any(severs: Severs, roster: Names) -> bool:

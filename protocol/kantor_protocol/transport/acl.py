@@ -1,7 +1,7 @@
-"""Who may do what on a router, as Zenoh's access control wants it. Whatever is not granted is denied.
+"""Rights on a router, in the form of Zenoh's access control. What is not granted is denied.
 
-A robot may put on its own keys and read its own `rx`. A site speaks for its robots: towards the hub it may do
-what they may together, and the hub may do towards it the same seen from the other side. An observer reads.
+A robot may put on its own keys and read its own `rx`. A site acts for its robots: towards the hub it has the rights
+of all of them, and the hub has the same rights towards it, seen from the other side. An observer reads.
 """
 
 from collections.abc import Iterable, Sequence
@@ -12,7 +12,7 @@ from kantor_protocol.wire import keys
 
 
 class Grant(NamedTuple):
-    """Something that a subject may do, seen from the router that enforces it."""
+    """A right of a subject, seen from the router that enforces it."""
 
     flow: Literal["ingress", "egress"]
     message: Literal[
@@ -30,12 +30,12 @@ Grants = Sequence[Grant]
 
 
 def robot(fleet: str, name: ParticipantId) -> Grants:
-    """What a robot, or the supervisor, may do."""
+    """The rights of a robot, or of the supervisor."""
     return _participants(fleet, (name,))
 
 
 def observer(fleet: str) -> Grants:
-    """Reads everything."""
+    """The rights of an observer: to read everything."""
     everything = (keys.everything(fleet),)
     return (
         Grant("ingress", "declare_subscriber", everything),
@@ -44,7 +44,7 @@ def observer(fleet: str) -> Grants:
 
 
 def anyone(fleet: str) -> Grants:
-    """Whoever has a certificate of the fleet's authority, even if it is not let in, may ask why."""
+    """The right of every holder of a certificate of the fleet's authority: to query why it is refused."""
     door = (keys.door(fleet),)
     return (
         Grant("ingress", "query", door),
@@ -54,9 +54,9 @@ def anyone(fleet: str) -> Grants:
 
 
 def site(fleet: str, members: Iterable[ParticipantId]) -> Grants:
-    """What a site may do at the hub: speak for its robots, and hear who listens to them.
+    """The rights of a site at the hub: to act for its robots, and to learn which keys have subscribers.
 
-    To know that somebody subscribes discloses nothing; without it a router keeps to itself what it is told.
+    That a key has a subscriber discloses nothing; without this a router does not forward what is put on it.
     """
     return (
         *_participants(fleet, tuple(members)),
@@ -65,12 +65,12 @@ def site(fleet: str, members: Iterable[ParticipantId]) -> Grants:
 
 
 def hub(fleet: str, members: Iterable[ParticipantId]) -> Grants:
-    """What the hub may do at a site."""
+    """The rights of the hub at a site."""
     return tuple(grant.mirrored for grant in site(fleet, members))
 
 
 def control(subjects: Iterable[tuple[str, dict[str, list[str]], Grants]]) -> dict[str, Any]:
-    """The setting `access_control`: for each subject its id, how the router knows it, and its grants."""
+    """The setting `access_control`: for each subject its id, how the router recognizes it, and its rights."""
     rules: list[dict[str, Any]] = []
     known: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -98,11 +98,11 @@ def control(subjects: Iterable[tuple[str, dict[str, list[str]], Grants]]) -> dic
 
 
 def _participants(fleet: str, names: tuple[ParticipantId, ...]) -> Grants:
-    says = (keys.tx, keys.pose, keys.weights)
-    heard = tuple(keys.rx(fleet, name) for name in names)
+    written = (keys.tx, keys.pose, keys.weights)
+    read = tuple(keys.rx(fleet, name) for name in names)
     return (
-        Grant("ingress", "put", tuple(key(fleet, name) for name in names for key in says)),
-        Grant("ingress", "declare_subscriber", heard),
-        Grant("egress", "put", heard),
+        Grant("ingress", "put", tuple(key(fleet, name) for name in names for key in written)),
+        Grant("ingress", "declare_subscriber", read),
+        Grant("egress", "put", read),
         Grant("ingress", "liveliness_token", tuple(keys.alive(fleet, name) for name in names)),
     )

@@ -16,10 +16,10 @@ from kantor_protocol.wire import keys
 
 
 class ParticipantSession:
-    """A participant's end of the bus: a client of world-sim."""
+    """A participant's end of the bus: a client of world-sim's router, or of a site's."""
 
     def __init__(self, session: zenoh.Session, identity: Identity, nonce: str) -> None:
-        """Use `line` to open one."""
+        """A session is opened by `participant_session`."""
         fleet, name = identity.fleet, identity.user
         self.nonce = nonce
         self._session = session
@@ -29,65 +29,67 @@ class ParticipantSession:
         self._drop = zenoh.CongestionControl.DROP
         self._tx, self._pose = keys.tx(fleet, name), keys.pose(fleet, name)
         self._weights = keys.weights(fleet, name)
-        self._held: list[Any] = [
+        self._declared: list[Any] = [
             session.declare_subscriber(keys.rx(fleet, name), self._on_message),
             session.liveliness().declare_token(keys.alive(fleet, name, nonce)),
         ]
         if isinstance(identity, Certificate):
-            self._held.append(session.info.declare_transport_events_listener(self._on_transport))
+            self._declared.append(
+                session.info.declare_transport_events_listener(self._on_transport)
+            )
 
     def next(self, timeout_s: float | None) -> bytes | None:
         """The next message from world-sim, or None after the timeout.
 
-        Raises BusError if world-sim was started again and does not let us in any more.
+        Raises BusError if world-sim was started again and does not admit this process any more.
         """
         try:
-            got = self._received.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
+            message = self._received.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
         except queue.Empty:
             return None
-        if isinstance(got, BusError):
-            raise got
-        return got
+        if isinstance(message, BusError):
+            raise message
+        return message
 
-    def send(self, payload: bytes, *, patiently: bool) -> None:
-        """Put on the own `tx`. patiently: wait for a full queue rather than drop."""
-        congestion = self._block if patiently else self._drop
+    def send(self, payload: bytes, *, blocking: bool) -> None:
+        """Put a message on the own `tx`. blocking: wait while the queue is full, instead of dropping the message."""
+        congestion = self._block if blocking else self._drop
         self._session.put(self._tx, payload, congestion_control=congestion, express=True)
 
     def publish_pose(self, payload: bytes) -> None:
-        """Tell observers the own pose."""
+        """Publish the own pose for observers."""
         self._session.put(self._pose, payload)
 
     def publish_weights(self, payload: bytes) -> None:
-        """Tell observers the own weight vector."""
+        """Publish the own weight vector for observers."""
         self._session.put(self._weights, payload)
 
     def close(self) -> None:
         """Leave the bus."""
-        close_session(self._session, self._held)
+        close_session(self._session, self._declared)
 
     def _on_message(self, sample: zenoh.Sample) -> None:
         if self._received.qsize() < QUEUE_MAX:
             self._received.put(sample.payload.to_bytes())
 
     def _on_transport(self, event: zenoh.TransportEvent) -> None:
-        """We are connected again: perhaps to a world-sim with another register."""
+        """Check admission after a reconnection: it may be to a world-sim with another member list."""
         assert isinstance(self._identity, Certificate)
-        with contextlib.suppress(zenoh.ZError):  # it is closed meanwhile
+        with contextlib.suppress(zenoh.ZError):  # it was closed meanwhile
             if event.kind == zenoh.SampleKind.PUT and (
-                objection := _reason_of_refusal(self._session, self._identity)
+                reason := _reason_of_refusal(self._session, self._identity)
             ):
-                self._received.put(BusError(f"refuses {self._identity.user}: {objection}"))
+                self._received.put(BusError(f"refuses {self._identity.user}: {reason}"))
 
 
 class ObserverSession:
     """An observer's end of the bus: reads, never writes."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
-        """Use `watch` to open one."""
+        """A session is opened by `observer_session`."""
         self._session = session
         self._received: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
-        self._held: list[Any] = [session.declare_subscriber(key, self._on_message)]
+        self._declared: list[Any] = [session.declare_subscriber(key, self._on_message)]
 
     def next(self, timeout_s: float) -> tuple[str, bytes] | None:
         """The next message as (key, payload), or None after the timeout."""
@@ -98,7 +100,7 @@ class ObserverSession:
 
     def close(self) -> None:
         """Leave the bus."""
-        close_session(self._session, self._held)
+        close_session(self._session, self._declared)
 
     def _on_message(self, sample: zenoh.Sample) -> None:
         if self._received.qsize() < QUEUE_MAX:
@@ -107,32 +109,32 @@ class ObserverSession:
 
 @contextlib.contextmanager
 def participant_session(
-    connect: str, identity: Identity, nonce: str, patience_s: float
+    connect: str, identity: Identity, nonce: str, connect_timeout_s: float
 ) -> Iterator[ParticipantSession]:
-    """Join world-sim's bus as a participant, waiting for it up to `patience_s`. Raises BusError."""
-    opened = ParticipantSession(client(connect, identity, patience_s), identity, nonce)
+    """Join the bus as a participant, waiting for world-sim up to `connect_timeout_s`. Raises BusError."""
+    session = ParticipantSession(client(connect, identity, connect_timeout_s), identity, nonce)
     try:
-        yield opened
+        yield session
     finally:
-        opened.close()
+        session.close()
 
 
 @contextlib.contextmanager
 def observer_session(
-    connect: str, identity: Identity, key: str, patience_s: float
+    connect: str, identity: Identity, key: str, connect_timeout_s: float
 ) -> Iterator[ObserverSession]:
-    """Join world-sim's bus as an observer of the keys that match. Raises BusError."""
-    opened = ObserverSession(client(connect, identity, patience_s), key)
+    """Join the bus as an observer of the keys that match. Raises BusError."""
+    session = ObserverSession(client(connect, identity, connect_timeout_s), key)
     try:
-        yield opened
+        yield session
     finally:
-        opened.close()
+        session.close()
 
 
-def client(connect: str, identity: Identity, patience_s: float) -> zenoh.Session:
-    """Session of a client with an endpoint, once the router admits it. Raises BusError."""
+def client(connect: str, identity: Identity, connect_timeout_s: float) -> zenoh.Session:
+    """Open the session of a client, once the router at the endpoint admits it. Raises BusError."""
     check_endpoint(connect, identity)
-    await_endpoint(connect, patience_s, identity)
+    await_endpoint(connect, connect_timeout_s, identity)
     try:
         session = open_session("client", zenoh_config.client_config(identity), connect=connect)
     except zenoh.ZError:
@@ -150,18 +152,21 @@ def client(connect: str, identity: Identity, patience_s: float) -> zenoh.Session
 
 
 def _check_admitted(connect: str, session: zenoh.Session, identity: Certificate) -> None:
-    """Ask whether we are let in: a certificate may be sound and yet not the register's. Raises BusError."""
-    objection = _reason_of_refusal(session, identity)
-    if objection is None:
+    """Ask the router for admission: a certificate may be valid and yet not in the member list. Raises BusError."""
+    reason = _reason_of_refusal(session, identity)
+    if reason is None:
         raise BusError(
             f"{connect}: no world-sim of fleet {identity.fleet} answers; check --connect"
         )
-    if objection:
-        raise BusError(f"{connect}: refuses {identity.user}: {objection}")
+    if reason:
+        raise BusError(f"{connect}: refuses {identity.user}: {reason}")
 
 
 def _reason_of_refusal(session: zenoh.Session, identity: Certificate) -> str | None:
-    """What the router has against us; None if nobody answers. One that has just been opened may take a moment."""
+    """Why the router refuses this identity, empty if it does not; None without an answer.
+
+    A session that has just been opened may take a moment until queries reach the router.
+    """
     give_up = time.monotonic() + zenoh_config.HANDSHAKE_S
     while time.monotonic() < give_up:
         for reply in session.get(keys.door(identity.fleet, identity.name), timeout=1.0):

@@ -1,9 +1,9 @@
-"""Identities on the bus: who a process is, one TOML file for each, for the eyes of its owner only.
+"""Identities of processes on the bus: one TOML file for each, readable by its owner only.
 
 There are two kinds. A *password* is for a run on one machine: `kantor worldsim` makes them, a folder with
 `<id>.toml` for each identity and `users.txt` for the router. A *certificate* is for everything else: it is
 issued by the fleet's authority (`kantor keys`), and never by world-sim. World-sim's own certificate comes
-with the register of whom it lets in.
+with the list of the members that it admits.
 """
 
 import os
@@ -27,14 +27,14 @@ SOON = timedelta(days=7)
 """A certificate that expires within this is worth a warning."""
 _USERS = "users.txt"
 _PEM_MAX = 16_384
-"""Characters of a certificate or a key; what is longer is none."""
+"""Characters of a certificate or a key; a longer text is refused."""
 FLEET_PATTERN = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 NAME_PATTERN = re.compile(r"[a-z0-9-]{1,69}\.[0-9a-f]{16}")
 """Names of certificates."""
 
 
 class CredentialsError(ValueError):
-    """Credentials that are missing or no use; the message is one line with the remedy."""
+    """Credentials that are missing or unusable; the message is one line with the remedy."""
 
 
 def _check_fleet(fleet: str) -> None:
@@ -43,19 +43,19 @@ def _check_fleet(fleet: str) -> None:
 
 
 class Password(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Who a process is on which fleet's bus: a user with a password."""
+    """The identity of a process on one fleet's bus: a user with a password."""
 
     fleet: str
     user: ParticipantId
     password: str
 
     def __post_init__(self) -> None:
-        """Refuse a fleet that is no name. Raises ValueError."""
+        """Check the name of the fleet. Raises ValueError."""
         _check_fleet(self.fleet)
 
 
 class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A certificate as the register knows it."""
+    """An entry of the member list: the certificate that counts for a user."""
 
     name: str
     """Its common name: the identity's id, a dot, and the certificate's serial number in hexadecimal."""
@@ -64,7 +64,7 @@ class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Who a process is on which fleet's bus: a user with a certificate. All three parts are PEM."""
+    """The identity of a process on one fleet's bus: a user with a certificate. All three parts are PEM."""
 
     fleet: str
     user: ParticipantId
@@ -75,15 +75,15 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     certificate: str
     key: str
     revoked: tuple[str, ...] = ()
-    """A router's: names of certificates that were withdrawn before their time."""
+    """A router's: names of certificates that were revoked before they expired."""
     members: dict[ParticipantId, Member] = {}
-    """A router's: the certificate of everybody; whoever shows another is not let in. A site's has its robots
+    """A router's: the certificate of each member; clients that show another one are refused. A site's has its robots
     and world-sim."""
     sites: dict[ParticipantId, tuple[ParticipantId, ...]] = {}
-    """World-sim's: for each site the robots that stand behind it."""
+    """World-sim's: for each site its robots."""
 
     def __post_init__(self) -> None:
-        """Refuse what no authority has made. Raises ValueError."""
+        """Check that an authority can have issued this. Raises ValueError."""
         _check_fleet(self.fleet)
         for user, name, until in (
             (self.user, self.name, self.until),
@@ -96,17 +96,17 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if any(len(part) > _PEM_MAX for part in (self.authority, self.certificate, self.key)):
             raise ValueError("no PEM")
 
-    def behind(self) -> dict[ParticipantId, tuple[ParticipantId, ...]]:
-        """For each site the robots that it speaks for: those that have not been revoked."""
+    def robots_by_site(self) -> dict[ParticipantId, tuple[ParticipantId, ...]]:
+        """For each site the robots that it acts for: those that have not been revoked."""
         return {
-            site: tuple(name for name in there if name in self.members)
-            for site, there in self.sites.items()
+            site: tuple(name for name in robots if name in self.members)
+            for site, robots in self.sites.items()
         }
 
-    def objection(self, name: str, wanted: Iterable[ParticipantId]) -> str:
-        """Why the holder of a certificate is not let in, with the remedy; empty if it is.
+    def refusal_reason(self, name: str, wanted: Iterable[ParticipantId]) -> str:
+        """Why the holder of a certificate is refused, with the remedy; empty if it is admitted.
 
-        wanted: the users that take part.
+        name: the certificate's common name. wanted: the users that take part.
         """
         user = name.partition(".")[0]
         member = self.members.get(user)
@@ -158,7 +158,7 @@ def issue(folder: Path, fleet: str, users: Iterable[ParticipantId]) -> dict[str,
 
 
 def _kept(path: Path, fleet: str, user: ParticipantId) -> Password | None:
-    """What a folder of passwords has for a user."""
+    """The password that a folder has for a user, if any. Raises CredentialsError."""
     if not path.exists():
         return None
     identity = _read(path)
@@ -176,7 +176,7 @@ def _kept(path: Path, fleet: str, user: ParticipantId) -> Password | None:
 
 
 def users_file(folder: Path) -> Path:
-    """What the router reads."""
+    """The file of passwords that the router reads."""
     return folder / _USERS
 
 
@@ -209,14 +209,14 @@ def _read(path: Path) -> Identity | None:
 
 
 def read(path: Path, kind: type[T]) -> T | None:
-    """A TOML file as a Struct; None if it is none."""
+    """A TOML file as a Struct; None if it is none of this kind."""
     return _converted(_tree(path), kind)
 
 
 def _tree(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):  # not to be read, no text, no TOML
+    except (OSError, ValueError, RecursionError):  # unreadable, no text, or no TOML
         return {}
 
 
@@ -260,13 +260,13 @@ def _text(value: str) -> str:
 
 
 def expiry(until: datetime, now: datetime) -> str:
-    """When a certificate expires, in words."""
+    """When a certificate expires or has expired, in plain English."""
     when = f"{until:%Y-%m-%d %H:%M} UTC"
     return f"expires on {when}" if until > now else f"expired on {when}"
 
 
 def write(path: Path, text: str) -> None:
-    """Write for the owner's eyes only, whole or not at all."""
+    """Write a file that its owner alone can read, whole or not at all."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     with os.fdopen(
         os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8"

@@ -10,7 +10,7 @@ from kantor_protocol.transport.session import BusError
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
-    """A loopback endpoint that nobody uses now."""
+    """A loopback endpoint on which nothing listens now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
@@ -18,41 +18,41 @@ def free_endpoint(protocol: str = "tcp") -> str:
 
 def await_endpoint(
     connect: str,
-    patience_s: float,
+    connect_timeout_s: float,
     identity: Identity | None = None,
     monotonic: Callable[[], float] = time.monotonic,
 ) -> None:
-    """Return once something accepts connections there.
+    """Return once a router accepts connections there.
 
-    identity: if it is a certificate, also shake hands with it, which is worth an objection in words. Raises
-    BusError after `patience_s`, and at once if either side objects.
+    identity: if it is a certificate, a TLS handshake with it must succeed as well. Raises BusError after
+    `connect_timeout_s`, and at once, with the reason, if either side refuses the other.
     """
     _, host, port = parse_endpoint(connect)
-    give_up = monotonic() + patience_s
+    give_up = monotonic() + connect_timeout_s
     pause_s = 0.02
     while True:
         try:
-            objection = _look_in(host, port, identity)
+            reason = _probe(host, port, identity)
         except socket.gaierror:
             raise BusError(f"{connect}: no such host; check --connect") from None
         except OSError:
             if monotonic() >= give_up:
                 raise BusError(
-                    f"{connect}: nothing listens there after {patience_s:g} s; "
+                    f"{connect}: nothing listens there after {connect_timeout_s:g} s; "
                     f"start `kantor worldsim` or check --connect"
                 ) from None
         else:
-            if objection:
-                raise BusError(f"{connect}: {objection}")
+            if reason:
+                raise BusError(f"{connect}: {reason}")
             return
         time.sleep(pause_s)
         pause_s = min(0.2, 1.5 * pause_s)
 
 
-def _look_in(host: str, port: int, identity: Identity | None) -> str:
-    """What world-sim or we have against each other. Raises OSError if nothing listens there."""
+def _probe(host: str, port: int, identity: Identity | None) -> str:
+    """Why either side refuses the other; empty if neither does. Raises OSError if nothing listens there."""
     if isinstance(identity, Certificate):
-        return tls.objection(host, port, identity)
+        return tls.handshake_failure(host, port, identity)
     socket.create_connection((host, port), timeout=1.0).close()
     return ""
 
@@ -90,7 +90,7 @@ def check_endpoint(endpoint: str, identity: Identity | None = None) -> None:
 
 
 def check_free(listen: str) -> None:
-    """Raise BusError if somebody else listens there."""
+    """Raise BusError if another process listens there."""
     _, host, port = parse_endpoint(listen)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family) as probe:

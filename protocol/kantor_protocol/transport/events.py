@@ -1,4 +1,4 @@
-"""Events of the bus, as a router tells them."""
+"""Events of the bus, as a router reports them."""
 
 from typing import NamedTuple
 
@@ -6,30 +6,30 @@ from kantor_protocol.base.machine import ParticipantId
 
 
 class Joined(NamedTuple):
-    """A participant's process has come."""
+    """A participant's process has declared its token."""
 
     name: ParticipantId
     nonce: str
 
 
 class Left(NamedTuple):
-    """A participant's process has gone, or has been silent for a lease."""
+    """A participant's process has ended, or was silent for a lease."""
 
     name: ParticipantId
     nonce: str
 
 
-class Heard(NamedTuple):
-    """A message from a participant."""
+class Received(NamedTuple):
+    """A message of a participant has arrived."""
 
     name: ParticipantId
     payload: bytes
 
 
 class Flooded(NamedTuple):
-    """A participant has gone beyond its quota for the first time."""
+    """A participant has exceeded its quota for the first time."""
 
     name: ParticipantId
 
 
-Event = Joined | Left | Heard | Flooded
+Event = Joined | Left | Received | Flooded

@@ -1,8 +1,8 @@
-"""How much a participant may say: a token bucket of messages and of bytes, pure.
+"""Rate limits of participants: a token bucket of messages and of bytes, without a clock of its own.
 
-A sound participant says what it is asked for, once, and of itself no more than its clock has it say, and then again
-now and then. So a question earns the answer to it, however fast questions follow each other, and time earns the rest.
-What is beyond that is not listened to.
+Each request grants one reply, however fast requests follow each other; unsolicited messages draw on tokens that
+accrue with time. A correct participant answers each request once, sends no more by itself than one report for each
+step of its clock, and repeats a report now and then. Messages beyond the quota are dropped.
 """
 
 from collections.abc import Iterable
@@ -15,25 +15,25 @@ from kantor_protocol.scenario.clocks import StepClock
 from kantor_protocol.wire.messages import MESSAGE_BYTES_MAX
 
 BURST_MESSAGES = 256
-"""What may come at once, such as all that was said again while world-sim was frozen."""
+"""Messages that may come at once, such as all repeated reports while world-sim was frozen."""
 BURST_BYTES = MESSAGE_BYTES_MAX
 """The longest message passes after a rest."""
 _SPARE_PER_S = 20.0
-"""Said unasked: who comes back, and what has not been heard, five times a second."""
+"""Unsolicited messages: of a process that joins again, and reports that are repeated five times a second."""
 _MARGIN = 4.0
 _MEAN_BYTES = 16_384
-"""A report with news for thirty robots; what a partition has held up comes on top, from the burst."""
+"""A report with a gossip message for thirty robots; more, after a partition, comes from the burst."""
 
 
 class RateLimit(NamedTuple):
-    """What time earns, in real seconds."""
+    """Tokens that accrue in a real second."""
 
     messages_per_s: float
     bytes_per_s: float
 
     @classmethod
     def of(cls, steps_per_s: float) -> "RateLimit":
-        """For a participant that steps so often by its own clock; 0 if it steps when it is asked only."""
+        """The limit of a participant that steps so often by its own clock; 0 if it steps on request only."""
         messages_per_s = _MARGIN * steps_per_s + _SPARE_PER_S
         return cls(messages_per_s, messages_per_s * _MEAN_BYTES)
 
@@ -41,47 +41,46 @@ class RateLimit(NamedTuple):
 def rate_limits(
     clocks: dict[ParticipantId, StepClock], exchange: str, speed: float
 ) -> dict[ParticipantId, RateLimit]:
-    """The quota of everybody. speed: wall, simulated seconds in a real one."""
-    of_its_own = speed if exchange == "wall" else 0.0
-    return {
-        name: RateLimit.of(of_its_own * 1e9 / clock.period_ns) for name, clock in clocks.items()
-    }
+    """The limits of all participants. speed: realtime exchange, simulated seconds in a real one."""
+    own_speed = speed if exchange == "wall" else 0.0
+    return {name: RateLimit.of(own_speed * 1e9 / clock.period_ns) for name, clock in clocks.items()}
 
 
 class Excess(msgspec.Struct, frozen=True):
-    """What was not listened to."""
+    """Messages and bytes beyond a quota, which were dropped."""
 
     messages: int
     bytes: int
 
 
 class TokenBucket:
-    """What one participant may say yet. One thread asks, another takes; neither waits for the other."""
+    """The tokens of one participant. One thread grants replies, another admits messages; neither waits for the other."""
 
     def __init__(self, quota: RateLimit) -> None:
-        """It is full at the start."""
+        """A full bucket."""
         self.quota = quota
+        """May be replaced."""
         self._messages, self._bytes = float(BURST_MESSAGES), float(BURST_BYTES)
         self._at_s: float | None = None
-        self._asked = self._credited = 0
+        self._granted = self._credited = 0
         self._excess_messages = self._excess_bytes = 0
 
     @property
     def excess(self) -> Excess:
-        """What was beyond the quota so far."""
+        """Messages and bytes beyond the quota so far."""
         return Excess(self._excess_messages, self._excess_bytes)
 
     @property
-    def floods(self) -> bool:
-        """Whether there was anything beyond it."""
+    def exceeded(self) -> bool:
+        """Whether any message was beyond the quota."""
         return self._excess_messages > 0
 
-    def ask(self) -> None:
-        """It has been asked something, which it may answer."""
-        self._asked += 1
+    def grant_reply(self) -> None:
+        """Grant one message of any length: the reply to a request."""
+        self._granted += 1
 
     def admit(self, size: int, now_s: float) -> bool:
-        """Whether a message of so many bytes is within the quota. now_s does not run back."""
+        """Whether a message of so many bytes is within the quota; if so, it is charged. now_s never falls."""
         self._fill(now_s)
         if self._messages < 1.0 or self._bytes < size:
             self._excess_messages += 1
@@ -93,14 +92,14 @@ class TokenBucket:
 
     def _fill(self, now_s: float) -> None:
         elapsed_s = 0.0 if self._at_s is None else now_s - self._at_s
-        asked = self._asked
-        answers, self._at_s, self._credited = asked - self._credited, now_s, asked
-        messages = self._messages + answers + elapsed_s * self.quota.messages_per_s
-        # An answer may be as long as any message.
-        octets = self._bytes + answers * MESSAGE_BYTES_MAX + elapsed_s * self.quota.bytes_per_s
+        granted = self._granted
+        replies, self._at_s, self._credited = granted - self._credited, now_s, granted
+        messages = self._messages + replies + elapsed_s * self.quota.messages_per_s
+        # A reply may be as long as any message.
+        octets = self._bytes + replies * MESSAGE_BYTES_MAX + elapsed_s * self.quota.bytes_per_s
         self._messages, self._bytes = min(messages, BURST_MESSAGES), min(octets, BURST_BYTES)
 
 
 def excesses(buckets: Iterable[tuple[ParticipantId, TokenBucket]]) -> dict[ParticipantId, Excess]:
-    """Of those that have gone beyond their quota."""
-    return {name: bucket.excess for name, bucket in buckets if bucket.floods}
+    """The excess of each participant that has exceeded its quota."""
+    return {name: bucket.excess for name, bucket in buckets if bucket.exceeded}

@@ -1,15 +1,15 @@
-"""The bus: the only file that knows Zenoh.
+"""Routers of the bus: world-sim's (the hub) and those of sites.
 
 World-sim is the router; every other process is a client of it, with an identity of its own: a password on
-`tcp/HOST:PORT`, a certificate on `tls/HOST:PORT`, where both sides prove who they are. Access control makes world-sim the
-only way from one participant to another: a participant may put on its own keys and read its own `rx`, nothing else. The traps that the settings below avoid are in
-protocol/README.md.
+`tcp/HOST:PORT`, a certificate on `tls/HOST:PORT`, where both sides authenticate. Access control makes world-sim the
+only way from one participant to another: a participant may put on its own keys and read its own `rx`, nothing else.
+The traps that Zenoh's settings avoid are in protocol/README.md.
 
-A callback only enqueues; all work is done by whoever calls `next`. No queue grows without bound: what a
-slow reader has no room for is lost, as on any link.
+A callback only enqueues; all work is done by the thread that calls `next`. No queue grows without bound: messages
+that find it full are dropped, as on any link.
 
-A client connects again by itself when world-sim comes back: its token and its subscription are declared
-anew, so that world-sim sees it join with the nonce that it had.
+A client connects again by itself when world-sim comes back: its token and its subscription are declared anew, so
+that world-sim sees it join with the nonce that it had.
 """
 
 import queue
@@ -26,7 +26,7 @@ from kantor_protocol.transport import tls, zenoh_config
 from kantor_protocol.transport.client import client
 from kantor_protocol.transport.credentials import OBSERVER, Certificate, Identity
 from kantor_protocol.transport.endpoint import check_endpoint, check_free
-from kantor_protocol.transport.events import Event, Flooded, Heard, Joined, Left
+from kantor_protocol.transport.events import Event, Flooded, Joined, Left, Received
 from kantor_protocol.transport.rate_limit import Excess, RateLimit, TokenBucket, excesses
 from kantor_protocol.transport.session import (
     QUEUE_MAX,
@@ -39,15 +39,15 @@ from kantor_protocol.wire import keys
 
 
 class Router:
-    """A router's session, which tells what happens on the bus."""
+    """A router's session, which reports the events of the bus."""
 
     _session: zenoh.Session
-    _held: list[Any]
+    _declared: list[Any]
 
     def __init__(self) -> None:
         """No session yet."""
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._door: RefusalResponder | None = None
+        self._refusal_responder: RefusalResponder | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -64,9 +64,9 @@ class Router:
 
     def close(self) -> None:
         """Leave the bus."""
-        if self._door is not None:
-            self._door.close()
-        close_session(self._session, self._held)
+        if self._refusal_responder is not None:
+            self._refusal_responder.close()
+        close_session(self._session, self._declared)
 
 
 class HubRouter(Router):
@@ -78,23 +78,24 @@ class HubRouter(Router):
         listen: str,
         users_file: Path | None,
         roster: tuple[ParticipantId, ...],
-        say: Callable[[str], None] = lambda _line: None,
+        notify: Callable[[str], None] = lambda _line: None,
     ) -> None:
-        """listen: an endpoint such as `tcp/127.0.0.1:7447`. users_file: of passwords, for an identity that is one.
+        """Listen.
 
-        say: takes a line on whoever shows a certificate of the fleet's authority and is not let in; called
-        from a thread. Raises BusError if the endpoint cannot be had, CredentialsError if it is not of the
+        listen: an endpoint such as `tcp/127.0.0.1:7447`. users_file: of passwords, for an identity that is one.
+        notify: takes a line about each client that shows a certificate of the fleet's authority and is refused;
+        called from a thread. Raises BusError if the endpoint is not free, CredentialsError if it is not of the
         identity's kind.
         """
         super().__init__()
         check_endpoint(listen, identity)
         fleet = identity.fleet
-        known = zenoh_config.hub_config(identity, roster, users_file)
+        config = zenoh_config.hub_config(identity, roster, users_file)
         self._fleet = fleet
-        self._listening = threading.Lock()
+        self._admitting = threading.Lock()
         self._buckets = {name: TokenBucket(RateLimit.of(0.0)) for name in roster}
         try:
-            self._session = open_session("router", known, listen=listen)
+            self._session = open_session("router", config, listen=listen)
         except zenoh.ZError as error:
             raise BusError(
                 f"cannot listen on {listen}: {one_line(error)}; choose another"
@@ -105,41 +106,44 @@ class HubRouter(Router):
         self._progress = keys.progress(fleet)
         if isinstance(identity, Certificate):
             wanted = (*roster, *identity.sites, OBSERVER)
-            self._door = RefusalResponder(self._session, identity, wanted, say)
-        self._held: list[Any] = [
+            self._refusal_responder = RefusalResponder(self._session, identity, wanted, notify)
+        self._declared: list[Any] = [
             self._session.declare_subscriber(keys.tx(fleet), self._on_message),
             self._session.liveliness().declare_subscriber(
                 keys.alive(fleet), self._on_token, history=True
             ),
         ]
 
-    def send(self, name: ParticipantId, payload: bytes, *, patiently: bool) -> None:
-        """Put on a participant's `rx`. patiently: wait for a full queue, up to 0.2 s, rather than drop."""
-        congestion = self._block if patiently else self._drop
-        if patiently:  # what may be lost is news, and news asks for nothing
-            self._buckets[name].ask()
+    def send(self, name: ParticipantId, payload: bytes, *, blocking: bool) -> None:
+        """Put a message on a participant's `rx`.
+
+        blocking: wait while the queue is full, up to 0.2 s, instead of dropping the message.
+        """
+        congestion = self._block if blocking else self._drop
+        if blocking:  # messages that may be dropped request nothing
+            self._buckets[name].grant_reply()
         self._session.put(self._rx[name], payload, congestion_control=congestion, express=True)
 
     def limit(self, quotas: Mapping[ParticipantId, RateLimit]) -> None:
-        """How much to take in of what each says; before that, little more than answers."""
+        """Set the quotas of participants; before that, little more than replies is admitted."""
         for name, quota in quotas.items():
             self._buckets[name].quota = quota
 
     @property
     def excess(self) -> dict[ParticipantId, Excess]:
-        """What was beyond the quotas."""
+        """Messages and bytes beyond the quotas, which were dropped."""
         return excesses(self._buckets.items())
 
     def publish_progress(self, payload: bytes) -> None:
-        """Tell observers how the mission goes."""
+        """Publish how the mission goes, for observers."""
         self._session.put(self._progress, payload, congestion_control=self._drop)
 
     def _on_message(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
-        if key is None or not self._listens(key.name, len(sample.payload)):
+        if key is None or not self._admits(key.name, len(sample.payload)):
             return
         if self._events.qsize() < QUEUE_MAX:
-            self._events.put(Heard(key.name, sample.payload.to_bytes()))
+            self._events.put(Received(key.name, sample.payload.to_bytes()))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
@@ -147,26 +151,26 @@ class HubRouter(Router):
             return
         if sample.kind == zenoh.SampleKind.DELETE:
             self._events.put(Left(key.name, key.nonce))
-        elif self._listens(key.name, len(key.nonce)):
+        elif self._admits(key.name, len(key.nonce)):
             self._events.put(Joined(key.name, key.nonce))
 
-    def _listens(self, name: ParticipantId, size: int) -> bool:
-        """Whether something that a participant says is within its quota."""
+    def _admits(self, name: ParticipantId, size: int) -> bool:
+        """Whether a message or a token of a participant is within its quota."""
         bucket = self._buckets.get(name)
         if bucket is None:
             return False
-        with self._listening:  # messages and tokens come in different threads
-            flooded = bucket.floods
-            taken = bucket.admit(size, time.monotonic())
-            if bucket.floods and not flooded:
+        with self._admitting:  # messages and tokens come in different threads
+            exceeded_before = bucket.exceeded
+            admitted = bucket.admit(size, time.monotonic())
+            if bucket.exceeded and not exceeded_before:
                 self._events.put(Flooded(name))
-            return taken
+            return admitted
 
 
 class RefusalResponder:
-    """Tells whoever shows a certificate of the fleet's authority, and is not let in, why; and the host's log too.
+    """Answers clients with a certificate of the fleet's authority why they are refused, and reports them.
 
-    For TLS such a certificate is sound, and Zenoh silently passes nothing of its holder's on.
+    For TLS such a certificate is valid, and Zenoh silently forwards nothing of its holder's.
     """
 
     def __init__(
@@ -174,39 +178,40 @@ class RefusalResponder:
         session: zenoh.Session,
         identity: Certificate,
         wanted: Iterable[ParticipantId],
-        say: Callable[[str], None],
+        notify: Callable[[str], None],
     ) -> None:
+        """wanted: the users that take part. notify: takes a line for the operator; called from a thread."""
         self._identity = identity
         self._wanted = frozenset(wanted)
-        self._refusals = tls.Refusals(say)
-        self._held: list[Any] = [
-            session.declare_queryable(keys.door(identity.fleet), self._on_question),
+        self._refusals = tls.RefusalLog(notify)
+        self._declared: list[Any] = [
+            session.declare_queryable(keys.door(identity.fleet), self._on_query),
             session.info.declare_link_events_listener(self._on_link),
         ]
 
     def close(self) -> None:
-        """Tell what has not been told."""
-        self._held.clear()
+        """Stop answering, and report what has not been reported yet."""
+        self._declared.clear()
         self._refusals.close()
 
-    def _objection(self, name: str) -> str:
-        return self._identity.objection(name, self._wanted)
+    def _reason(self, name: str) -> str:
+        return self._identity.refusal_reason(name, self._wanted)
 
-    def _on_question(self, query: zenoh.Query) -> None:
+    def _on_query(self, query: zenoh.Query) -> None:
         name = str(query.key_expr).rpartition("/")[2]
-        query.reply(keys.door(self._identity.fleet, name), self._objection(name).encode())
+        query.reply(keys.door(self._identity.fleet, name), self._reason(name).encode())
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         name = event.link.auth_identifier
-        if event.kind == zenoh.SampleKind.PUT and name and (objection := self._objection(name)):
-            self._refusals.tell(f"refused {name.partition('.')[0]}: {objection}")
+        if event.kind == zenoh.SampleKind.PUT and name and (reason := self._reason(name)):
+            self._refusals.report(f"refused {name.partition('.')[0]}: {reason}")
 
 
 class SiteRouter(Router):
-    """A router of a place: its robots connect to it, and it connects to world-sim's.
+    """The router of a site: the site's robots connect to it, and it connects to world-sim's.
 
-    What each robot may do is enforced here, what all of them may do at world-sim. It connects again by itself;
-    without it its robots have left.
+    The rights of each robot are enforced here, those of all of them together at world-sim. It connects again by
+    itself; while it is not connected, its robots have left.
     """
 
     def __init__(
@@ -214,26 +219,30 @@ class SiteRouter(Router):
         identity: Certificate,
         connect: str,
         listen: str,
-        patience_s: float,
-        say: Callable[[str], None] = lambda _line: None,
+        connect_timeout_s: float,
+        notify: Callable[[str], None] = lambda _line: None,
     ) -> None:
-        """Wait for world-sim up to `patience_s`, then listen. say: see Host. Raises BusError, CredentialsError."""
+        """Wait for world-sim up to `connect_timeout_s`, then listen. notify: see HubRouter.
+
+        Raises BusError, CredentialsError.
+        """
         super().__init__()
         check_endpoint(listen, identity)
         fleet = identity.fleet
         self.members = tuple(name for name in identity.members if name != WORLD_SIM)
-        """Its robots."""
+        """The site's robots."""
         check_free(listen)
-        close_session(
-            client(connect, identity, patience_s), []
-        )  # which is told why, if it is not let in
-        own = zenoh_config.site_config(identity, self.members)
+        # A client gets the reason if world-sim refuses this identity; a router would not.
+        close_session(client(connect, identity, connect_timeout_s), [])
+        config = zenoh_config.site_config(identity, self.members)
         try:
-            self._session = open_session("router", own, connect=connect, listen=listen)
+            self._session = open_session("router", config, connect=connect, listen=listen)
         except zenoh.ZError as error:
             raise BusError(f"cannot connect {listen} to {connect}: {one_line(error)}") from None
-        self._door = RefusalResponder(self._session, identity, (*self.members, WORLD_SIM), say)
-        self._held: list[Any] = [
+        self._refusal_responder = RefusalResponder(
+            self._session, identity, (*self.members, WORLD_SIM), notify
+        )
+        self._declared: list[Any] = [
             self._session.liveliness().declare_subscriber(
                 keys.alive(fleet), self._on_token, history=True
             ),
@@ -241,7 +250,7 @@ class SiteRouter(Router):
 
     @property
     def connected(self) -> bool:
-        """Whether world-sim is there."""
+        """Whether it is connected to world-sim."""
         return bool(self._session.info.routers_zid())
 
     def _on_token(self, sample: zenoh.Sample) -> None:

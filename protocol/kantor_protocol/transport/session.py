@@ -13,14 +13,15 @@ LEASE_MS = zenoh_config.LEASE_MS
 
 
 QUEUE_MAX = 16_384
-"""Messages that wait for a reader."""
+"""Messages that wait for a reader; more are dropped."""
 
 
 CLOSE_S = 5.0
+"""How long to wait for a session to close."""
 
 
 class BusError(ConnectionError):
-    """The bus cannot be reached or refuses us; the message is one line with the remedy."""
+    """The bus cannot be reached, or refuses this process; the message is one line with the remedy."""
 
 
 def open_session(
@@ -30,16 +31,16 @@ def open_session(
     connect: str | None = None,
     listen: str | None = None,
 ) -> zenoh.Session:
-    """Raises zenoh.ZError."""
+    """Open a session with the settings that all processes have and its own. Raises zenoh.ZError."""
     config = zenoh.Config()
     for key, value in (zenoh_config.common_config(mode, connect, listen) | own).items():
         config.insert_json5(key, json.dumps(value))
     return zenoh.open(config)
 
 
-def close_session(session: zenoh.Session, held: list[Any]) -> None:
-    """Close without ever hanging: a close may block when the other side is gone."""
-    held.clear()
+def close_session(session: zenoh.Session, declared: list[Any]) -> None:
+    """Close within CLOSE_S: a close may block when the other side is gone. declared: on the session; it is cleared."""
+    declared.clear()
 
     def close() -> None:
         with contextlib.suppress(zenoh.ZError):
@@ -51,5 +52,5 @@ def close_session(session: zenoh.Session, held: list[Any]) -> None:
 
 
 def one_line(error: Exception) -> str:
-    """First line of one of Zenoh's errors, without the place in its source."""
+    """The first line of one of Zenoh's errors, without the place in its source."""
     return str(error).splitlines()[0].partition(" at ")[0][:200]

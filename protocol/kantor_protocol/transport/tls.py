@@ -1,7 +1,7 @@
-"""Why a connection with certificates is refused, in words.
+"""Reasons why a connection with certificates is refused, in plain English.
 
-Zenoh tells neither side. A client therefore shakes hands once by itself before it joins, with the same
-certificate and the same authority, and reads the alert; world-sim reads the line that Zenoh logs.
+Zenoh reports them to neither side. A client therefore makes one TLS handshake by itself before it joins, with the
+same certificate and the same authority, and reads the alert; world-sim reads the line that Zenoh logs.
 """
 
 import os
@@ -16,13 +16,13 @@ from kantor_protocol.transport.credentials import Certificate, CredentialsError
 
 HANDSHAKE_S = 5.0
 _WINDOW_S = 10.0
-"""World-sim tells of the same reason once in this time, however many are refused."""
+"""World-sim reports the same reason once in this time, however many clients are refused."""
 
 
-def objection(host: str, port: int, identity: Certificate) -> str:
-    """Shake hands with world-sim: why it comes to nothing, with the remedy; empty if it does not.
+def handshake_failure(host: str, port: int, identity: Certificate) -> str:
+    """Make a TLS handshake with a router: why it fails, with the remedy; empty if it succeeds.
 
-    Raises OSError if nothing listens there, CredentialsError if the identity is no use.
+    Raises OSError if nothing listens there, CredentialsError if the identity is damaged.
     """
     renew = f"`kantor keys {identity.fleet} --renew {identity.user}` makes a new one"
     with socket.create_connection((host, port), timeout=HANDSHAKE_S) as raw:
@@ -54,19 +54,21 @@ _ALERTS = {
 
 
 def _shake_hands(raw: socket.socket, host: str, context: ssl.SSLContext) -> None:
-    """Raises ssl.SSLError, OSError."""
+    """Make a handshake, and wait for the server's verdict. Raises ssl.SSLError, OSError."""
     with context.wrap_socket(raw, server_hostname=host) as secured:
-        # In TLS 1.3 the server looks at our certificate after our handshake is over. Once it has taken note
-        # that we say no more, it has either sent its alert or closes.
+        # In TLS 1.3 the server examines the client's certificate after the client's handshake is over. Once it has
+        # received the end of the client's data, it has either sent its alert or closes.
         raw_end = socket.socket(fileno=os.dup(secured.fileno()))
-        with raw_end, suppress(OSError):  # it may have hung up already
+        with raw_end, suppress(OSError):  # it may be closed already
             raw_end.shutdown(socket.SHUT_WR)
-        with suppress(ConnectionError):  # without an alert: whoever joins is told why
+        with suppress(
+            ConnectionError
+        ):  # without an alert: the router answers why, see RefusalResponder
             secured.recv(1)
 
 
 def _distrust(error: ssl.SSLCertVerificationError, host: str, identity: Certificate) -> str:
-    """Why we do not trust whoever answers."""
+    """Why this identity does not trust the server that answers."""
     code, fleet = error.verify_code, identity.fleet
     if code in {62, 64}:  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
         return (
@@ -87,7 +89,7 @@ def _distrust(error: ssl.SSLCertVerificationError, host: str, identity: Certific
 
 
 def context(identity: Certificate) -> ssl.SSLContext:
-    """A client's, which trusts the fleet's authority alone. Raises CredentialsError."""
+    """The SSL context of a client, which trusts the fleet's authority alone. Raises CredentialsError."""
     made = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
         made.load_verify_locations(cadata=identity.authority)
@@ -103,7 +105,7 @@ def context(identity: Certificate) -> ssl.SSLContext:
 
 @contextmanager
 def _readable(text: str) -> Iterator[str]:
-    """A text as a path, for a library that reads files only; no file is made."""
+    """A path from which a text can be read, for a library that reads files only; no file is made."""
     reading, writing = os.pipe()
     try:
         with os.fdopen(writing, "w", encoding="utf-8") as file:
@@ -113,34 +115,34 @@ def _readable(text: str) -> Iterator[str]:
         os.close(reading)
 
 
-class Refusals:
-    """Tells of whom world-sim refuses: a line for a reason at once, then how often, now and then."""
+class RefusalLog:
+    """Reports refused clients: a line for each reason at once, then, now and then, how often it occurred."""
 
     def __init__(
-        self, say: Callable[[str], None], monotonic: Callable[[], float] = time.monotonic
+        self, notify: Callable[[str], None], monotonic: Callable[[], float] = time.monotonic
     ) -> None:
-        """say: takes one line for a person. monotonic: seconds."""
-        self._say = say
+        """notify: takes one line for the operator. monotonic: seconds."""
+        self._notify = notify
         self._monotonic = monotonic
         self._due_s: dict[str, float] = {}
-        self._untold: dict[str, int] = {}
+        self._unreported: dict[str, int] = {}
 
-    def tell(self, reason: str) -> None:
-        """Somebody was refused."""
+    def report(self, reason: str) -> None:
+        """Count a refused client, and report the reason if that is due."""
         now_s = self._monotonic()
-        self._untold[reason] = self._untold.get(reason, 0) + 1
+        self._unreported[reason] = self._unreported.get(reason, 0) + 1
         if now_s >= self._due_s.get(reason, now_s):
             self._due_s[reason] = now_s + _WINDOW_S
             self._flush(reason)
 
     def close(self) -> None:
-        """Tell what has not been told."""
-        for reason in tuple(self._untold):
+        """Report what has not been reported yet."""
+        for reason in tuple(self._unreported):
             self._flush(reason)
 
     def _flush(self, reason: str) -> None:
-        count = self._untold.pop(reason)
-        self._say(reason if count == 1 else f"{reason} ({count} times)")
+        count = self._unreported.pop(reason)
+        self._notify(reason if count == 1 else f"{reason} ({count} times)")
 
 
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
@@ -154,14 +156,14 @@ _LOGGED_REASONS = {
     "fatal alert: CertificateExpired": "to it, world-sim's certificate has expired",
     "fatal alert: (UnsupportedCertificate|BadCertificate|CertificateUnknown)": "it does not trust world-sim's certificate",
 }
-_NOBODY = re.compile(r"\beof\b|reset|timed? ?out", re.IGNORECASE)
-"""Who only looks whether the port is open is nobody that was refused."""
+_PROBE = re.compile(r"\beof\b|reset|timed? ?out", re.IGNORECASE)
+"""A connection that only probes whether the port is open is not a refused client."""
 
 
 def logged_reason(line: str) -> str:
-    """Why Zenoh refused a client, from a line of its log; empty if it does not say so."""
+    """Why Zenoh refused a client, from a line of its log; empty if the line is about something else."""
     found = _LOGGED.search(_COLOURS.sub("", line).rstrip())
-    if found is None or _NOBODY.search(found[1]):
+    if found is None or _PROBE.search(found[1]):
         return ""
     for pattern, words in _LOGGED_REASONS.items():
         if re.search(pattern, found[1]):

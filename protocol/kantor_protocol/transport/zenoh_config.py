@@ -1,4 +1,4 @@
-"""Zenoh's settings: how a process proves who it is, and what a router lets in.
+"""Zenoh's settings: how a process authenticates, and what a router admits.
 
 The traps that they avoid are in protocol/README.md.
 """
@@ -15,7 +15,7 @@ from kantor_protocol.wire import keys
 from kantor_protocol.wire.messages import MESSAGE_BYTES_MAX
 
 LEASE_MS = 1000
-"""A frozen or cut-off process is noticed after this."""
+"""A process that is frozen or disconnected is noticed after this."""
 HANDSHAKE_S = 3.0
 POSE_BYTES_MAX = 256
 SHOWN_PER_S = 1000
@@ -29,7 +29,7 @@ Subject = tuple[str, dict[str, list[str]], acl.Grants]
 
 
 def common_config(mode: str, connect: str | None, listen: str | None) -> ZenohConfig:
-    """What every process has."""
+    """The settings of every process."""
     return {
         "mode": mode,
         "scouting/multicast/enabled": False,
@@ -42,7 +42,7 @@ def common_config(mode: str, connect: str | None, listen: str | None) -> ZenohCo
 
 
 def client_config(identity: Identity) -> ZenohConfig:
-    """A process that connects, and connects again."""
+    """The settings of a process that connects, and connects again when the connection is lost."""
     return _proof(identity) | {
         "connect/timeout_ms": round(HANDSHAKE_S * 1000),
         "connect/retry": {
@@ -57,17 +57,19 @@ def client_config(identity: Identity) -> ZenohConfig:
 def hub_config(
     identity: Identity, roster: Iterable[ParticipantId], users_file: Path | None
 ) -> ZenohConfig:
-    """World-sim's router. users_file: the passwords, for an identity that has one."""
+    """The settings of world-sim's router. users_file: the passwords, for an identity that has one."""
     fleet, roster = identity.fleet, tuple(roster)
     subjects = [(name, acl.robot(fleet, name)) for name in roster]
     if isinstance(identity, Certificate):
-        subjects += [(name, acl.site(fleet, there)) for name, there in identity.behind().items()]
+        subjects += [
+            (name, acl.site(fleet, robots)) for name, robots in identity.robots_by_site().items()
+        ]
     subjects.append((OBSERVER, acl.observer(fleet)))
     return _router(identity, subjects, roster, users_file)
 
 
 def site_config(identity: Certificate, members: Iterable[ParticipantId]) -> ZenohConfig:
-    """A site's router, which also connects to world-sim's."""
+    """The settings of a site's router, which also connects to world-sim's."""
     fleet, members = identity.fleet, tuple(members)
     robots = [(name, acl.robot(fleet, name)) for name in members]
     subjects = [*robots, (WORLD_SIM, acl.hub(fleet, members))]
@@ -86,10 +88,10 @@ def _router(
         "open/return_conditions": {"connect_scouted": False, "declares": False},
         # A frozen client must not hold the router for long (the unit is microseconds).
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 200_000,
-        # A flood reaches the router in small portions, so that the others' turn comes between them.
+        # A flood reaches the router in small portions, so that messages of others are read between them.
         "transport/link/tcp/so_rcvbuf": _RECEIVE_BYTES,
         "transport/link/tls/so_rcvbuf": _RECEIVE_BYTES,
-        # Longer ones are not put together. Without this a robot could have a gigabyte waiting.
+        # Longer messages are not reassembled. Without this a robot could have a gigabyte waiting.
         "transport/link/rx/max_message_size": MESSAGE_BYTES_MAX + _FRAME_BYTES,
         "access_control": acl.control(_subjects(identity, grants)),
         "low_pass_filter": [
@@ -101,7 +103,7 @@ def _router(
 
 
 def _subjects(identity: Identity, grants: list[tuple[str, acl.Grants]]) -> list[Subject]:
-    """With how the router knows each. Who has no certificate, or none that counts, is unknown to it."""
+    """Subjects with the marks by which the router recognizes them; without a valid certificate it recognizes none."""
     if isinstance(identity, Password):
         return [(name, {"usernames": [name]}, granted) for name, granted in grants]
     known = [
@@ -113,7 +115,7 @@ def _subjects(identity: Identity, grants: list[tuple[str, acl.Grants]]) -> list[
 
 
 def _proof(identity: Identity, users_file: Path | None = None) -> ZenohConfig:
-    """How a process shows who it is, and sees who others are."""
+    """The settings by which a process authenticates, and checks others."""
     if isinstance(identity, Password):
         known = {"dictionary_file": str(users_file)} if users_file is not None else {}
         proof = {"user": identity.user, "password": identity.password, **known}
@@ -138,7 +140,7 @@ def _base64(text: str) -> str:
 
 
 def _low_pass(label: str, key: str, bytes_max: int) -> ZenohConfig:
-    """Nothing longer passes the router."""
+    """A rule that stops longer messages at the router."""
     return {
         "id": label,
         "flows": ["ingress"],
@@ -149,7 +151,7 @@ def _low_pass(label: str, key: str, bytes_max: int) -> ZenohConfig:
 
 
 def _downsampling(fleet: str, roster: tuple[ParticipantId, ...]) -> list[ZenohConfig]:
-    """What observers can do without. A rule for each, since many may stand behind one router."""
+    """Rules that thin out messages for observers: one for each participant, since many may be behind one router."""
     return [
         {
             "id": f"{name}-shows",

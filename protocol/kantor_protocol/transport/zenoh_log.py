@@ -14,23 +14,23 @@ from kantor_protocol.transport.session import CLOSE_S
 
 
 def init_log() -> None:
-    """Zenoh's own log: silent, since kantor tells what a user can mend, unless RUST_LOG says more."""
+    """Silence Zenoh's own log, unless RUST_LOG is set: kantor reports the errors that a user can repair."""
     zenoh.init_log_from_env_or("off")
 
 
 @contextlib.contextmanager
-def host_log(identity: Identity, say: Callable[[str], None]) -> Iterator[None]:
-    """`init_log` for a host; with certificates, also a line on whoever comes without a sound one.
+def host_log(identity: Identity, notify: Callable[[str], None]) -> Iterator[None]:
+    """`init_log` for a router; with certificates, also a line about clients without a valid one.
 
-    Zenoh tells of them in its log alone (zenoh#2712), without an address and with a misleading hint, and its log
-    goes to standard output. In here its lines are read instead, while our own output goes on where it went.
-    say: called from a thread.
+    Zenoh reports them in its log alone (zenoh#2712), without an address and with a misleading hint, and its log goes
+    to standard output. Within this context its lines are read instead, while kantor's own output goes where it went.
+    notify: takes a line for the operator; called from a thread.
     """
     if isinstance(identity, Password) or "RUST_LOG" in os.environ:
         init_log()
         yield
         return
-    refusals = tls.Refusals(say)
+    refusals = tls.RefusalLog(notify)
     sys.stdout.flush()
     usual = sys.stdout
     reading, writing = os.pipe()
@@ -42,16 +42,16 @@ def host_log(identity: Identity, say: Callable[[str], None]) -> Iterator[None]:
 
     def read() -> None:
         with os.fdopen(reading, encoding="utf-8", errors="replace") as lines:
-            for participant_session in lines:
-                if reason := tls.logged_reason(participant_session):
-                    refusals.tell(reason)
+            for line in lines:
+                if reason := tls.logged_reason(line):
+                    refusals.report(reason)
 
     reader = threading.Thread(target=read, daemon=True)
     reader.start()
     try:
         yield
     finally:
-        os.dup2(kept, 1)  # closes the pipe, unless somebody else holds it
+        os.dup2(kept, 1)  # closes the pipe, unless another process holds it
         os.close(kept)
         reader.join(CLOSE_S)
         refusals.close()

@@ -1,8 +1,8 @@
 """Every message on the bus and on the radio: frozen records in msgpack, versioned, add-only.
 
 A record travels as a msgpack array: tag, version, fields in order. New fields go to the end with a
-default; unknown further fields are ignored; a change of meaning takes a new version. What does not
-decode, has another version or is not finite is refused at the door and changes nothing.
+default; unknown further fields are ignored; a change of meaning takes a new version. A message
+that does not decode, has another version or a number that is not finite is refused on arrival and changes nothing.
 """
 
 import math
@@ -25,7 +25,7 @@ MESSAGE_BYTES_MAX = 4 * 1024 * 1024
 
 
 class RefusedError(ValueError):
-    """A message that must not be taken in; the text says why."""
+    """A message that must not be used; the text says why."""
 
 
 class _Message(msgspec.Struct, frozen=True, array_like=True):
@@ -33,7 +33,7 @@ class _Message(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Array(msgspec.Struct, frozen=True, array_like=True):
-    """A numpy array as dtype, shape and bytes. Object arrays do not exist here."""
+    """A numpy array as dtype, shape and bytes. Object arrays are refused."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -61,32 +61,32 @@ class Array(msgspec.Struct, frozen=True, array_like=True):
 
 
 class GossipMessage(_Message, frozen=True, array_like=True, tag=1, gc=False):
-    """Radio, participant to participant: the sender's registers and the log suffixes others lack."""
+    """Radio, participant to participant: version vector, and the log suffixes, claims and registers that others lack."""
 
     step: int
     """The sender's step."""
     x_m: float
     y_m: float
-    """Where the sender says it is, world frame."""
+    """The place of the sender by its own account, world frame."""
     version_vector: bytes
-    """Version vector: for every slot that the sender knows (`slots.py`), how many log entries it holds;
-    then, with claims, the newest claim stamp it holds. LEB128."""
+    """For every incarnation id that the sender knows (`base/incarnations.py`), how many log entries it holds; then, with
+    claims, the newest claim stamp that it holds. See `version_vector.py`. LEB128."""
     logs: bytes
-    """Suffixes: origin, start, span, count, then count packed pairs. LEB128."""
+    """Suffixes: incarnation id of the origin, start, span, count, then count packed pairs. LEB128."""
     claims: bytes
-    """Registers: origin, stamp, sample + 1 (0: none), since_ns. LEB128."""
+    """Claims: incarnation id of the origin, stamp, sample + 1 (0: none), since_ns. LEB128."""
     registers: bytes = b""
-    """For every such slot the stamp of the register that the sender holds; then registers: origin, stamp,
-    numbers. LEB128, the numbers zigzag-folded. Empty in a mission whose planner has none."""
+    """For every such id the stamp of the register that the sender holds; then registers: incarnation id of the origin,
+    stamp, how many numbers, numbers. LEB128, the numbers zigzag-folded. Empty in a mission whose planner has none."""
     incarnation: int = 0
     """The sender's incarnation."""
 
 
 class Mission(_Message, frozen=True, array_like=True, tag=2):
-    """World-sim to a participant that has joined: all that it needs to know."""
+    """World-sim to a participant that has joined: the mission, and the body that it takes over."""
 
     nonce: str
-    """The joining process that is meant."""
+    """The nonce of the process that it is for."""
     scenario: Scenario
     seed: int
     starts: Array
@@ -94,13 +94,13 @@ class Mission(_Message, frozen=True, array_like=True, tag=2):
     samples: Array
     """(N, 2) float64 at time 0."""
     exchange: str
-    """`lockstep` or `wall`."""
+    """`lockstep`, or `wall` for the realtime exchange."""
     frame: Frame | None
-    """How the cells of the map lie, if there is one; what is in them is for the robots to find out."""
+    """The frame of the map, if there is one, without its contents."""
     run: str
-    """Names this run of the mission, so that no snapshot of another is taken for its own."""
+    """The name of this run of the mission, so that the write-ahead log of another run is not used."""
     body: Body
-    """What the participant takes over."""
+    """The body that the participant takes over."""
 
 
 class Refusal(_Message, frozen=True, array_like=True, tag=3):
@@ -111,37 +111,37 @@ class Refusal(_Message, frozen=True, array_like=True, tag=3):
 
 
 class StartClock(_Message, frozen=True, array_like=True, tag=4):
-    """World-sim to a participant, wall exchange: simulated time runs from here."""
+    """World-sim to a participant, realtime exchange: simulated time runs from here."""
 
     nonce: str
     now_ns: int
     speed: float
     """Simulated seconds in a real one."""
     observation: Observation | None = None
-    """What the participant sees before its first step."""
+    """The observation of the participant's first step."""
     skew_ns: int = 0
-    """So far ahead is the clock that its machine reads. Sent again, it sets that clock anew."""
+    """How far ahead the clock is that its machine reads. Sent again, it sets that clock anew."""
 
 
 class StepRequest(_Message, frozen=True, array_like=True, tag=5):
-    """World-sim to a participant: lockstep, step now; wall, news since the last one."""
+    """World-sim to a participant. Lockstep: make a step now. Realtime: what has arrived since the last request."""
 
     inputs: Inputs
 
 
 class Report(_Message, frozen=True, array_like=True, tag=6):
-    """Participant to world-sim: what it did."""
+    """Participant to world-sim: the outputs of a step."""
 
     nonce: str
     outputs: Outputs
     now_ns: int = 0
-    """Wall: the time on the participant's clock at which it stepped."""
+    """Realtime: the time on the participant's clock at which it stepped."""
     heard: tuple[tuple[ParticipantId, int], ...] = ()
-    """Wall: source and sequence of each envelope in the inbox of this step, in order."""
+    """Realtime: source and sequence of each envelope in the inbox of this step, in order."""
     observed: int = 0
-    """Wall: the step in the observation that it used."""
+    """Realtime: the step in the observation that it used."""
     skew_ns: int = 0
-    """Wall: how far the clock that its machine read was ahead of now_ns."""
+    """Realtime: how far the clock that its machine read was ahead of now_ns."""
 
 
 class Ready(_Message, frozen=True, array_like=True, tag=7):
@@ -149,11 +149,11 @@ class Ready(_Message, frozen=True, array_like=True, tag=7):
 
     nonce: str
     incarnation: int = 0
-    """Which incarnation it is."""
+    """The incarnation that answers."""
     step: int = 0
-    """The step that it goes on from, by its own snapshot."""
+    """The last step that it has recovered from its write-ahead log."""
     now_ns: int = 0
-    """Wall: the time on its clock, if that runs already."""
+    """Realtime: the time on its clock, if that runs already."""
 
 
 class Stop(_Message, frozen=True, array_like=True, tag=8):
@@ -177,7 +177,7 @@ class Progress(_Message, frozen=True, array_like=True, tag=22):
     phase: str
     """`waiting`, `running` or `over`."""
     detail: str
-    """waiting: who is missing; over: why."""
+    """waiting: the participants that are missing; over: the reason."""
     energy_spent: int
     energy_total: int
     detected: int
@@ -185,13 +185,13 @@ class Progress(_Message, frozen=True, array_like=True, tag=22):
     w_ub: float
     links: int
     messages_per_s: float
-    """Deliveries a second of simulated time."""
+    """Deliveries in a second of simulated time."""
     robots_done: int
     robots: int
     mass_left: float = 1.0
     """Share of the mass that the common weights still hold; on a map, of the cells not yet seen."""
     distance_m: float | None = None
-    """On a map: what all robots have driven."""
+    """On a map: the distance that all robots have driven."""
 
 
 FromParticipant = Report | Ready
@@ -205,16 +205,16 @@ _PROGRESS = msgspec.msgpack.Decoder(Progress)
 encode = _ENCODER.encode
 _decode_gossip = msgspec.msgpack.Decoder(GossipMessage).decode
 _decode_inputs = msgspec.msgpack.Decoder(Inputs).decode
-_NO_EPOCH, _NO_REGISTERS = encode(0), encode(b"") + encode(0)
+_NO_INCARNATION, _NO_REGISTERS = encode(0), encode(b"") + encode(0)
 
 
-def encode_gossip(news: GossipMessage) -> bytes:
-    """The body of an envelope. What has a default and is at the end is left out."""
-    body = encode(news)
-    if news.incarnation:
+def encode_gossip(message: GossipMessage) -> bytes:
+    """The body of an envelope. Fields at the end that have their default are left out."""
+    body = encode(message)
+    if message.incarnation:
         return body
-    if news.registers:
-        return b"\x99" + body[1 : -len(_NO_EPOCH)]
+    if message.registers:
+        return b"\x99" + body[1 : -len(_NO_INCARNATION)]
     return b"\x98" + body[1 : -len(_NO_REGISTERS)]
 
 
@@ -223,18 +223,18 @@ def decode_gossip(body: bytes) -> GossipMessage:
     if len(body) > BODY_BYTES_MAX:
         raise RefusedError(f"body of {len(body)} bytes")
     try:
-        news = _decode_gossip(body)
+        message = _decode_gossip(body)
     except _UNDECODABLE as error:
         raise RefusedError(str(error)) from None
-    if news.version != VERSION:
-        raise RefusedError(f"version {news.version}, this is {VERSION}")
-    if not (math.isfinite(news.x_m) and math.isfinite(news.y_m)) or news.step < 0:
-        raise RefusedError("news without a finite place")
-    if not 0 <= news.incarnation <= INCARNATIONS_MAX:
+    if message.version != VERSION:
+        raise RefusedError(f"version {message.version}, this is {VERSION}")
+    if not (math.isfinite(message.x_m) and math.isfinite(message.y_m)) or message.step < 0:
+        raise RefusedError("gossip message without a finite place")
+    if not 0 <= message.incarnation <= INCARNATIONS_MAX:
         raise RefusedError(
-            f"news of incarnation {news.incarnation}, the last is {INCARNATIONS_MAX}"
+            f"gossip message of incarnation {message.incarnation}, the last is {INCARNATIONS_MAX}"
         )
-    return news
+    return message
 
 
 def decode_from_participant(payload: bytes) -> FromParticipant:
@@ -260,7 +260,7 @@ def decode_progress(payload: bytes) -> Progress:
 
 
 def decode_inputs(payload: bytes) -> Inputs:
-    """Inputs as they passed the codec. Raises RefusedError."""
+    """Encoded Inputs, as in a write-ahead log. Raises RefusedError."""
     try:
         return _decode_inputs(payload)
     except _UNDECODABLE as error:

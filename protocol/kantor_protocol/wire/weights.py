@@ -25,9 +25,9 @@ class Units(msgspec.Struct, frozen=True):
     whole: int
     """L = lcm(M, N): all mass."""
     sample: int
-    """L / N: what each sample starts with."""
+    """L / N: the initial weight of each sample."""
     point: int
-    """L / M: what one robot point ships."""
+    """L / M: the weight that one robot point ships."""
 
     @classmethod
     def of(cls, points: int, samples: int) -> "Units":
@@ -55,7 +55,7 @@ class WeightsMessage(msgspec.Struct, frozen=True, array_like=True, tag=20, gc=Fa
 def _note(
     lowered: np.ndarray, changed: np.ndarray, count: int, noted_in: np.ndarray, message: int
 ) -> int:
-    """Put indices that this message does not have yet behind changed[:count]; how many there are."""
+    """Append to changed[:count] the indices that this message does not have yet; how many there are then."""
     for i in range(lowered.shape[0]):
         j = lowered[i]
         if noted_in[j] != message:
@@ -66,7 +66,7 @@ def _note(
 
 
 class WeightsPublisher:
-    """Gathers what fell in a weight vector and turns it into messages."""
+    """Collects the entries that fell in a weight vector and encodes them as messages."""
 
     def __init__(self, weights: Weights, every: int, keyframe_every: int) -> None:
         """weights: (N,) the live vector in units; it is read, never written.
@@ -84,9 +84,9 @@ class WeightsPublisher:
         self._pairs = Pairs()
 
     def step(self, lowered: npt.NDArray[np.int32], *, last: bool) -> bytes:
-        """Note the indices that fell; the encoded message when one is due, else nothing.
+        """Add the indices that fell in a step; the encoded message when one is due, else nothing.
 
-        last: nothing will fall any more, so a message is due now.
+        last: no entry will fall any more, so a message is due now.
         """
         if lowered.size:
             self._count = _note(
@@ -126,7 +126,7 @@ class WeightsSubscriber:
         self._decoder = msgspec.msgpack.Decoder(WeightsMessage)
 
     def apply(self, payload: bytes) -> bool:
-        """Apply a message; False when it is malformed or does not follow what was received."""
+        """Apply a message; False when it is malformed or does not follow the last one."""
         try:
             message = self._decoder.decode(payload)
         except (msgspec.MsgspecError, RecursionError):

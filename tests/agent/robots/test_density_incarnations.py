@@ -1,4 +1,4 @@
-"""Robots and supervisors that lose all they know and go on with the same body; clocks that run wrong."""
+"""Robots and supervisors that lose their state and go on with the same body; clocks that run wrong."""
 
 import math
 from collections import Counter
@@ -65,26 +65,26 @@ MISSIONS = {
 EVERY_MISSION = pytest.mark.parametrize("name", list(MISSIONS))
 
 
-class Rehearsal:
-    """Everybody steps once a period; what is sent in a round arrives before the next."""
+class Rounds:
+    """All machines step once a period; what is sent in a round arrives before the next."""
 
     def __init__(self, scenario: Scenario, seed: int = 1) -> None:
         self.scenario, self._seed = scenario, seed
         self.machines: dict[ParticipantId, StateMachine] = build_team(scenario, SAMPLES_M, seed)
         self.bodies = {name: Body(pose) for name, pose in start_poses(scenario).items()}
-        self.told: dict[ParticipantId, list[Outputs]] = {name: [] for name in self.machines}
+        self.outputs: dict[ParticipantId, list[Outputs]] = {name: [] for name in self.machines}
         """Of all incarnations, one after the other."""
-        self.births: dict[ParticipantId, list[int]] = {name: [0] for name in self.machines}
-        """Where in `told` incarnations begin."""
+        self.beginnings: dict[ParticipantId, list[int]] = {name: [0] for name in self.machines}
+        """Where in `outputs` incarnations begin."""
         self._inboxes: dict[ParticipantId, list[Envelope]] = {name: [] for name in self.machines}
         self.rounds = 0
 
-    def lose_all(self, name: ParticipantId) -> None:
+    def begin_incarnation(self, name: ParticipantId) -> None:
         """A new incarnation takes over; what was under way to the one before is lost."""
         body = self.bodies[name]
         body = Body(body.pose, body.step, body.energy_spent, body.incarnation + 1)
         self.bodies[name], self._inboxes[name] = body, []
-        self.births[name].append(len(self.told[name]))
+        self.beginnings[name].append(len(self.outputs[name]))
         if name == SUPERVISOR:
             self.machines[name] = DensitySupervisor(name, self.scenario, body, N)
         else:
@@ -105,10 +105,10 @@ class Rehearsal:
                 self._inboxes[name] = []
                 continue
             body, now_ns = self.bodies[name], self.rounds * self.scenario.period_ns
-            look = Observation(body.step, body.pose)
+            observation = Observation(body.step, body.pose)
             now_ns += skew_ns if name == "r1" else 0
-            outputs = machine.step(Inputs(now_ns, look, tuple(self._inboxes[name])))
-            self.told[name].append(outputs)
+            outputs = machine.step(Inputs(now_ns, observation, tuple(self._inboxes[name])))
+            self.outputs[name].append(outputs)
             self._inboxes[name] = []
             self.bodies[name] = Body(
                 outputs.pose, outputs.step, outputs.energy_spent, body.incarnation
@@ -123,7 +123,7 @@ class Rehearsal:
             validate_all(self.machines.values())
 
     def replica(self, name: ParticipantId) -> Replica:
-        """What a participant holds."""
+        """The replica of a participant."""
         machine = self.machines[name]
         if isinstance(machine, DensityRobot):
             return machine._belief.replica
@@ -131,9 +131,9 @@ class Rehearsal:
         return machine._replica
 
     def consumed(self) -> Counter[int]:
-        """By sample: what was really spent."""
+        """By sample: the units that were really spent."""
         spent = Counter[int]()
-        for outputs in (one for told in self.told.values() for one in told):
+        for outputs in (one for put_out in self.outputs.values() for one in put_out):
             spent.update(dict(pairs(outputs.spent)))
         return spent
 
@@ -154,15 +154,15 @@ def pairs(packed: bytes) -> list[tuple[int, int]]:
 def test_all_know_the_same_in_the_end_whatever_incarnations_begin(
     *, name: str, deaths: set[tuple[int, int]], lost: set[int]
 ) -> None:
-    """Robots and the supervisor forget all at any moment, messages are lost; then the radio is good."""
-    played = Rehearsal(mission(*MISSIONS[name]))
+    """Robots and the supervisor lose their state at any moment, messages are lost; then the radio is perfect."""
+    played = Rounds(mission(*MISSIONS[name]))
     names = list(played.machines)
     copies = iter(range(10**6))
     for moment in range(15):
         for who in range(len(names)):
             if (moment, who) in deaths and played.bodies[names[who]].step > 0:
-                played.lose_all(names[who])
-        played.round(lambda _speaker, _listener: next(copies) not in lost)
+                played.begin_incarnation(names[who])
+        played.round(lambda _source, _receiver: next(copies) not in lost)
     for _ in range(30):
         played.round()
 
@@ -174,61 +174,63 @@ def test_all_know_the_same_in_the_end_whatever_incarnations_begin(
     totals = [held.registers.total.tolist() for held in replicas]
     assert totals == [replicas[0].registers.values.sum(axis=0).tolist()] * len(names)
     for one in names:
-        check_life(played, one)
+        check_incarnations(played, one)
 
 
-def check_life(played: Rehearsal, name: ParticipantId) -> None:
-    """What holds for one participant over all its incarnations, and within each."""
-    told, births = played.told[name], played.births[name]
-    steps = list(range(1, len(told) + 1))
-    assert [outputs.step for outputs in told] == steps
-    assert [outputs.outbox[0].sequence for outputs in told] == steps
-    spent = np.cumsum([bool(outputs.spent) for outputs in told]).tolist()
-    assert [outputs.energy_spent for outputs in told] == spent
+def check_incarnations(played: Rounds, name: ParticipantId) -> None:
+    """Assert the rules for one participant over all its incarnations, and within each."""
+    put_out, beginnings = played.outputs[name], played.beginnings[name]
+    steps = list(range(1, len(put_out) + 1))
+    assert [outputs.step for outputs in put_out] == steps
+    assert [outputs.outbox[0].sequence for outputs in put_out] == steps
+    spent = np.cumsum([bool(outputs.spent) for outputs in put_out]).tolist()
+    assert [outputs.energy_spent for outputs in put_out] == spent
     assert spent[-1] <= played.scenario.steps_per_robot
-    assert {outputs.refused for outputs in told} == {0}
+    assert {outputs.refused for outputs in put_out} == {0}
     subscriber = WeightsSubscriber()
-    for incarnation, (born, died) in enumerate(zip(births, [*births[1:], len(told)], strict=True)):
+    for incarnation, (first, end) in enumerate(
+        zip(beginnings, [*beginnings[1:], len(put_out)], strict=True)
+    ):
         left = [UNITS.sample] * N
-        for i in range(born, died):
-            assert decode_gossip(told[i].outbox[0].body).incarnation == incarnation
-            for sample, weight in pairs(told[i].lowered):
+        for i in range(first, end):
+            assert decode_gossip(put_out[i].outbox[0].body).incarnation == incarnation
+            for sample, weight in pairs(put_out[i].lowered):
                 assert weight < left[sample]
                 left[sample] = weight
             assert (
-                i > born or told[i].weights
+                i > first or put_out[i].weights
             )  # a keyframe: nothing goes on from what was forgotten
-            assert not told[i].weights or subscriber.apply(told[i].weights)
-        assert died == born or subscriber.weights is not None
+            assert not put_out[i].weights or subscriber.apply(put_out[i].weights)
+        assert end == first or subscriber.weights is not None
 
 
 def test_sums_over_visits_count_those_of_earlier_incarnations() -> None:
-    """Spectral: what an incarnation has told of its visits stays in everybody's sums, once."""
-    played = Rehearsal(mission(*MISSIONS["spectral"], "energy.points=60"))
+    """Spectral: the visits that an incarnation has sent stay in the sums of all robots, once."""
+    played = Rounds(mission(*MISSIONS["spectral"], "energy.points=60"))
     for moment in range(30):
         if moment in (6, 13):
-            played.lose_all("r2")
+            played.begin_incarnation("r2")
         played.round()
     scenario = played.scenario
     visits = np.zeros(16, dtype=np.int64)
-    for told in played.told.values():
-        for before, outputs in zip([None, *told], told, strict=False):
+    for put_out in played.outputs.values():
+        for before, outputs in zip([None, *put_out], put_out, strict=False):
             start_m = scenario.starts.poses_m[scenario.robot_ids.index(outputs.outbox[0].source)]
             pose = before.pose if before else Pose(*start_m)
             if outputs.spent:
                 visits += visit_at(pose.x_m, pose.y_m, rectangle_of(scenario.domain), 4)
-    # All but the last word of each of the dead, which died before anybody heard it: here nobody's.
+    # All but the last word of each of the dead, which end before anybody heard it: here nobody's.
     for name in scenario.robot_ids:
         assert played.replica(name).registers.total.tolist() == visits.tolist()
 
 
 def test_an_incarnation_that_takes_over_a_body_holds_for_a_step() -> None:
     """It cannot know when the body moved last; a full step could break the speed limit."""
-    played = Rehearsal(mission(*MISSIONS["spectral"], "energy.points=300"))
+    played = Rounds(mission(*MISSIONS["spectral"], "energy.points=300"))
     for _ in range(5):
         played.round()
     before = played.bodies["r1"].pose
-    played.lose_all("r1")
+    played.begin_incarnation("r1")
     played.round()
     held = played.bodies["r1"].pose
     played.round()
@@ -243,22 +245,22 @@ def test_an_incarnation_that_takes_over_a_body_holds_for_a_step() -> None:
 @pytest.mark.parametrize("merge", ["centralized", "centralized-min"])
 @pytest.mark.parametrize("disk", ["kept", "lost"])
 def test_robots_go_on_without_a_supervisor_and_come_back(merge: str, disk: str) -> None:
-    """Nine silent steps, then everybody is told; the first word of the supervisor ends it. Nothing is lost."""
-    played = Rehearsal(mission(*MISSIONS[merge], "energy.points=300"))
+    """Nine silent steps, then robots send to all in range; the first message of the supervisor ends it. Nothing is lost."""
+    played = Rounds(mission(*MISSIONS[merge], "energy.points=300"))
     for _ in range(10):
         played.round()
     for _ in range(20):
         played.round(absent=[SUPERVISOR])
     if disk == "lost":
-        played.lose_all(SUPERVISOR)
+        played.begin_incarnation(SUPERVISOR)
     for _ in range(90):
         played.round()
 
     for name in played.scenario.robot_ids:
-        alone = [outputs.outbox[0].target == EVERYBODY for outputs in played.told[name]]
+        alone = [outputs.outbox[0].target == EVERYBODY for outputs in played.outputs[name]]
         # It spoke last in round 10, which is heard in round 11; and first again in round 31.
         assert [i + 1 for i, one in enumerate(alone) if one] == list(range(20, 32))
-        assert played.told[name][-1].state is not State.EXPLORING
+        assert played.outputs[name][-1].state is not State.EXPLORING
     weights = [played.replica(name).weights.tolist() for name in played.machines]
     assert weights == [weights[0]] * 4
     if merge == "centralized":
@@ -268,17 +270,19 @@ def test_robots_go_on_without_a_supervisor_and_come_back(merge: str, disk: str) 
 
 def test_only_the_robot_out_of_the_supervisors_range_fails_over() -> None:
     """Failover is each robot's own: the others go on with the supervisor."""
-    played = Rehearsal(mission("coordination=centralized", "energy.points=300"))
+    played = Rounds(mission("coordination=centralized", "energy.points=300"))
     for _ in range(30):
-        played.round(lambda speaker, listener: {speaker, listener} != {SUPERVISOR, "r1"})
-    targets = {name: played.told[name][-1].outbox[0].target for name in played.scenario.robot_ids}
+        played.round(lambda source, receiver: {source, receiver} != {SUPERVISOR, "r1"})
+    targets = {
+        name: played.outputs[name][-1].outbox[0].target for name in played.scenario.robot_ids
+    }
 
     assert targets == {"r1": EVERYBODY, "r2": SUPERVISOR, "r3": SUPERVISOR}
 
 
 def test_a_version_vector_beyond_the_log_is_accepted_and_changes_nothing() -> None:
     """Whoever claims to hold more of a robot's log than it has written is heard, and no more."""
-    played = Rehearsal(mission())
+    played = Rounds(mission())
     for _ in range(4):
         played.round()
     news = GossipMessage(1, 9, 0.0, 0.0, bytes([99, 0, 0, 99, 0, 0]), b"", b"")
@@ -298,7 +302,7 @@ def test_a_version_vector_beyond_the_log_is_accepted_and_changes_nothing() -> No
 @given(skews=st.lists(SKEWS_NS | st.just(0), min_size=25, max_size=25))
 def test_wrong_clock_breaks_no_rule(*, name: str, skews: list[int]) -> None:
     """Ahead, behind, standing or back: no step beyond a period's way, nothing refused, all agree after."""
-    played = Rehearsal(mission(*MISSIONS[name], "vehicle.speed_m_s=20.0"))
+    played = Rounds(mission(*MISSIONS[name], "vehicle.speed_m_s=20.0"))
     stride_m = 20.0 * played.scenario.clock.period_s * (1 + 1e-9)
     for skew_ns in skews:
         before = played.bodies["r1"].pose
@@ -311,7 +315,7 @@ def test_wrong_clock_breaks_no_rule(*, name: str, skews: list[int]) -> None:
     weights = [played.replica(one).weights.tolist() for one in played.machines]
     assert weights == [weights[0]] * len(weights)
     for one in played.machines:
-        check_life(played, one)
+        check_incarnations(played, one)
 
 
 def test_samples_walk_a_bounded_way_at_once_and_never_back() -> None:
@@ -333,8 +337,8 @@ def test_samples_walk_a_bounded_way_at_once_and_never_back() -> None:
 # On maps, in the real world-sim.
 
 
-class Troubled:
-    """A participant that forgets all before some of its steps, and reads a clock that may be wrong."""
+class Faulty:
+    """A participant that loses its state before some of its steps, and reads a clock that may be wrong."""
 
     def __init__(
         self,
@@ -352,20 +356,22 @@ class Troubled:
         self._step, self._incarnation = 0, 0
 
     def step(self, inputs: Inputs, /) -> Outputs:
-        """The next step of whichever incarnation."""
+        """The next step of the present incarnation."""
         self._step += 1
         if self._step in self._deaths:
             self._incarnation += 1
-            look = inputs.observation
-            self.machine = self._build(Body(look.pose, look.step, 0, self._incarnation))
+            observation = inputs.observation
+            self.machine = self._build(
+                Body(observation.pose, observation.step, 0, self._incarnation)
+            )
         now_ns = inputs.now_ns + round(self._skew_s(self._step) * 1e9)
         outputs = self.machine.step(Inputs(now_ns, inputs.observation, inputs.inbox))
         first, last = self._silent
-        return outputs if not first <= self._step < last else without_words(outputs)
+        return outputs if not first <= self._step < last else without_messages(outputs)
 
 
-def without_words(outputs: Outputs) -> Outputs:
-    """What a participant would do whose radio is broken."""
+def without_messages(outputs: Outputs) -> Outputs:
+    """The outputs of a participant whose radio is broken."""
     return Outputs(
         step=outputs.step,
         pose=outputs.pose,
@@ -376,10 +382,10 @@ def without_words(outputs: Outputs) -> Outputs:
     )
 
 
-def explore(scenario: Scenario, troubled: dict[ParticipantId, Troubled]) -> list[Record]:
-    """A mission with some of its participants in trouble; nobody breaks a rule of the world."""
+def explore(scenario: Scenario, faulty: dict[ParticipantId, Faulty]) -> list[Record]:
+    """A mission with some faulty participants; no step breaks a rule of world-sim."""
     site, records = site_of(scenario), list[Record]()
-    machines = team(scenario, 1, site) | troubled
+    machines = team(scenario, 1, site) | faulty
     play(scenario, 1, site, [records.append], machines=machines)
     for batch in records:
         for step_record in batch.step_records if isinstance(batch, Batch) else ():
@@ -393,14 +399,14 @@ def explore(scenario: Scenario, troubled: dict[ParticipantId, Troubled]) -> list
 @pytest.mark.parametrize("planner", MAP_PLANNERS)
 @pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
 def test_map_is_explored_whatever_incarnations_begin(planner: str, coordination: str) -> None:
-    """Layers of the dead count on; whoever comes back gets targets and rests at last."""
+    """Layers of earlier incarnations count on; a robot that comes back gets targets and rests at last."""
     scenario = on_map(f"planner.name={planner}", f"coordination={coordination}", "limit_s=300")
     site = site_of(scenario)
-    troubled = {"r2": Troubled("r2", scenario, site, deaths=(5, 11))}
+    faulty = {"r2": Faulty("r2", scenario, site, deaths=(5, 11))}
     if scenario.centralized:
-        troubled[SUPERVISOR] = Troubled(SUPERVISOR, scenario, site, deaths=(8,), silent=(8, 25))
-    records = explore(scenario, troubled)
-    robot = troubled["r2"].machine
+        faulty[SUPERVISOR] = Faulty(SUPERVISOR, scenario, site, deaths=(8,), silent=(8, 25))
+    records = explore(scenario, faulty)
+    robot = faulty["r2"].machine
 
     assert isinstance(records[-1], Ending)
     assert records[-1].reason == "done"
@@ -429,7 +435,7 @@ def test_map_is_explored_by_a_clock_that_jumps_and_comes_back(
 
     whose = (*scenario.robot_ids[:1], *([SUPERVISOR] if scenario.centralized else []))
     for who in whose:
-        records = explore(scenario, {who: Troubled(who, scenario, site, skew_s=skew_s)})
+        records = explore(scenario, {who: Faulty(who, scenario, site, skew_s=skew_s)})
 
         assert isinstance(records[-1], Ending)
         assert records[-1].reason == "done"

@@ -29,6 +29,7 @@ from kantor_worldsim.world.maps import Ground
 from kantor_worldsim.world.starts import observable, starts_on
 from kantor_worldsim.world.world import WorldSetup
 from support.grounds import drawn
+from support.strategies import validate_all
 
 ROOMS = drawn(
     "####################",
@@ -64,7 +65,7 @@ def mission(*overrides: str) -> Scenario:
 
 
 class Played:
-    """A mission to its end, with what everybody then held."""
+    """A mission to its end, with the machines as they are then."""
 
     def __init__(
         self,
@@ -88,9 +89,15 @@ class Played:
         machines: dict[str, StateMachine] = dict(self.machines)
         if disturb is not None:
             disturb(machines)
-        self.reason = play(scenario, seed, site, [self.records.append], machines=machines)
+        observers = [self.records.append, self._validate]
+        self.reason = play(scenario, seed, site, observers, machines=machines)
         self.ground = ground
         self.observable = observable(ground, starts_m).ravel()
+
+    def _validate(self, _record: Record) -> None:
+        """Validate the machines after every 25th record."""
+        if len(self.records) % 25 == 0:
+            validate_all(self.machines.values())
 
     @property
     def batches(self) -> list[Batch]:
@@ -99,7 +106,7 @@ class Played:
 
     @property
     def ticks(self) -> int:
-        """Until everybody rested."""
+        """Until all robots rest."""
         ending = self.records[-1]
         assert isinstance(ending, Ending)
         return ending.now_ns // 1_000_000_000
@@ -109,7 +116,7 @@ class Played:
         return np.asarray(self.machines[name]._fused_map.cells)
 
     def assert_explored(self) -> None:
-        """Everybody rests and knows everything that can be seen, as it is."""
+        """Every robot rests and knows all observable cells, as they are."""
         truth = self.ground.cells.ravel()
         assert self.reason == "done"
         for name in ("r1", "r2", "r3"):

@@ -1,7 +1,7 @@
-"""Transcripts of robots: what they were given, line by line, and what they did about it.
+"""Transcripts of robots: commands, line by line, and the outputs that follow.
 
 A line that begins with `>` is a command, the lines below it are what follows from it. After a wanted
-change of behaviour run `pytest tests/agent/test_transcripts.py --rewrite` and read the difference: commit
+change of behaviour run `pytest tests/agent/robots/test_transcripts.py --rewrite` and read the difference: commit
 it only if you understand what caused it.
 
     > fleet N KEY=VALUE …     N robots that start at the origin, with overrides of the scenario
@@ -9,7 +9,7 @@ it only if you understand what caused it.
     > step NAME [SECONDS]     the robot steps, a period (or that long) after its step before
     > deliver FROM TO [k]     its k-th envelope (by default the last) goes into the other's inbox
     > garble FROM TO          the last envelope arrives cut in half
-    > shove NAME X,Y          the world says that the robot is elsewhere
+    > shove NAME X,Y          world-sim reports that the robot is elsewhere
 """
 
 from pathlib import Path
@@ -40,8 +40,8 @@ density = [{ mean_m = [0, 0], variance_m2 = [1, 1] }]
 """
 
 
-class Stage:
-    """Robots under the pen of a transcript."""
+class Team:
+    """Robots that follow the commands of a transcript."""
 
     def __init__(self) -> None:
         self.scenario: Scenario
@@ -53,10 +53,10 @@ class Stage:
         self.sent: dict[str, list[Envelope]] = {}
 
     def run(self, line: str) -> list[str]:
-        """What follows from a command."""
+        """The lines that follow from a command."""
         verb, *words = line.split()
-        told = getattr(self, verb)(*words)
-        return [] if told is None else list(told)
+        lines = getattr(self, verb)(*words)
+        return [] if lines is None else list(lines)
 
     def fleet(self, count: str, *overrides: str) -> None:
         """> fleet"""
@@ -83,7 +83,7 @@ class Stage:
         outputs = self.robots[name].step(Inputs(self.now_ns[name], self.observed[name], inbox))
         self.observed[name] = Observation(outputs.step, outputs.pose)
         self.sent[name] += outputs.outbox
-        return self._told(outputs)
+        return self._lines(outputs)
 
     def deliver(self, source: str, target: str, which: str = "") -> None:
         """> deliver"""
@@ -101,7 +101,7 @@ class Stage:
         x, y = (float(v) for v in place.split(","))
         self.observed[name] = Observation(self.observed[name].step, Pose(x, y))
 
-    def _told(self, outputs: Outputs) -> list[str]:
+    def _lines(self, outputs: Outputs) -> list[str]:
         pose, goal = outputs.pose, outputs.goal
         lines = [
             f"step {outputs.step} at ({pose.x_m:.4g}, {pose.y_m:.4g}), "
@@ -112,7 +112,7 @@ class Stage:
         for label, packed in (("spent", outputs.spent), ("left", outputs.lowered)):
             if packed:
                 lines.append(f"{label} {self._pairs(packed)}")
-        lines += [self._says(envelope) for envelope in outputs.outbox]
+        lines += [self._message(envelope) for envelope in outputs.outbox]
         return lines
 
     def _pairs(self, packed: bytes) -> str:
@@ -120,7 +120,7 @@ class Stage:
         assert pairs is not None
         return " ".join(f"{j}:{u}" for j, u in zip(*map(np.ndarray.tolist, pairs), strict=True))
 
-    def _says(self, envelope: Envelope) -> str:
+    def _message(self, envelope: Envelope) -> str:
         news = decode_gossip(envelope.body)
         logs = read_logs(news.logs)
         version_vector = read_version_vector(news.version_vector, len(self.scenario.roster))
@@ -132,22 +132,22 @@ class Stage:
 
     def _registers(self, news: GossipMessage) -> str:
         """Visits by origin, for those that the message has: the first number counts them."""
-        width, told = self.scenario.register_width, []
+        width, listed = self.scenario.register_width, []
         for place, name in enumerate(self.scenario.roster if width else ()):
             found = read_register(news.registers, len(self.scenario.roster), width, place)
             assert found is not None
             stamp, numbers = found
-            told += [f" {name}#{stamp}={numbers[0] // VISIT}"] if stamp else []
-        return f", registers{''.join(told) or ' none'}" if width else ""
+            listed += [f" {name}#{stamp}={numbers[0] // VISIT}"] if stamp else []
+        return f", registers{''.join(listed) or ' none'}" if width else ""
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.txt")), ids=lambda path: path.stem)
 def test_transcript(path: Path, request: pytest.FixtureRequest) -> None:
     """Robots do what the transcript says, to the letter."""
-    simulation, lines = Stage(), []
+    team, lines = Team(), []
     for line in path.read_text(encoding="utf-8").splitlines():
         if line.startswith("> "):
-            lines += [line, *(f"  {told}" for told in simulation.run(line[2:]))]
+            lines += [line, *(f"  {line_out}" for line_out in team.run(line[2:]))]
         elif not line.startswith("  "):
             lines.append(line)
     text = "\n".join(lines) + "\n"

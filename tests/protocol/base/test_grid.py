@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.base.grid import FREE, NOWHERE, Frame, free_way
+from kantor_protocol.base.grid import FREE, NOWHERE, Frame, free_way, neighbour
 from support.grounds import Place, drawn, places
 from support.strategies import examples
 
@@ -31,6 +31,17 @@ def test_the_middle_of_a_cell_is_in_it(rows: int, columns: int, data: st.DataObj
     cell = data.draw(st.integers(0, frame.cells - 1))
 
     assert frame.cell_of(*frame.centre_of(cell)) == cell
+
+
+@given(rows=st.integers(1, 9), columns=st.integers(1, 9))
+def test_neighbours_are_the_cells_at_a_cells_width(rows: int, columns: int) -> None:
+    """Below, left, right, above; NOWHERE beyond the border."""
+    frame = Frame(1.0, (0.0, 0.0), rows, columns)
+    for cell in range(frame.cells):
+        x, y = frame.centre_of(cell)
+        expected = [frame.cell_of(x + u, y + v) for u, v in ((0, -1), (-1, 0), (1, 0), (0, 1))]
+
+        assert [neighbour(cell, side, columns, frame.cells) for side in range(4)] == expected
 
 
 CORNER = drawn(

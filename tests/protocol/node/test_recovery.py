@@ -74,7 +74,7 @@ def test_step_is_done_once(times_ns: list[int], again: int) -> None:
 
     assert answers == [first[-1]] * again
     assert reborn.step(last).refused == first[-1]
-    assert reborn.unheard == (last, reborn.step(last))
+    assert reborn.last_step == (last, reborn.step(last))
     assert len(wal.read() or ()) == 2
     assert told(life, [7], len(times_ns)) == told(Rememberer(HOME), [*times_ns, 7])[-1:]
 
@@ -99,10 +99,10 @@ class FullDisk(InMemoryLog):
 
     full = False
 
-    def note(self, inputs: bytes) -> None:
+    def append(self, inputs: bytes) -> None:
         if self.full:
             raise OSError("full")
-        super().note(inputs)
+        super().append(inputs)
 
 
 def test_what_cannot_be_noted_is_not_done() -> None:
@@ -137,7 +137,7 @@ def test_who_lacks_a_step_that_others_know_of_is_another(
     damage(wal)
     reborn = RecoverableNode(Rememberer, wal, at(3))
 
-    assert (reborn.incarnation, reborn.step_count, reborn.unheard) == (1, 3, None)
+    assert (reborn.incarnation, reborn.step_count, reborn.last_step) == (1, 3, None)
     assert told(reborn, [4, 5], 3) == told(Rememberer(at(3, incarnation=1)), [4, 5], 3)
 
 

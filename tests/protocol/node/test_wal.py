@@ -34,9 +34,9 @@ PAGES = [entry(step) for step in range(3, 9)]
 def written(path: Path, entries: list[bytes], run: str = "run") -> None:
     """A diary that somebody left."""
     wal = WalFile(path, run)
-    wal.begin(BIRTH)
+    wal.reset(BIRTH)
     for content in entries:
-        wal.note(content)
+        wal.append(content)
     wal.close()
 
 
@@ -64,7 +64,7 @@ def test_a_diary_is_continued_where_it_ends(tmp_path: Path) -> None:
     again = WalFile(path, "run")
     again.read()
     again.skew_ns = -7
-    again.note(PAGES[2])
+    again.append(PAGES[2])
     again.close()
 
     last = WalFile(path, "run")
@@ -122,7 +122,7 @@ def test_a_cut_diary_is_continued_after_its_last_sound_page(tmp_path: Path) -> N
         file.truncate(path.stat().st_size - 3)
     again = WalFile(path, "run")
     again.read()
-    again.note(PAGES[4])
+    again.append(PAGES[4])
     again.close()
 
     assert found(path) == WalContents(BIRTH, [*PAGES[:2], PAGES[4]])
@@ -178,13 +178,13 @@ def test_a_full_disk_takes_no_page_and_no_half_of_one(tmp_path: Path, spare: int
     """The page is refused with an error, and fits when there is room again."""
     path = tmp_path / "r1.diary"
     wal = WalFile(path, "run")
-    wal.begin(BIRTH)
-    wal.note(PAGES[0])
+    wal.reset(BIRTH)
+    wal.append(PAGES[0])
     with room_for(path.stat().st_size + spare), pytest.raises(OSError, match="File too large"):
-        wal.note(PAGES[1])
+        wal.append(PAGES[1])
     assert found_beside(path) == PAGES[:1]
-    wal.note(PAGES[1])
-    wal.note(PAGES[2])
+    wal.append(PAGES[1])
+    wal.append(PAGES[2])
     wal.close()
 
     assert found(path) == WalContents(BIRTH, PAGES[:3])
@@ -195,7 +195,7 @@ def test_a_full_disk_keeps_the_old_diary_when_a_new_one_does_not_fit(tmp_path: P
     written(path, PAGES[:1])
     wal = WalFile(path, "run")
     with room_for(20), pytest.raises(OSError, match="File too large"):
-        wal.begin(BIRTH)
+        wal.reset(BIRTH)
 
     assert found(path) == WalContents(BIRTH, PAGES[:1])
     assert [file.name for file in tmp_path.iterdir()] == ["r1.diary"]

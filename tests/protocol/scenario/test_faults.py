@@ -236,7 +236,7 @@ REFUSED = {
     ),
     "empty group": (
         {"kind": "partition", "shape": "groups", "groups": [["r1"], []]},
-        "faults[0].groups[1]: nobody is in it; name somebody",
+        "faults[0].groups[1]: empty; name a participant",
     ),
     "all together": (
         {"kind": "partition", "shape": "groups", "groups": [["r1", "r2", "r3"]]},
@@ -321,7 +321,7 @@ REFUSED = {
     ),
     "everybody late": (
         {"kind": "late", "who": ["r3", "r1", "r2"], "until_s": 2},
-        "faults[0].who: nobody would be there at the start; leave out a robot",
+        "faults[0].who: no robot would be there at the start; leave one out",
     ),
     "slow as ever": (
         {"kind": "slow", "who": ["r1"], "every": 1},
@@ -448,7 +448,7 @@ TOGETHER = {
     ),
     "impostor of the dead": (
         (process("impostor", "r1", 2), kill("r1", 1, 3)),
-        "faults[1]: r1 is away when its impostor comes, who would be let in, see faults[0]; move it",
+        "faults[1]: r1 is away when its impostor joins, which would be admitted, see faults[0]; move it",
     ),
 }
 

@@ -80,7 +80,7 @@ def test_only_whom_the_register_names_is_let_in(
 ) -> None:
     """By its very certificate, and only if it takes part; else there is an objection of one line."""
     for shown in (name, *router.revoked, *(member.name for member in router.members.values())):
-        objection = router.objection(shown, wanted)
+        objection = router.refusal_reason(shown, wanted)
         named = [
             user for user in wanted if user in router.members and router.members[user].name == shown
         ]
@@ -91,7 +91,7 @@ def test_only_whom_the_register_names_is_let_in(
 @given(routers())
 @examples(100)
 def test_a_site_does_not_speak_for_who_is_revoked(router: Certificate) -> None:
-    behind = router.behind()
+    behind = router.robots_by_site()
     assert set(behind) == set(router.sites)
     for site, there in behind.items():
         assert set(there) == set(router.sites[site]) & set(router.members)

@@ -45,7 +45,7 @@ def test_whatever_is_said_no_more_is_taken_than_was_asked_for_and_earned(
     for pause_s, size, is_asked in said:
         now_s += pause_s
         if is_asked:
-            bucket.ask()
+            bucket.grant_reply()
             asked += 1
         if bucket.admit(size, now_s):
             taken, taken_bytes = taken + 1, taken_bytes + size
@@ -55,7 +55,7 @@ def test_whatever_is_said_no_more_is_taken_than_was_asked_for_and_earned(
         assert taken <= BURST_MESSAGES + asked + earned + 1e-6
         assert taken_bytes <= BURST_BYTES + asked * MESSAGE_BYTES_MAX + earned_bytes + 1e-3
         assert bucket.excess == excess
-        assert bucket.floods == (excess.messages > 0)
+        assert bucket.exceeded == (excess.messages > 0)
 
 
 @examples(100)
@@ -66,7 +66,7 @@ def test_an_answer_is_always_taken(sizes: list[int], flood: int) -> None:
     for _ in range(flood):
         bucket.admit(MESSAGE_BYTES_MAX, 0.0)
     for size in sizes:
-        bucket.ask()
+        bucket.grant_reply()
         assert bucket.admit(size, 0.0)
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from kantor_protocol.transport.tls import Refusals, logged_reason
+from kantor_protocol.transport.tls import RefusalLog, logged_reason
 
 START = "\x1b[2m2026-11-23T01:03:57.322606Z\x1b[0m \x1b[33m WARN\x1b[0m acc-0 ThreadId(04) "
 START += "\x1b[2mzenoh_link_tls::unicast\x1b[0m\x1b[2m:\x1b[0m "
@@ -42,9 +42,9 @@ def test_a_thousand_refusals_are_a_few_lines() -> None:
     """At once, then at most every ten seconds for each reason, with how many; none is forgotten."""
     said: list[str] = []
     times = iter([i * 0.025 for i in range(1000)])  # 25 s
-    refusals = Refusals(said.append, lambda: next(times))
+    refusals = RefusalLog(said.append, lambda: next(times))
     for i in range(1000):
-        refusals.tell("odd" if i % 2 else "even")
+        refusals.report("odd" if i % 2 else "even")
     refusals.close()
 
     assert said[:2] == ["even", "odd"]

@@ -35,9 +35,9 @@ class Bus:
         self.now_s += timeout_s
         return None
 
-    def send(self, name: str, payload: bytes, *, patiently: bool) -> None:
+    def send(self, name: str, payload: bytes, *, blocking: bool) -> None:
         """Note it."""
-        assert patiently
+        assert blocking
         self.sent.append((name, payload))
 
 

@@ -16,6 +16,7 @@ from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.liveness import LivenessChecker, settling_ns
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.records import Batch, Ending, Record, StepRecord
 from kantor_worldsim.world.world import WorldSetup
 from support.strategies import mission
@@ -53,8 +54,9 @@ def rested(*overrides: str, seed: int = 1) -> list[Record]:
 
 def judged(records: Sequence[Record]) -> LivenessChecker:
     checker = LivenessChecker()
+    pipeline = Pipeline(checker)
     for record in records:
-        checker.observe(record)
+        pipeline.observe(record)
     return checker
 
 

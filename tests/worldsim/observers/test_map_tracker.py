@@ -27,7 +27,8 @@ from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
 from kantor_worldsim.observers.metrics.map_tracker_kernels import AS_SENT, KIND
-from kantor_worldsim.record.columnar import ColumnarDecoder
+from kantor_worldsim.observers.metrics.mapping import MapMetrics
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.records import Batch, Opening, Record, StepRecord
 from kantor_worldsim.world.maps import Ground, parts
 from support.grounds import grounds
@@ -46,8 +47,9 @@ RUNS = {
 
 def surveyed(records: Records) -> MapTracker:
     map_tracker = MapTracker()
+    pipeline = Pipeline(map_tracker)
     for record in records:
-        map_tracker.observe(record)
+        pipeline.observe(record)
     return map_tracker
 
 
@@ -220,19 +222,17 @@ def test_bumps_are_counted_where_they_happen() -> None:
     assert surveyed(records).bumps == [(bumped.pose.x_m, bumped.pose.y_m)]
 
 
-def test_referees_may_share_a_survey() -> None:
-    """A record that is handed on twice counts once."""
-    decoder = ColumnarDecoder()
-    map_tracker = MapTracker(decoder)
+def test_metrics_keep_the_tracker_up_to_date() -> None:
+    """Each record counts once."""
+    metrics = MapMetrics()
+    pipeline = Pipeline(metrics)
     for record in explored():
-        decoder.read(record)
-        map_tracker.observe(record)
-        map_tracker.observe(record)
+        pipeline.observe(record)
 
-    once = surveyed(explored())
-    assert map_tracker.seen == once.seen
-    assert map_tracker.log_bytes == once.log_bytes
-    assert map_tracker.ways_m == once.ways_m
+    once, kept = surveyed(explored()), metrics.map_tracker
+    assert kept.seen == once.seen
+    assert kept.log_bytes == once.log_bytes
+    assert kept.ways_m == once.ways_m
 
 
 @pytest.mark.parametrize("radio", [(), ("radio.range_m=0.01", "radio.beacon=state")])

@@ -23,6 +23,7 @@ from kantor_protocol.wire.messages import (
 from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_worldsim.observers.checkers.checker import Checker, check
 from kantor_worldsim.observers.checkers.mapping import MapChecker
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
 from support.checkers import listed, rules
 from support.grounds import drawn
@@ -445,6 +446,7 @@ def test_checker_stands_what_nobody_can_read() -> None:
     records = explored()
     rng = np.random.default_rng(3)
     checker = Checker()
+    pipeline = Pipeline(checker)
     for record in records:
         told = record
         if isinstance(record, Batch):
@@ -459,7 +461,7 @@ def test_checker_stands_what_nobody_can_read() -> None:
                 for step_record in record.step_records
             )
             told = msgspec.structs.replace(record, step_records=step_records)
-        checker.observe(told)
+        pipeline.observe(told)
 
     assert checker.count > 0
 

@@ -12,10 +12,11 @@ import pytest
 from kantor_fleet.execution.in_process_team import play
 from kantor_protocol.base.grid import Frame
 from kantor_protocol.base.machine import Observation, Outputs, Pose, State
+from kantor_worldsim.observers.checkers.checker import Checker
 from kantor_worldsim.observers.metrics.density import DensityMetrics
-from kantor_worldsim.observers.metrics.map_tracker import MapTracker
 from kantor_worldsim.observers.metrics.mapping import SHAPES, MapMetrics, MapRow
 from kantor_worldsim.observers.metrics.result import MapResult, Result
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.observers.recording import Recording, metrics_of
 from kantor_worldsim.radio.channel import DROPPED
 from kantor_worldsim.record.records import Batch, Ending, Opening, Record, StepRecord, opening_of
@@ -29,8 +30,9 @@ Records = Sequence[Record]
 
 def measured(records: Records) -> MapMetrics:
     metrics = MapMetrics()
+    pipeline = Pipeline(metrics)
     for record in records:
-        metrics.observe(record)
+        pipeline.observe(record)
     return metrics
 
 
@@ -252,7 +254,8 @@ class Errand:
     def __init__(self) -> None:
         self.scenario = on_map("robots.count=1", "starts.poses_m=[[1.5, 8.5]]", "metrics.every=1")
         self.metrics = MapMetrics()
-        self.metrics.observe(opening_of(self.scenario, 1, site_of(self.scenario), {"r1": ()}))
+        self.pipeline = Pipeline(self.metrics)
+        self.pipeline.observe(opening_of(self.scenario, 1, site_of(self.scenario), {"r1": ()}))
         self.tick = 0
         self.pose = Pose(1.5, 8.5)
 
@@ -270,10 +273,10 @@ class Errand:
         outputs = Outputs(self.tick, self.pose, goal=goal_m, state=state)
         verdict = StepVerdict(self.pose, bumped=bumped)
         step_record = StepRecord("r1", self.tick * PERIOD_NS, look, (), outputs, verdict)
-        self.metrics.observe(Batch(self.tick * PERIOD_NS, (step_record,), (), 0))
+        self.pipeline.observe(Batch(self.tick * PERIOD_NS, (step_record,), (), 0))
 
     def end(self) -> MapResult:
-        self.metrics.observe(Ending(self.tick * PERIOD_NS, "limit"))
+        self.pipeline.observe(Ending(self.tick * PERIOD_NS, "limit"))
         return map_of(self.metrics)
 
 
@@ -372,16 +375,20 @@ def test_run_folder_has_rows_and_result(tmp_path: Path) -> None:
     assert result.map == map_of(measured(explored()))
 
 
-def test_survey_may_be_shared_only_with_who_comes_later() -> None:
-    """The measures are the same with a survey of their own."""
-    map_tracker = MapTracker()
-    shared, own = MapMetrics(map_tracker=map_tracker), MapMetrics()
+def test_checker_that_reads_the_tracker_of_metrics_finds_what_one_with_its_own_finds() -> None:
+    """Metrics come first and keep the tracker: rows and violations are the same."""
+    metrics, alone = MapMetrics(), MapMetrics()
+    reading, own = Checker(metrics.map_tracker), Checker()
+    both, checked = Pipeline(metrics, reading), Pipeline(own)
+    measured_alone = Pipeline(alone)
     for record in explored():
-        shared.observe(record)
-        map_tracker.observe(record)
-        own.observe(record)
+        both.observe(record)
+        checked.observe(record)
+        measured_alone.observe(record)
 
-    assert shared.rows == own.rows
+    assert metrics.rows == alone.rows
+    assert reading.complaints == own.complaints == []
+    assert reading.count == own.count
 
 
 def test_opening_alone_can_be_measured() -> None:

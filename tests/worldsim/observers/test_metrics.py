@@ -31,6 +31,7 @@ from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.state import FORGED_FIRST
 from kantor_worldsim.observers.metrics.density import DensityMetrics, DensityRow
 from kantor_worldsim.observers.metrics.result import Rejoining, Result
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.radio.channel import DROPPED, DeliveryDecision
 from kantor_worldsim.record.records import (
@@ -56,8 +57,9 @@ def result_of(metrics: DensityMetrics) -> Result:
 def measured(records: Iterable[Record]) -> DensityMetrics:
     """What records are measured by."""
     metrics = DensityMetrics()
+    pipeline = Pipeline(metrics)
     for record in records:
-        metrics.observe(record)
+        pipeline.observe(record)
     return metrics
 
 
@@ -94,13 +96,14 @@ class Line:
             np.array(SAMPLES_M), np.zeros((0, 2)), np.array([[0.0, 0.0], [40.0, 0.0]])
         )
         self.metrics = DensityMetrics()
-        self.metrics.observe(opening_of(scenario, 1, site, {"r1": (), "r2": ()}))
+        self.pipeline = Pipeline(self.metrics)
+        self.pipeline.observe(opening_of(scenario, 1, site, {"r1": (), "r2": ()}))
         self.tick = 0
 
     def play(self, *step_records: StepRecord) -> None:
         """One period."""
         self.tick += 1
-        self.metrics.observe(Batch(self.tick * PERIOD_NS, step_records, (), 0))
+        self.pipeline.observe(Batch(self.tick * PERIOD_NS, step_records, (), 0))
 
     def step_record(
         self,
@@ -122,7 +125,7 @@ class Line:
         )
 
     def rows(self) -> list[DensityRow]:
-        self.metrics.observe(Ending(self.tick * PERIOD_NS, "done"))
+        self.pipeline.observe(Ending(self.tick * PERIOD_NS, "done"))
         return self.metrics.rows
 
 
@@ -407,12 +410,12 @@ def test_counts_are_those_of_the_record(played: Play) -> None:
 def test_absences_and_refused_messages_are_counted() -> None:
     """Who gave no outputs, and what robots and world-sim turned away."""
     line = Line()
-    line.metrics.observe(Batch(PERIOD_NS, (), (), 0, absent=("r1", "r2")))
+    line.pipeline.observe(Batch(PERIOD_NS, (), (), 0, absent=("r1", "r2")))
     pose = Pose(0.0, 0.0)
     refusing = Outputs(1, pose, refused=3)
     step_record = StepRecord("r1", PERIOD_NS, Observation(0, pose), (), refusing, StepVerdict(pose))
-    line.metrics.observe(Batch(2 * PERIOD_NS, (step_record,), (), 0))
-    line.metrics.observe(Batch(3 * PERIOD_NS, (step_record,), (), 0))
+    line.pipeline.observe(Batch(2 * PERIOD_NS, (step_record,), (), 0))
+    line.pipeline.observe(Batch(3 * PERIOD_NS, (step_record,), (), 0))
     line.rows()
 
     assert result_of(line.metrics).absences == 2
@@ -492,10 +495,11 @@ def test_view_of_a_new_incarnation_is_full_again(played: Play) -> None:
     """What it had learnt counts no more, until it learns it again."""
     records = played(*STRUCK, "merge=min", "claims=false")
     metrics = DensityMetrics()
+    pipeline = Pipeline(metrics)
     before = after = 0
     for record in records:
         before = int(metrics._tally.views[1].sum()) if isinstance(record, ProcessEvent) else before
-        metrics.observe(record)
+        pipeline.observe(record)
         if isinstance(record, ProcessEvent) and record.incarnation:
             after = int(metrics._tally.views[1].sum())
             break
@@ -513,7 +517,7 @@ def test_unfinished_team_has_no_finishing_tick() -> None:
         step_record = StepRecord(
             name, PERIOD_NS, Observation(0, pose), (), outputs, StepVerdict(pose)
         )
-        line.metrics.observe(Batch(PERIOD_NS, (step_record,), (), 0))
+        line.pipeline.observe(Batch(PERIOD_NS, (step_record,), (), 0))
     line.rows()
 
     assert result_of(line.metrics).finished_tick is None
@@ -530,7 +534,7 @@ def test_bytes_are_payload_on_the_bus() -> None:
         step_record = StepRecord(
             name, PERIOD_NS, Observation(0, pose), (), outputs, StepVerdict(pose)
         )
-        line.metrics.observe(Batch(PERIOD_NS, (step_record,), (), 0))
+        line.pipeline.observe(Batch(PERIOD_NS, (step_record,), (), 0))
     line.rows()
     wire = result_of(line.metrics).bytes_per_robot_tick
 
@@ -584,7 +588,7 @@ def test_glance_tells_the_rate_of_deliveries() -> None:
     line = Line()
     decisions = (DeliveryDecision("r1", 1, "r2", 0), DeliveryDecision("r2", 1, "r1", DROPPED))
     for tick in range(1, 31):
-        line.metrics.observe(Batch(tick * PERIOD_NS, (), decisions, 0))
+        line.pipeline.observe(Batch(tick * PERIOD_NS, (), decisions, 0))
     snapshot = line.metrics.snapshot()
 
     assert snapshot.messages_per_s == pytest.approx(10.0)

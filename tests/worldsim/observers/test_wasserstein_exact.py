@@ -15,6 +15,7 @@ from kantor_protocol.scenario.schema import MAP_PLANNERS, PlannerName
 from kantor_worldsim.observers.checkers.checker import Checker
 from kantor_worldsim.observers.metrics.density import DensityMetrics, DensityRow
 from kantor_worldsim.observers.metrics.wasserstein_exact import w1
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.records import Record
 from support.strategies import SEEDS, examples
 
@@ -60,8 +61,9 @@ def test_on_a_line_it_is_the_area_between_the_distributions(seed: int, n: int, m
 def judged(records: tuple[Record, ...], every: int) -> tuple[list[DensityRow], Checker]:
     """The rows of a record with exact distances, and a checker that has seen them."""
     metrics, checker = DensityMetrics(every), Checker()
+    pipeline = Pipeline(metrics)
     for record in records:
-        metrics.observe(record)
+        pipeline.observe(record)
     for row in metrics.rows:
         checker.observe_row(row)
     return metrics.rows, checker
@@ -103,8 +105,9 @@ def test_it_is_computed_when_asked_for(played: Play) -> None:
 
     def ticks(every: int | None) -> list[int]:
         metrics = DensityMetrics(every)
+        pipeline = Pipeline(metrics)
         for record in records:
-            metrics.observe(record)
+            pipeline.observe(record)
         return [row.tick for row in metrics.rows if row.w1_exact is not None]
 
     last = judged(records, every=0)[0][-1].tick

@@ -34,6 +34,7 @@ from kantor_protocol.scenario.load import from_tree
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.observers.metrics.result import FaultCounts, Result
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.observers.recording import metrics_of
 from kantor_worldsim.radio.channel import DROPPED, Channel, DeliveryDecision, Sent
 from kantor_worldsim.radio.fault_kernels import in_burst
@@ -721,9 +722,9 @@ def result_of(records: Sequence[Record]) -> Result:
     assert isinstance(first, Opening)
     metrics = metrics_of(first.scenario)
     journal = Journal()
+    pipeline = Pipeline(journal, metrics)
     for record in records:
-        metrics.observe(record)
-        journal.append(record)
+        pipeline.observe(record)
     return metrics.result(
         exchange="in-process",
         digest=journal.digest.hex,

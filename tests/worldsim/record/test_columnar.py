@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 from kantor_protocol.base.machine import SUPERVISOR, Envelope, Observation, Outputs, Pose
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.wire.messages import GossipMessage, RefusedError, decode_gossip, encode
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.radio.channel import DROPPED, DeliveryDecision
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import (
     ColumnarBatch,
     ColumnarDecoder,
+    DecodedRecord,
     head_of,
     parts_of_gossip,
     skip,
@@ -142,14 +144,17 @@ def test_tables_hold_what_the_record_holds(played: Play, coordination: str) -> N
     records = played(*LOSSY, f"coordination={coordination}")
     opening, decoder, given = records[0], ColumnarDecoder(), ColumnarDecoder()
     assert isinstance(opening, Opening)
-    decoder.read(opening)
-    given.read(opening)
+    decoder.decode(opening)
+    given.decode(opening)
     for record in records:
         if isinstance(record, Batch):
             told = plain(record, opening.scenario.roster, 60)
-            assert tabled(ColumnarBatch(*decoder.read(record))) == told
+            assert tabled(ColumnarBatch(*decoder.decode(record).columns)) == told
             payload = encode_record(record)
-            assert tabled(ColumnarBatch(*given.read(decode_record(payload), payload))) == told
+            assert (
+                tabled(ColumnarBatch(*given.decode(decode_record(payload), payload).columns))
+                == told
+            )
 
 
 ODD = Batch(
@@ -191,9 +196,9 @@ ODD = Batch(
 def test_odd_values_are_read_too(played: Play) -> None:
     """Whatever a record may hold, the tables hold it."""
     decoder = ColumnarDecoder()
-    decoder.read(played()[0])
+    decoder.decode(played()[0])
 
-    assert tabled(ColumnarBatch(*decoder.read(ODD))) == plain(ODD, ROSTER, 60)
+    assert tabled(ColumnarBatch(*decoder.decode(ODD).columns)) == plain(ODD, ROSTER, 60)
 
 
 def test_tables_grow_with_what_comes(played: Play) -> None:
@@ -207,19 +212,30 @@ def test_tables_grow_with_what_comes(played: Play) -> None:
     )
     batch = Batch(1, (step_record,), many, 0)
     decoder = ColumnarDecoder()
-    decoder.read(played()[0])
+    decoder.decode(played()[0])
 
-    assert tabled(ColumnarBatch(*decoder.read(batch))) == plain(batch, ROSTER, 60)
+    assert tabled(ColumnarBatch(*decoder.decode(batch).columns)) == plain(batch, ROSTER, 60)
 
 
-def test_record_is_read_once_for_all(played: Play) -> None:
-    """Referees that share a reader share its work."""
+def test_record_is_decoded_once_for_all_observers_in_order(played: Play) -> None:
+    """Every observer is given the same object, the first observer first, and its bytes are the record's."""
+    calls: list[tuple[str, DecodedRecord]] = []
+
+    class Noting:
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def observe(self, decoded: DecodedRecord, /) -> None:
+            calls.append((self.name, decoded))
+
     records = played()
-    decoder = ColumnarDecoder()
-    decoder.read(records[0])
+    pipeline = Pipeline(Noting("first"), Noting("second"))
+    for record in records[:3]:
+        assert pipeline.observe(record).payload == encode_record(record)
 
-    assert decoder.read(records[1]) is decoder.read(records[1])
-    assert decoder.read(records[1])[0] == encode_record(records[1])
+    assert [name for name, _ in calls] == 3 * ["first", "second"]
+    assert all(calls[i][1] is calls[i + 1][1] for i in range(0, 6, 2))
+    assert [decoded.record for _, decoded in calls[::2]] == list(records[:3])
 
 
 # Msgpack, beside the library.
@@ -342,7 +358,7 @@ def test_odd_news(tree: Any, *, single: bool) -> None:
 def test_record_holds_more_fields_some_day(played: Play) -> None:
     """Fields that are added at the end are passed over."""
     decoder = ColumnarDecoder()
-    decoder.read(played()[0])
+    decoder.decode(played()[0])
     tree = msgspec.msgpack.decode(encode_record(ODD))
     tree.append({"new": 1})
     for step_record in tree[2]:
@@ -353,7 +369,7 @@ def test_record_holds_more_fields_some_day(played: Play) -> None:
                 part.append(b"new")
     for decision in tree[3]:
         decision.append(1.0)
-    sizes, *tables = (table.copy() for table in ColumnarBatch(*decoder.read(ODD))[1:])
+    sizes, *tables = (table.copy() for table in ColumnarBatch(*decoder.decode(ODD).columns)[1:])
     told = plain(ODD, ROSTER, 60)
     payload = msgspec.msgpack.encode(tree)
     bits = tables[1].view(np.int64)

@@ -18,6 +18,7 @@ from kantor_fleet.execution.in_process_team import play
 from kantor_protocol.scenario.load import load
 from kantor_worldsim.observers.metrics.density import DensityMetrics
 from kantor_worldsim.observers.metrics.result import Result
+from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.record.journal import (
     METRICS_TOPIC,
@@ -49,14 +50,10 @@ LONG = ("robots.count=3", "energy.points=9000", "samples.count=4000", "metrics.e
 
 def write(records: tuple[Record, ...], path: Path) -> Journal:
     """A journal with records and the metrics that follow from them."""
-    journal, metrics = Journal(path), DensityMetrics()
-    written = 0
+    journal = Journal(path)
+    pipeline = Pipeline(journal, DensityMetrics(on_row=journal.append_row))
     for record in records:
-        journal.append(record)
-        metrics.observe(record)
-        for row in metrics.rows[written:]:
-            journal.append_row(row)
-        written = len(metrics.rows)
+        pipeline.observe(record)
     journal.close()
     return journal
 

@@ -39,7 +39,7 @@ from kantor_worldsim.record.records import (
 )
 from kantor_worldsim.world.world import World, WorldSetup
 
-Observer = Callable[[Record], None]
+Observer = Callable[[Record], object]
 """Receives each record as it is emitted."""
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 import msgspec
 
 from kantor_protocol.base.machine import WORLD_SIM, Body, ParticipantId
-from kantor_protocol.transport.events import Flooded, Heard, Joined, Left
+from kantor_protocol.transport.events import Flooded, Joined, Left, Received
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import LEASE_MS, BusError
 from kantor_protocol.wire.messages import (
@@ -158,7 +158,7 @@ class Lobby:
                 self._join(event)
             case Left():
                 self._leave(event)
-            case Heard():
+            case Received():
                 return self._receive(event)
             case Flooded():
                 self._say(f"{event.name} floods the bus; what is beyond its quota is not taken in")
@@ -181,7 +181,7 @@ class Lobby:
         waiting = set(self._config.scenario.roster)
         while waiting:
             for name in sorted(filter(self.is_present, waiting)):
-                self._host.send(name, encode(Stop(VERSION, reason)), patiently=True)
+                self._host.send(name, encode(Stop(VERSION, reason)), blocking=True)
                 waiting.discard(name)
             waiting -= self._excused
             if time.monotonic() >= give_up:
@@ -235,15 +235,15 @@ class Lobby:
         """Drop the newcomers; in lockstep no clock is started for them."""
         self._newcomers.clear()
 
-    def request(self, name: ParticipantId, request: StepRequest, *, patiently: bool) -> None:
+    def request(self, name: ParticipantId, request: StepRequest, *, blocking: bool) -> None:
         """Send a participant a step request."""
-        self._host.send(name, encode(request), patiently=patiently)
+        self._host.send(name, encode(request), blocking=blocking)
 
     def start_clock(self, name: ParticipantId, now_ns: int, speed: float, skew_ns: int) -> None:
         """Realtime: start a ready participant's clock, or set it."""
         look = self._simulation.look(name)
         message = StartClock(VERSION, self._ready[name], now_ns, speed, look, skew_ns)
-        self._host.send(name, encode(message), patiently=True)
+        self._host.send(name, encode(message), blocking=True)
 
     # Arrivals and departures.
 
@@ -272,7 +272,7 @@ class Lobby:
 
     def _refuse(self, event: Joined, reason: str) -> None:
         refusal = Refusal(VERSION, event.nonce, reason)
-        self._host.send(event.name, encode(refusal), patiently=True)
+        self._host.send(event.name, encode(refusal), blocking=True)
 
     def _brief_again(self) -> None:
         """Send the mission again to present participants that are not ready; it may not have reached them."""
@@ -301,7 +301,7 @@ class Lobby:
             self._run,
             self._simulation.body(event.name),
         )
-        self._host.send(event.name, encode(mission), patiently=True)
+        self._host.send(event.name, encode(mission), blocking=True)
 
     def _leave(self, event: Left) -> None:
         name = event.name
@@ -319,7 +319,7 @@ class Lobby:
         self._simulation.leave((name,))
         self._note(name, ProcessEventKind.LEAVE)
 
-    def _receive(self, event: Heard) -> tuple[ParticipantId, Report] | None:
+    def _receive(self, event: Received) -> tuple[ParticipantId, Report] | None:
         try:
             message = decode_from_participant(event.payload)
         except RefusedError:

@@ -61,7 +61,7 @@ class LockstepExchange:
             due = arrivals_then != arrivals or now_s - asked_s > RETRY_S
             if lobby.is_ready(name) and name not in outputs and due:
                 asked[name] = arrivals, now_s
-                lobby.request(name, StepRequest(VERSION, inputs[name]), patiently=True)
+                lobby.request(name, StepRequest(VERSION, inputs[name]), blocking=True)
 
     def kill(self, name: ParticipantId) -> None:
         """Kill a process; world-sim's own kill does not return."""

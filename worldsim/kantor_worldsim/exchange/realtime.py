@@ -166,7 +166,7 @@ class RealtimeExchange:
         if self._injector.skew_ns(name, now_ns) != self._skews_ns[name]:
             self._set_clock(name, now_ns)
         request = StepRequest(VERSION, msgspec.structs.replace(given, inbox=outbox.hand()))
-        self._lobby.request(name, request, patiently=False)
+        self._lobby.request(name, request, blocking=False)
 
 
 class Outbox:

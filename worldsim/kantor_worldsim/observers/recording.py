@@ -1,9 +1,10 @@
-"""The folder that a run leaves (design, part 7), and the referees that follow the run."""
+"""The recording of a run: journal, metrics and checker in a declared order, and the files of the run folder."""
 
 import secrets
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -14,10 +15,10 @@ from kantor_protocol.transport.rate_limit import Excess
 from kantor_worldsim.observers.checkers.checker import Checker
 from kantor_worldsim.observers.metrics.base import RunMetrics
 from kantor_worldsim.observers.metrics.density import DensityMetrics
-from kantor_worldsim.observers.metrics.map_tracker import MapTracker
 from kantor_worldsim.observers.metrics.mapping import MapMetrics
 from kantor_worldsim.observers.metrics.result import Result
-from kantor_worldsim.record.columnar import ColumnarDecoder
+from kantor_worldsim.observers.pipeline import Pipeline
+from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.journal import Journal, file_digest
 from kantor_worldsim.record.records import Record
 from kantor_worldsim.record.run_folder import (
@@ -37,20 +38,22 @@ from kantor_worldsim.record.run_folder import (
 def metrics_of(
     scenario: Scenario,
     exact_every: int | None = None,
-    decoder: ColumnarDecoder | None = None,
-    map_tracker: MapTracker | None = None,
+    on_row: Callable[[Any], None] = lambda _row: None,
 ) -> RunMetrics:
-    """What follows a run of a scenario: what a density needs, or a map. exact_every: see Metrics.
+    """Metrics for a scenario: of a density, or of a map. exact_every: see DensityMetrics.
 
-    decoder, map_tracker: those that other referees of the same run follow it by.
+    on_row: called with each row when it is complete.
     """
-    if scenario.mapping:
-        return MapMetrics(decoder, map_tracker)
-    return DensityMetrics(exact_every, decoder)
+    return MapMetrics(on_row) if scenario.mapping else DensityMetrics(exact_every, on_row)
 
 
 class Recording:
-    """Follows a run: journal, metrics and checker; writes the run folder if there is one."""
+    """Records a run: its pipeline of observers, and the run folder if there is one.
+
+    The order of the observers: first the journal, so that nothing is measured that is not on record; then metrics,
+    whose rows go to the journal, the checker and `metrics.csv`; then the checker, which on a map reads the map
+    tracker that metrics keep.
+    """
 
     def __init__(
         self,
@@ -63,66 +66,63 @@ class Recording:
         speed: float = 1.0,
         past: Past | None = None,
     ) -> None:
-        """folder: an existing folder for the run's files; None keeps nothing. exact_every: see Metrics.
+        """folder: an existing folder for the run's files; None keeps nothing. exact_every: see DensityMetrics.
 
-        speed: wall, simulated seconds in a real one. past: what the folder has of this run already.
+        speed: realtime, simulated seconds in a real one. past: records of this run that the folder has already.
         """
-        self._decoder = ColumnarDecoder()
-        map_tracker = MapTracker(self._decoder) if scenario.mapping else None
-        self.metrics = metrics_of(scenario, exact_every, self._decoder, map_tracker)
-        self.checker = Checker(self._decoder, map_tracker, virtual=exchange != "wall")
-        self.payload = b""
-        """The last record, encoded."""
         self.refused_at_door = 0
-        """Messages to world-sim that it could not take in; whoever runs the bus counts them."""
+        """Messages that world-sim refused; set by the process that hosts the bus."""
         self.excess: dict[ParticipantId, Excess] = {}
-        """What it did not listen to, by participant; likewise."""
+        """Messages beyond each participant's quota; set likewise."""
+        self.run = secrets.token_hex(8) if past is None else past.terms.run
+        """Names the run."""
         self._scenario = scenario
         self._seed = seed
         self._exchange = exchange
         self._folder = folder
         self._monotonic = monotonic
         self._started = monotonic()
-        self._rows = 0
-        self._table: MetricsFile | None = None
-        self.run = secrets.token_hex(8) if past is None else past.terms.run
-        """Names the run."""
-        if folder is not None and past is not None:
+        self.metrics = metrics_of(scenario, exact_every, self._distribute)
+        tracker = self.metrics.map_tracker if isinstance(self.metrics, MapMetrics) else None
+        self.checker = Checker(tracker, virtual=exchange != "wall")
+        self._table = self._open_folder(folder, exact_every, speed, past)
+        self.journal = Journal(None if folder is None else folder / JOURNAL, anew=past is not None)
+        self._pipeline = Pipeline(self.journal, self.metrics, self.checker)
+        if past is not None:
+            self._catch_up(past.records)
+
+    def _open_folder(
+        self, folder: Path | None, exact_every: int | None, speed: float, past: Past | None
+    ) -> MetricsFile | None:
+        """Write the files that a run folder has from the start."""
+        if folder is None:
+            return None
+        if past is not None:
             resumed = past.manifest.get("resumed", 0) + 1
             self._manifest = past.manifest | {"resumed": resumed}
-        elif folder is not None:
-            write_text(folder / SCENARIO, to_toml(scenario))
-            self._manifest = new_manifest(scenario, seed, exchange)
+        else:
+            write_text(folder / SCENARIO, to_toml(self._scenario))
+            self._manifest = new_manifest(self._scenario, self._seed, self._exchange)
             self._manifest |= {"run": self.run, "speed": speed, "exact_every": exact_every}
-        if folder is not None:
-            write_json(folder / MANIFEST, self._manifest)
-            self._table = MetricsFile(folder / METRICS, self.metrics.columns)
-        self.journal = Journal(None if folder is None else folder / JOURNAL, anew=past is not None)
-        if past is not None:
-            self._follow(past.records)
+        write_json(folder / MANIFEST, self._manifest)
+        return MetricsFile(folder / METRICS, self.metrics.columns)
 
-    def _follow(self, records: Iterable[Record]) -> None:
-        """Catch up. The old journal is there until all of it is in the new one."""
+    def _catch_up(self, records: Iterable[Record]) -> None:
+        """Observe the records of the past. The old journal stays until the new one has all of them."""
         for record in records:
             self.observe(record)
         self.journal.replace()
 
-    def observe(self, record: Record) -> None:
-        """Follow one record."""
-        self.payload = self._decoder.read(record)[0]
-        self.journal.append(record, self.payload)
-        self.metrics.observe(record)
-        self.checker.observe(record)
-        if len(self.metrics.rows) > self._rows:
-            self._write_rows()
+    def observe(self, record: Record) -> DecodedRecord:
+        """Record one record; decoded, for further observers."""
+        return self._pipeline.observe(record)
 
-    def _write_rows(self) -> None:
-        for row in self.metrics.rows[self._rows :]:
-            self.journal.append_row(row)
-            self.checker.observe_row(row)
-            if self._table is not None:
-                self._table.add(row)
-        self._rows = len(self.metrics.rows)
+    def _distribute(self, row: Any) -> None:
+        """Pass on a row of metrics."""
+        self.journal.append_row(row)
+        self.checker.observe_row(row)
+        if self._table is not None:
+            self._table.add(row)
 
     def finish(self) -> Result:
         """Close the files and sum up."""

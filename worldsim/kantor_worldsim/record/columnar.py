@@ -510,23 +510,29 @@ def parts_of_weights(payload: bytes, at: int, end: int) -> tuple[int, int, int, 
     return sequence, base, size, at, at + length
 
 
+class DecodedRecord(NamedTuple):
+    """A record with its bytes and, for a batch, its columns: decoded once for all observers."""
+
+    record: Record
+    payload: bytes
+    """The record encoded."""
+    columns: tuple[Any, ...]
+    """The fields of a `ColumnarBatch`, as arguments of a kernel. They are overwritten by the next batch."""
+
+
 class ColumnarDecoder:
-    """Reads the records of a run in order. Several referees may share one; each record is read once."""
+    """Decodes the records of one run in order."""
 
     def __init__(self) -> None:
-        self._record: Record | None = None
-        self._reading: tuple[Any, ...] = ()
         self._bounds = (0, STRANGER, 0)
-        """Robots, place of the supervisor, samples."""
+        """Number of robots, index of the supervisor, number of samples."""
         self._make_room(1 << 10)
 
-    def read(self, record: Record, payload: bytes = b"") -> tuple[Any, ...]:
-        """The record's bytes and, of a batch, its tables: a Reading as arguments of a kernel.
+    def decode(self, record: Record, payload: bytes = b"") -> DecodedRecord:
+        """The record's bytes and, for a batch, its columns.
 
         The first record must be an opening. payload: the record encoded, if it came so.
         """
-        if record is self._record:
-            return self._reading
         payload = payload or encode_record(record)
         if isinstance(record, Batch):
             while _read_batch(payload, *self._tables, self._pose_bits, *self._bounds) < 0:
@@ -536,9 +542,7 @@ class ColumnarDecoder:
             scenario = record.scenario
             supervisor = scenario.robots.count if scenario.centralized else STRANGER
             self._bounds = (scenario.robots.count, supervisor, record.samples_m.shape[0])
-        self._reading = (payload, *self._tables)
-        self._record = record
-        return self._reading
+        return DecodedRecord(record, payload, (payload, *self._tables))
 
     def _make_room(self, rows: int) -> None:
         """Tables of so many rows each; none needs more than its payload has bytes."""

@@ -18,6 +18,7 @@ from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, IndexType, Writer
 
+from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.records import Batch, Ending, Record, decode_record, encode_record
 
 RECORD_TOPIC = "/kantor/record"
@@ -85,8 +86,12 @@ class Journal:
         except OSError as error:
             self._give_up(error)
 
+    def observe(self, decoded: DecodedRecord, /) -> None:
+        """Write one record."""
+        self.append(decoded.record, decoded.payload)
+
     def append(self, record: Record, payload: bytes = b"") -> None:
-        """Write one record. payload: the record encoded, if somebody has done so already."""
+        """Write one record. payload: the record encoded, if it came so."""
         payload = payload or encode_record(record)
         self.digest.add(payload)
         if isinstance(record, (Batch, Ending)):

@@ -1,4 +1,4 @@
-"""What every fault has."""
+"""The base class of all faults."""
 
 from typing import Annotated
 
@@ -15,7 +15,7 @@ Names = tuple[ParticipantId, ...]
 
 
 class Fault(ScenarioTable, frozen=True, kw_only=True, tag_field="kind"):
-    """What every fault has: a window, its end excluded, in simulated time since the mission's start."""
+    """A fault within a window of simulated time since the mission's start, its end excluded."""
 
     from_s: Seconds = 0.0
     until_s: Seconds | None = None
@@ -23,12 +23,12 @@ class Fault(ScenarioTable, frozen=True, kw_only=True, tag_field="kind"):
 
     @property
     def from_ns(self) -> int:
-        """When it begins."""
+        """The begin of the window."""
         return round(self.from_s * 1e9)
 
     @property
     def until_ns(self) -> int | None:
-        """When it is over, or None."""
+        """The end of the window, or None."""
         return None if self.until_s is None else round(self.until_s * 1e9)
 
     def holds(self, now_ns: int) -> bool:

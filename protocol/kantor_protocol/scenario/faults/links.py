@@ -1,7 +1,7 @@
-"""Faults of links, and of what travels over them.
+"""Faults of links, and of the messages on them.
 
-They are injected where the radio rules (`kantor_worldsim.faults`), so they hold for every exchange, and a
-message that is under way when a window ends still arrives as ruled.
+They are injected where the radio decides on deliveries (`kantor_worldsim/radio/link_faults.py`), so they apply in
+every exchange, and a message that is under way when a window ends still arrives as decided.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from kantor_protocol.scenario.faults.base import Fault, Names, Share, Span
 from kantor_protocol.scenario.types import NotNegative, Positive, Probability, Seconds
 
 Severs = Callable[[ParticipantId, ParticipantId], bool]
-"""Whether nothing of a sender (first) reaches a receiver (second)."""
+"""Whether no message of a sender (first) reaches a receiver (second)."""
 
 COPIES_MAX = 8
 
@@ -33,7 +33,7 @@ class OnLinks(Fault, frozen=True, kw_only=True):
 
 
 class Drop(OnLinks, frozen=True, kw_only=True, tag="drop"):
-    """Every copy is lost with this probability, whatever happens to others."""
+    """Every copy is lost with this probability, independently."""
 
     probability: Share
 
@@ -41,8 +41,8 @@ class Drop(OnLinks, frozen=True, kw_only=True, tag="drop"):
 class Burst(OnLinks, frozen=True, kw_only=True, tag="burst"):
     """Losses come in bursts (Gilbert 1960, Elliott 1963).
 
-    Each direction of each link is good or bad, for times that are geometrically distributed in slots of a
-    tenth of the shorter mean. All begin the mission good, and go on changing outside the window.
+    Each direction of each link is good or bad, for times that are geometrically distributed in intervals of
+    a tenth of the shorter mean. All begin the mission good, and go on changing outside the window.
     """
 
     good_s: Span
@@ -86,38 +86,38 @@ class Reorder(OnLinks, frozen=True, kw_only=True, tag="reorder"):
 
 
 class OneWay(Fault, frozen=True, kw_only=True, tag="one-way"):
-    """Nothing of the senders reaches the receivers; the other direction stands."""
+    """No message of the senders reaches the receivers; the other direction works."""
 
     senders: Names = ()
-    """By default everybody."""
+    """By default all participants."""
     receivers: Names = ()
-    """By default everybody."""
+    """By default all participants."""
 
     def severs(self, roster: Names) -> Severs:
-        """Which links it cuts."""
+        """The links that it cuts."""
         senders, receivers = frozenset(self.senders or roster), frozenset(self.receivers or roster)
         return lambda sender, receiver: sender in senders and receiver in receivers
 
 
 class Partition(Fault, frozen=True, kw_only=True, tag="partition"):
-    """The team falls apart: nothing passes between two parts, in either direction."""
+    """The team is divided: no message passes between two parts, in either direction."""
 
     shape: Literal["halves", "ring", "bridge", "isolate", "groups"]
     """In the order of the roster, the supervisor last. halves: the first half and the second.
-    ring: everybody hears only the one before and the one after, the last and the first each other.
+    ring: each hears only the one before and the one after, the last and the first each other.
     bridge: two halves, and one in the middle that hears both. isolate: each of `robots` for itself.
-    groups: as given, and whoever is in none together."""
+    groups: as given, and all that are in none together."""
     robots: Names = ()
-    """isolate: who."""
+    """isolate: the participants to isolate."""
     groups: tuple[Names, ...] = ()
-    """groups: who together."""
+    """groups: the groups."""
     flap_s: Span | None = None
     """The cut comes and goes: so often it is drawn whether it is there. By default it stays."""
     flap_share: Annotated[float, Meta(gt=0.0, lt=1.0)] | None = None
     """Share of the time in which it is there, if it flaps; by default half."""
 
     def severs(self, roster: Names) -> Severs:
-        """Which links it cuts while it is there."""
+        """The links that it cuts while it is there."""
         if self.shape == "ring":
             place = {name: i for i, name in enumerate(roster)}
             return lambda one, other: 1 < abs(place[one] - place[other]) < len(roster) - 1
@@ -144,40 +144,40 @@ class Partition(Fault, frozen=True, kw_only=True, tag="partition"):
 
 
 class Clog(OnLinks, frozen=True, kw_only=True, tag="clog"):
-    """What is sent in the window arrives when it ends, in a burst, in the order of (sender, sequence)."""
+    """Messages sent in the window arrive when it ends, in a burst, in the order of (sender, sequence)."""
 
 
 class Bandwidth(Fault, frozen=True, kw_only=True, tag="bandwidth"):
-    """A sender has so many bytes a second; what is more waits behind what it sent before."""
+    """A sender has so many bytes a second; a message waits until those sent before have been transmitted."""
 
     robots: Names = ()
-    """Senders, each for itself; by default everybody."""
+    """Senders, each for itself; by default all participants."""
     bytes_per_s: Positive
-    """Of message bodies. A message takes its time on the air whether anybody hears it or not."""
+    """Of message bodies. A message takes its time on the air whether it reaches a receiver or not."""
     queue_bytes: Annotated[int, Meta(ge=0, le=2**62)] | None = None
-    """How much may wait; what finds more before it is dropped. By default everything waits."""
+    """How much may wait; a message that finds more waiting is dropped. By default everything waits."""
 
 
 class Range(OnLinks, frozen=True, kw_only=True, tag="range"):
-    """The radio reaches less far."""
+    """The radio range is shorter."""
 
     range_m: NotNegative | None = None
-    """So far at most, the bound included."""
+    """The range at most, the bound included."""
     factor: Probability | None = None
-    """Or so many times as far as before."""
+    """Or the share of the range that is left."""
 
     def reach_m(self, range_m: float) -> float:
-        """What is left of a range."""
+        """The range under this fault."""
         return (
             range_m * (self.factor or 0.0) if self.range_m is None else min(range_m, self.range_m)
         )
 
 
 class Hostile(OnLinks, frozen=True, kw_only=True, tag="hostile"):
-    """With this probability something that nobody sent comes beside a message, to be refused.
+    """With this probability a forgery arrives beside a message, to be refused by its receiver.
 
-    It is in the sender's name, or in that of a stranger: noise, what is cut short, of another version,
-    oversized, deeply nested, with numbers that are none, or of origins that nobody is.
+    It is in the sender's name, or in that of a stranger: noise, a message that is cut short, of another version,
+    oversized, deeply nested, with numbers that are not finite, or of origins that do not exist.
     """
 
     probability: Share

@@ -1,7 +1,7 @@
 """Faults of processes: of robots, of the supervisor, and of world-sim itself.
 
-In process and in lockstep they are played by whoever runs the mission, with the same record. On the wall
-they are real: signals, new processes, limits of the operating system.
+In process and in lockstep the event loop of the mission simulates them, with the same record. In the realtime
+exchange they are real: signals, new processes, limits of the operating system.
 """
 
 from typing import Annotated, Literal
@@ -11,14 +11,14 @@ from msgspec import Meta
 from kantor_protocol.scenario.faults.base import Fault, Names
 
 Disk = Literal["kept", "torn", "lost"]
-"""What a process that starts again finds of its snapshot: all, all but the end, or nothing."""
+"""What is left of the write-ahead log of a process that starts again: all, all but the end, or nothing."""
 
 
 class OnProcesses(Fault, frozen=True, kw_only=True):
     """A fault of processes."""
 
     who: Annotated[Names, Meta(min_length=1)]
-    """Participants, or worldsim where that is said."""
+    """Participants; worldsim as well where `of_world_sim` is true."""
 
     @property
     def of_world_sim(self) -> bool:
@@ -39,13 +39,13 @@ class Kill(OnProcesses, frozen=True, kw_only=True, tag="kill"):
     """SIGKILL at from_s; at until_s it is started again, or never if there is none."""
 
     disk: Disk = "kept"
-    """What is left of its snapshot. Whoever lacks what others may have comes back as a new incarnation."""
+    """What is left of its write-ahead log. A participant whose log lacks a step comes back as a new incarnation."""
     mid_step: bool = False
-    """It dies in its next step: after that was noted, before anybody heard of it."""
+    """It is killed in its next step: after that was written to the log, before it was reported."""
 
     @property
     def of_world_sim(self) -> bool:
-        """It starts again from its journal."""
+        """It can: it starts again from its journal."""
         return True
 
 
@@ -54,22 +54,22 @@ class Pause(WithEnd, frozen=True, kw_only=True, tag="pause"):
 
     @property
     def of_world_sim(self) -> bool:
-        """Everybody holds until it goes on."""
+        """It can: all participants hold until it goes on."""
         return True
 
 
 class Late(WithEnd, frozen=True, kw_only=True, tag="late"):
-    """It is not there from the start and joins at until_s."""
+    """It is missing from the start and joins at until_s."""
 
 
 class Slow(OnProcesses, frozen=True, kw_only=True, tag="slow"):
-    """It gets to only one of so many of its steps; what it hears waits meanwhile."""
+    """It makes only one of so many of its steps; messages to it wait meanwhile."""
 
     every: Annotated[int, Meta(ge=2, le=1000)]
 
 
 class FullDisk(WithEnd, frozen=True, kw_only=True, tag="full-disk"):
-    """It cannot write its snapshot; what it cannot note it must not do."""
+    """It cannot write its write-ahead log, and so must make no step."""
 
 
 class ClockFault(OnProcesses, frozen=True, kw_only=True, tag="clock"):
@@ -81,11 +81,11 @@ class ClockFault(OnProcesses, frozen=True, kw_only=True, tag="clock"):
 
     @property
     def stops(self) -> bool:
-        """It goes on."""
+        """It does not: the process goes on."""
         return False
 
     def skew_ns(self, now_ns: int) -> int:
-        """How far it is ahead at a time in the window."""
+        """How far the clock is ahead at a time in the window."""
         drift_ns = (now_ns - self.from_ns) * round(self.rate_ppm) // 1_000_000
         return round(self.offset_s * 1e9) + drift_ns
 
@@ -95,7 +95,7 @@ class Impostor(OnProcesses, frozen=True, kw_only=True, tag="impostor"):
 
     @property
     def stops(self) -> bool:
-        """It is somebody else."""
+        """It does not: the impostor is another process."""
         return False
 
 

@@ -10,14 +10,14 @@ from kantor_protocol.scenario.faults.processes import ProcessFault
 from kantor_protocol.scenario.types import ScenarioTable
 
 AnyFault = LinkFault | ProcessFault
-"""What may stand in a list of faults."""
+"""The faults that a list may hold."""
 
 
 FAULTS_MAX = 1000
 
 
 KINDS: dict[str, type[Fault]] = {str(k.__struct_config__.tag): k for k in get_args(AnyFault)}
-"""By their names in a file."""
+"""The kinds of faults by their names in a file."""
 
 
 class Chaos(ScenarioTable, frozen=True, kw_only=True):
@@ -27,5 +27,5 @@ class Chaos(ScenarioTable, frozen=True, kw_only=True):
 
 
 def kind_of(fault: Fault) -> str:
-    """Its name in a file."""
+    """The name of a fault's kind in a file."""
     return str(fault.__struct_config__.tag)

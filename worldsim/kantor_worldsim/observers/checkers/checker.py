@@ -48,7 +48,8 @@ from kantor_worldsim.observers.checkers.violations import (
 from kantor_worldsim.observers.metrics.density import DensityRow
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
 from kantor_worldsim.observers.metrics.wasserstein_exact import ROUNDING
-from kantor_worldsim.record.columnar import ColumnarDecoder
+from kantor_worldsim.observers.pipeline import Pipeline
+from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.process_events import (
     EVENTS,
     TAKE_OVER,
@@ -103,12 +104,11 @@ class Checker:
 
     def __init__(
         self,
-        decoder: ColumnarDecoder | None = None,
         map_tracker: MapTracker | None = None,
         *,
         virtual: bool = True,
     ) -> None:
-        """decoder, map_tracker: those of another observer of the same run, to share its work.
+        """map_tracker: one that an earlier observer of the same run keeps; by default one of its own.
 
         virtual: virtual time, in which a participant hears all that has arrived; not the realtime exchange.
         """
@@ -116,7 +116,6 @@ class Checker:
         """The first violations, as texts."""
         self.count = 0
         """All violations, also those beyond the ones that are kept."""
-        self._decoder = decoder or ColumnarDecoder()
         self._map_tracker = map_tracker
         self._virtual = virtual
         self._map_checker: MapChecker | None = None
@@ -125,8 +124,9 @@ class Checker:
         self._ended = False
         self._now_ns = 0
 
-    def observe(self, record: Record) -> None:
+    def observe(self, decoded: DecodedRecord, /) -> None:
         """Check one record."""
+        record = decoded.record
         if self._ended:
             self._report("order", "record", "something follows the ending")
         elif isinstance(record, Opening):
@@ -136,7 +136,7 @@ class Checker:
         elif self._opening is None:
             self._report("order", "record", "no opening")
         elif isinstance(record, Batch):
-            self._check(record)
+            self._check(record, decoded)
         elif isinstance(record, ProcessEvent):
             self._follow_event(record)
         else:
@@ -160,7 +160,6 @@ class Checker:
             self.complaints.append(f"{rule}: t={self._now_ns * 1e-9:.3f} s: {who}: {what}")
 
     def _open(self, opening: Opening) -> None:
-        self._decoder.read(opening)
         scenario = opening.scenario
         self._opening, self._scenario, self._units = opening, scenario, opening.units
         self._names = scenario.roster
@@ -186,15 +185,14 @@ class Checker:
             for name in fault.who if isinstance(fault, Late) else ():
                 self._stop(name, ProcessEventKind.KILL, 0)
         if scenario.mapping:
-            map_tracker = self._map_tracker or MapTracker(self._decoder)
-            self._map_checker = MapChecker(map_tracker, self._report)
+            self._map_checker = MapChecker(self._map_tracker, self._report)
             self._map_checker.open(opening)
 
     def _keep(self, state: CheckerState) -> None:
         self._state = state
         self._arguments = arguments(state, self._limits, self._links.table)
 
-    def _check(self, batch: Batch) -> None:
+    def _check(self, batch: Batch, decoded: DecodedRecord) -> None:
         self._pass_time(batch.now_ns)
         if self._stopped[WORLD_SIM]:
             self._report("dead", WORLD_SIM, "decides on steps, and is stopped")
@@ -203,18 +201,17 @@ class Checker:
         if self._clocks:
             self._check_clocks(batch)
         self._links.move_to(batch.now_ns)
-        columns = self._decoder.read(batch)
-        noted = check_batch(*columns, *self._arguments, batch.now_ns)
+        noted = check_batch(*decoded.columns, *self._arguments, batch.now_ns)
         while noted < 0:
             self._keep(self._state.lengthened(noted))
-            noted = check_batch(*columns, *self._arguments, batch.now_ns)
+            noted = check_batch(*decoded.columns, *self._arguments, batch.now_ns)
         if noted:
             self._report_noted(batch, self._state.counts.item(NOTED))
             self._check_keyframes(batch)
         if self._register_checker is not None:
             self._check_registers(batch, self._register_checker)
         if self._map_checker is not None:
-            beyond = self._map_checker.check(batch)  # it reports, which counts as well
+            beyond = self._map_checker.check(batch, decoded)  # it reports, which counts as well
             self.count += beyond
 
     def _pass_time(self, now_ns: int) -> None:
@@ -402,6 +399,7 @@ class Checker:
 def check(records: Iterable[Record], *, virtual: bool = True) -> Checker:
     """Check a whole record. virtual: see Checker."""
     checker = Checker(virtual=virtual)
+    pipeline = Pipeline(checker)
     for record in records:
-        checker.observe(record)
+        pipeline.observe(record)
     return checker

@@ -31,8 +31,9 @@ from kantor_worldsim.observers.checkers.links import Links
 from kantor_worldsim.observers.checkers.sight import Sight
 from kantor_worldsim.observers.checkers.state import FORGED_FIRST, has_ledger
 from kantor_worldsim.observers.metrics.gossip_reader import read_lengths
+from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.process_events import TAKE_OVER, ProcessEventKind
-from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record, StepRecord
+from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, StepRecord
 
 _UNLUCKY = 1e-9
 """The probability that may remain of losing a message and all its repetitions."""
@@ -88,8 +89,9 @@ class LivenessChecker:
         """The rules that this record could have broken."""
         self._opening: Opening | None = None
 
-    def observe(self, record: Record) -> None:
+    def observe(self, decoded: DecodedRecord, /) -> None:
         """Follow one record."""
+        record = decoded.record
         if isinstance(record, Opening):
             self._open(record)
         elif self._opening is None:

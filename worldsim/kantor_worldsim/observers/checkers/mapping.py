@@ -24,6 +24,7 @@ from kantor_worldsim.observers.metrics.map_tracker_kernels import (
     SHORT,
     UNREADABLE,
 )
+from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, StepRecord
 
 Report = Callable[[str, ParticipantId, str], None]
@@ -58,14 +59,16 @@ class MapChecker:
     finish      a robot that reports that it has finished can reach no frontier by what it holds (without noise)
     """
 
-    def __init__(self, map_tracker: MapTracker, report: Report) -> None:
-        """map_tracker: may be shared with other observers of the same run."""
-        self._map_tracker = map_tracker
+    def __init__(self, map_tracker: MapTracker | None, report: Report) -> None:
+        """map_tracker: one that an earlier observer of the same run keeps; None: one of its own."""
+        self._own_tracker = map_tracker is None
+        self._map_tracker = map_tracker or MapTracker()
         self._report = report
 
     def open(self, opening: Opening) -> None:
         """Begin with the first record."""
-        self._map_tracker.observe(opening)
+        if self._own_tracker:
+            self._map_tracker.open(opening)
         self._exact = opening.scenario.sensor.noise_m == 0.0
         self._names = opening.scenario.roster
         self._poses_m = dict(zip(self._names, self._map_tracker.poses_m, strict=False))
@@ -83,13 +86,15 @@ class MapChecker:
 
     def follow_event(self, incident: ProcessEvent) -> None:
         """Follow an event of a process."""
-        self._map_tracker.observe(incident)
+        if self._own_tracker:
+            self._map_tracker.follow_event(incident)
 
-    def check(self, batch: Batch) -> int:
+    def check(self, batch: Batch, decoded: DecodedRecord) -> int:
         """Follow one batch; the number of violations beyond those that are kept as texts."""
         if self._sight.counts:
             self._check_sight(batch)
-        self._map_tracker.observe(batch)
+        if self._own_tracker:
+            self._map_tracker.observe(decoded)
         noted, count = self._map_tracker.violations
         for kind, row, _, a, b in noted.tolist():
             self._describe(batch, kind, row, a, b)

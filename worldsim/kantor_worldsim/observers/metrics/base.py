@@ -1,7 +1,7 @@
 """Metrics that every run has, on a density or on a map."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
@@ -36,9 +36,9 @@ from kantor_worldsim.observers.metrics.tally import (
     begin_anew,
     follow,
 )
-from kantor_worldsim.record.columnar import ColumnarDecoder
+from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.process_events import EVENTS, TAKE_OVER, ProcessEventKind
-from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record
+from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent
 
 
 class Snapshot(NamedTuple):
@@ -68,22 +68,23 @@ class RunMetrics:
     columns: ClassVar[tuple[str, ...]]
     """The names in a row."""
 
-    def __init__(self, decoder: ColumnarDecoder | None = None) -> None:
-        """reader: the one that another referee of the same run reads by."""
+    def __init__(self, on_row: Callable[[Any], None] = lambda _row: None) -> None:
+        """on_row: called with each row when it is complete."""
+        self._on_row = on_row
         self.rows: list[Any] = []
         self.finds: list[tuple[float, ParticipantId, int, float, float]] = []
         """(time, robot, target, x, y), world frame."""
-        self._decoder = decoder or ColumnarDecoder()
         self._opening: Opening | None = None
         self._every = 1
         """Periods from one row to the next."""
 
-    def observe(self, record: Record) -> None:
+    def observe(self, decoded: DecodedRecord, /) -> None:
         """Follow one record."""
+        record = decoded.record
         if isinstance(record, Opening):
             self._open(record)
         elif isinstance(record, Batch):
-            self._follow(record)
+            self._follow(record, decoded)
         elif isinstance(record, ProcessEvent):
             self._befall(record)
         else:
@@ -91,7 +92,6 @@ class RunMetrics:
             self._row(last=True)
 
     def _open(self, opening: Opening) -> None:
-        self._decoder.read(opening)
         scenario, site = opening.scenario, opening.site
         self._opening, self._scenario, self._units = opening, scenario, opening.units
         self._period_ns = scenario.period_ns
@@ -133,7 +133,7 @@ class RunMetrics:
         self._begin(opening)
         self._row()
 
-    def _follow(self, batch: Batch) -> None:
+    def _follow(self, batch: Batch, decoded: DecodedRecord) -> None:
         tick = batch.now_ns // self._period_ns
         if tick != self._tick:
             if self._tick and self._tick % self._every == 0:
@@ -147,10 +147,9 @@ class RunMetrics:
                 self._tolls[stats.fault, deed] += getattr(stats, deed)
         if self._started_ns:
             self._note_rejoining(batch)
-        columns = self._decoder.read(batch)
-        if follow(*columns, *self._arguments):
+        if follow(*decoded.columns, *self._arguments):
             self._note_finds(batch)
-        self._attend(batch, columns)
+        self._attend(batch, decoded)
 
     def _befall(self, incident: ProcessEvent) -> None:
         """Follow what befell a process."""
@@ -210,8 +209,12 @@ class RunMetrics:
         """Prepare for the run, before its first row."""
         raise NotImplementedError
 
-    def _attend(self, batch: Batch, columns: tuple[Any, ...]) -> None:
-        """Follow a batch that has been counted. reading: a Reading as arguments of a kernel."""
+    def _attend(self, batch: Batch, decoded: DecodedRecord) -> None:
+        """Follow a batch that has been counted."""
+
+    def _add_row(self, row: Any) -> None:
+        self.rows.append(row)
+        self._on_row(row)
 
     def _row(self, *, last: bool = False) -> None:
         """Measure."""

@@ -1,6 +1,7 @@
 """Metrics of a mission on a density, from its records alone (Kabir & Lee, section VI)."""
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from kantor_worldsim.observers.metrics.tally import DELIVERIES, DROPS, ENERGY, L
 from kantor_worldsim.observers.metrics.wasserstein_bounds import Auction, measure
 from kantor_worldsim.radio.channel import links
 from kantor_worldsim.record import columnar as of
-from kantor_worldsim.record.columnar import ColumnarDecoder
+from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.records import Batch, Opening
 
 _PAIRS_PER_ROW = 200_000
@@ -161,13 +162,15 @@ class DensityMetrics(RunMetrics):
     rows: list[DensityRow]
 
     def __init__(
-        self, exact_every: int | None = None, decoder: ColumnarDecoder | None = None
+        self,
+        exact_every: int | None = None,
+        on_row: Callable[[DensityRow], None] = lambda _row: None,
     ) -> None:
         """exact_every: periods from one exact distance to the next; 0: at the end only; None: never.
 
-        decoder: the one that another referee of the same run reads by.
+        on_row: called with each row when it is complete.
         """
-        super().__init__(decoder)
+        super().__init__(on_row)
         self._exact_every = exact_every
 
     def _begin(self, opening: Opening) -> None:
@@ -191,9 +194,9 @@ class DensityMetrics(RunMetrics):
         self._auction = Auction(robots, samples, self._every)
         self._points: list[tuple[float, float, int]] = []
 
-    def _attend(self, _batch: Batch, columns: tuple[Any, ...]) -> None:
+    def _attend(self, _batch: Batch, decoded: DecodedRecord) -> None:
         if self._exact_every is not None:
-            self._note_points(of.ColumnarBatch(*columns))
+            self._note_points(of.ColumnarBatch(*decoded.columns))
 
     def _note_points(self, columns: of.ColumnarBatch) -> None:
         """Where a point was shipped, and how many units."""
@@ -228,7 +231,7 @@ class DensityMetrics(RunMetrics):
             _sum_up(*self._to_sum_up)
             pending = sum(self._terms[0].tolist())
             local = [] if scenario.centralized else self._terms[1].tolist()
-        self.rows.append(
+        self._add_row(
             DensityRow(
                 tick=self._tick,
                 time_s=self._tick * self._period_ns * 1e-9,

@@ -41,38 +41,33 @@ from kantor_worldsim.observers.metrics.map_tracker_kernels import (
     take_scan,
 )
 from kantor_worldsim.record import columnar as of
-from kantor_worldsim.record.columnar import ColumnarBatch, ColumnarDecoder
+from kantor_worldsim.record.columnar import ColumnarBatch, DecodedRecord
 from kantor_worldsim.record.process_events import TAKE_OVER
-from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record
+from kantor_worldsim.record.records import Batch, Opening, ProcessEvent
 from kantor_worldsim.world.starts import observable
 from kantor_worldsim.world.world import StepVerdict
 
 
 class MapTracker:
-    """Follows the records of a mapping run. Several observers may share one; each record counts once.
+    """Follows the records of a mapping run."""
 
-    An observer that needs the state before a record reads it before the first of them hands the record on.
-    """
-
-    def __init__(self, decoder: ColumnarDecoder | None = None) -> None:
-        """decoder: that of another observer of the same run, to share its work."""
-        self._decoder = decoder or ColumnarDecoder()
-        self._record: Record | None = None
-
-    def observe(self, record: Record) -> None:
+    def observe(self, decoded: DecodedRecord, /) -> None:
         """Follow one record. The first must be an opening with a true map; raises RefusedError."""
-        if record is self._record:
-            return
-        self._record = record
+        record = decoded.record
         if isinstance(record, Opening):
-            self._open(record)
+            self.open(record)
         elif isinstance(record, Batch):
-            self._follow(record)
-        elif isinstance(record, ProcessEvent) and record.kind in TAKE_OVER:
-            self._begin_incarnation(record)
+            self._follow(record, decoded)
+        elif isinstance(record, ProcessEvent):
+            self.follow_event(record)
 
-    def _open(self, opening: Opening) -> None:
-        self._decoder.read(opening)
+    def follow_event(self, event: ProcessEvent) -> None:
+        """Follow a process event."""
+        if event.kind in TAKE_OVER:
+            self._begin_incarnation(event)
+
+    def open(self, opening: Opening) -> None:
+        """Begin with the first record. Raises RefusedError if it has no true map."""
         scenario, site = opening.scenario, opening.site
         if site.ground is None:
             raise RefusedError("a mission on a map, and no map in its opening")
@@ -192,10 +187,10 @@ class MapTracker:
         )
         return bool((apart <= DEAD_FRONTIER_CELLS).any())
 
-    def _follow(self, batch: Batch) -> None:
+    def _follow(self, batch: Batch, decoded: DecodedRecord) -> None:
         self.state.totals[NOTED] = 0
         self.tick = batch.now_ns // self._period_ns
-        columns = ColumnarBatch(*self._decoder.read(batch))
+        columns = ColumnarBatch(*decoded.columns)
         stepped = [
             (row, self.places[step_record.name], step_record)
             for row, step_record in enumerate(batch.step_records)

@@ -15,6 +15,7 @@ Means over time are over the rows at multiples of `metrics.every`, 10 by default
 """
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,8 +27,8 @@ from kantor_worldsim.observers.metrics.base import RunMetrics
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
 from kantor_worldsim.observers.metrics.result import Bounds, ByRegions, MapResult
 from kantor_worldsim.radio.channel import Walls, links
-from kantor_worldsim.record.columnar import ColumnarDecoder
-from kantor_worldsim.record.records import Batch, Opening, StepRecord
+from kantor_worldsim.record.columnar import DecodedRecord
+from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, StepRecord
 
 EVERY = 10
 """Periods from one row to the next."""
@@ -117,11 +118,13 @@ class MapMetrics(RunMetrics):
     rows: list[MapRow]
 
     def __init__(
-        self, decoder: ColumnarDecoder | None = None, map_tracker: MapTracker | None = None
+        self,
+        on_row: Callable[[MapRow], None] = lambda _row: None,
     ) -> None:
-        """reader, survey: those that other referees of the same run follow it by, after this one."""
-        super().__init__(decoder)
-        self.map_tracker = map_tracker or MapTracker(self._decoder)
+        """on_row: called with each row when it is complete."""
+        super().__init__(on_row)
+        self.map_tracker = MapTracker()
+        """Follows the same records; observers after this one may read it."""
         self.shares: list[list[float]] = []
         """For each row, the share that each robot knows."""
         self.stall_ns = 0
@@ -129,7 +132,7 @@ class MapMetrics(RunMetrics):
         self.switches = 0
 
     def _begin(self, opening: Opening) -> None:
-        self.map_tracker.observe(opening)
+        self.map_tracker.open(opening)
         scenario, frame = opening.scenario, self.map_tracker.frame
         self._every = scenario.metrics.every or EVERY
         self._robots = scenario.robots.count
@@ -152,14 +155,17 @@ class MapMetrics(RunMetrics):
         self._walls = Walls.of(scenario.radio, self.map_tracker.ground)
         self._resolution_m = frame.resolution_m
 
-    def _attend(self, batch: Batch, _reading: tuple[Any, ...]) -> None:
-        self.map_tracker.observe(
-            batch
-        )  # not before: a row tells how things stood at the end of its tick
+    def _attend(self, batch: Batch, decoded: DecodedRecord) -> None:
+        # The row of a tick was made before: it has the state at the end of that tick.
+        self.map_tracker.observe(decoded)
         for step_record in batch.step_records:
             pace = self._paces.get(step_record.name)
             if pace is not None:
                 self._keep_pace(pace, step_record)
+
+    def _befall(self, incident: ProcessEvent) -> None:
+        super()._befall(incident)
+        self.map_tracker.follow_event(incident)
 
     def _keep_pace(self, pace: _Pace, step_record: StepRecord) -> None:
         """Whether a robot has changed its mind before the move, and whether it moves."""
@@ -182,7 +188,7 @@ class MapMetrics(RunMetrics):
         map_tracker = self.map_tracker
         self._measure(sample=self._tick > 0 and (not last or self._tick % self._every == 0))
         self.shares.append((map_tracker.held_cells / max(1, map_tracker.total)).tolist())
-        self.rows.append(
+        self._add_row(
             MapRow(
                 tick=self._tick,
                 time_s=self._tick * self._period_ns * 1e-9,
