@@ -395,7 +395,7 @@ def test_world_sim_warns_of_certificates_that_expire(kantor: "Kantor") -> None:
     warnings = [text for text in err.splitlines() if "warning" in text]
     assert len(warnings) == 4
     for text in (
-        "r3 is revoked and will not be let in",
+        "r3 is revoked and will be refused",
         "worldsim's certificate expires on",
         "r1's certificate expires on",
         "r2's certificate expired on",

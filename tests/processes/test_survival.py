@@ -296,7 +296,7 @@ def test_a_robot_that_is_killed_and_started_again_goes_on_where_it_was(by_hand: 
 
 def test_a_frozen_robot_goes_on_unless_it_has_a_successor(by_hand: ByHand) -> None:
     """Frozen for longer than a lease it is back by itself; with a successor it is sent away, and the two
-    never share a diary.
+    never share a write-ahead log.
     """
     frozen = by_hand.robots["r2"]
     frozen.send_signal(signal.SIGSTOP)
