@@ -92,6 +92,13 @@ class RecoverableNode:
         self._wal.append(entry)
         return self._advance(inputs)
 
+    def validate(self) -> None:
+        """Assert that the last step is that of the last inputs, and the invariants of the machine, if it has any."""
+        if (last := self.last_step) is not None:
+            assert last[1].step == self.step_count == last[0].observation.step + 1
+        if callable(validate := getattr(self._machine, "validate", None)):
+            validate()
+
     def _advance(self, inputs: Inputs) -> Outputs:
         self._last_inputs, self._last_outputs = inputs, self._machine.step(inputs)
         self.step_count = self._last_outputs.step
@@ -145,6 +152,11 @@ class KillableNode:
         """`step`, of encoded Inputs."""
         assert self._node is not None
         return self._node.step_encoded(entry)
+
+    def validate(self) -> None:
+        """Assert the invariants of the node, unless it is killed."""
+        if self._node is not None:
+            self._node.validate()
 
     def kill(self) -> None:
         """Discard everything but the write-ahead log."""
