@@ -179,7 +179,7 @@ def test_a_message_that_reaches_a_dead_robot_is_lost() -> None:
 def test_a_step_between_its_log_entry_and_its_answer_is_neither_lost_nor_made_twice(
     pace: str, until_s: float
 ) -> None:
-    """It spends once: logged before any participant receives it, reported when the robot is back."""
+    """The robot spends once: logged before any participant receives it, reported when it is back."""
     overrides = (*LOSSY, *PACES[pace])
     records = run(kill("r2", 1.22, until_s, "mid_step = true"), overrides=overrides)
     start = next(event for event in process_events(records) if event.kind == "start")
@@ -253,7 +253,7 @@ def test_a_robot_that_never_stepped_keeps_its_incarnation(disk: str) -> None:
 
 
 def test_a_late_joiner_takes_part() -> None:
-    """It neither steps nor receives before it joins; then its first step has number 1."""
+    """The robot neither steps nor receives before it joins; then its first step has number 1."""
     records = run('kind = "late"; who = ["r3"]; until_s = 1.55')
     first = step_records(records, "r3")[0]
     sent_ns = {
@@ -279,7 +279,7 @@ def test_a_late_joiner_takes_part() -> None:
     ],
 )
 def test_messages_to_an_idle_robot_wait(fault: str, kinds: tuple[str, str]) -> None:
-    """It takes no step and sends nothing; then it receives all that arrived, in order of arrival."""
+    """The robot takes no step and sends nothing; then it receives all that arrived, in order of arrival."""
     records = run(fault)
     r2 = step_records(records, "r2")
     back = next(step_record for step_record in r2 if step_record.now_ns == 1500 * MS)
@@ -358,7 +358,7 @@ def test_a_robot_that_is_dead_for_good_is_not_waited_for() -> None:
 
 
 def test_a_mission_without_a_robot_left_is_deserted() -> None:
-    """It ends with the last death."""
+    """The mission ends with the last death."""
     records = run(kill("r1", 0.5, None), kill("r2", 0.7, None), kill("r3", 0.7, None))
 
     assert records[-1] == Ending(700 * MS, "deserted")

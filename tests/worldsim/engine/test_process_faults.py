@@ -47,7 +47,7 @@ def test_ends_of_faults_come_before_beginnings() -> None:
 
 
 def test_world_sim_comes_first_and_goes_last() -> None:
-    """It observes each participant that starts or stops at the same moment."""
+    """World-sim observes each participant that starts or stops at the same moment."""
     outage = 'kind = "kill"; who = ["worldsim"]; from_s = 1.0; until_s = 2.0'
     pause = 'kind = "pause"; who = ["r3"]; from_s = 1.0; until_s = 2.0'
     schedule = schedule_of(troubled(outage, pause))

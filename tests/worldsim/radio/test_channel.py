@@ -229,7 +229,7 @@ def test_the_range_of_the_supervisor_is_its_own_less_the_walls() -> None:
 
 
 def test_a_supervisor_without_a_pose_is_in_range_everywhere() -> None:
-    """It is not on the map, so no wall is between."""
+    """The supervisor is not on the map, so no wall is between."""
     overrides = (CENTRALIZED, "radio.line_of_sight=true", "radio.wall_loss_m=1.0")
     radio = among_walls(*overrides, places_m=IN_A_ROW)
 

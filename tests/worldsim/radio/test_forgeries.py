@@ -100,7 +100,7 @@ def test_forgeries_come_at_their_rate(probability: float) -> None:
 
 
 def test_a_forgery_arrives_with_its_message_and_has_a_sequence_number_of_its_own() -> None:
-    """It is for that receiver, in the sender's name or a stranger's, and it is on record."""
+    """A forgery is for the same receiver, in the sender's name or a stranger's, and it is on record."""
     radio = HostileRadio(Hostile(probability=1.0))
     decisions, extra = radio.transmit(*broadcasts(100))
     forgeries = radio.faults.pop_forged()

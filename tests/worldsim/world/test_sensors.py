@@ -113,14 +113,14 @@ def test_a_scan_has_ranges_in_fractions_of_the_sensor_range(
     ground, pose = place
     u, v = in_cells(ground, pose)
     range_cells = range_m / ground.frame.resolution_m
-    told = []
+    codes = []
     for beam in range(beams):
         angle_rad = beam_rad(pose.heading_rad, math.radians(view_deg), beams, beam)
         way = plain_way(ground.cells, u, v, angle_rad, range_cells)
-        told.append(NO_RETURN if way == math.inf else round(way / range_cells * CODES))
+        codes.append(NO_RETURN if way == math.inf else round(way / range_cells * CODES))
     sensor = SensorOptions(range_m=range_m, beams=beams, field_of_view_deg=view_deg)
 
-    assert scan_of(ground, sensor, pose).tolist() == told
+    assert scan_of(ground, sensor, pose).tolist() == codes
 
 
 def test_range_is_inclusive() -> None:
@@ -170,9 +170,9 @@ def test_noise_depends_on_its_key_alone() -> None:
         first, second = words[1] << 32 | words[0], words[3] << 32 | words[2]
         units = (first >> 11) * 2.0**-53, (second >> 11) * 2.0**-53
         normal = math.sqrt(-2.0 * math.log(1.0 - units[0])) * math.cos(math.tau * units[1])
-        told = scan_of(ground, sensor, Pose(10.0, 0.5), seed=seed, robot=robot, step=step)
+        codes = scan_of(ground, sensor, Pose(10.0, 0.5), seed=seed, robot=robot, step=step)
 
-        assert told.tolist() == [round((30.0 + 2.0 * normal) / 50.0 * CODES)]
+        assert codes.tolist() == [round((30.0 + 2.0 * normal) / 50.0 * CODES)]
 
 
 def test_noise_is_normal() -> None:

@@ -319,9 +319,10 @@ def test_observable_cells_are_those_of_the_definition(
 
     for r in range(rows):
         for c in range(columns):
-            beside = {(r - 1, c), (r + 1, c), (r, c - 1), (r, c + 1)}
+            neighbours = {(r - 1, c), (r + 1, c), (r, c - 1), (r, c + 1)}
             near = any(
-                0 <= a < rows and 0 <= b < columns and a * columns + b in reached for a, b in beside
+                0 <= a < rows and 0 <= b < columns and a * columns + b in reached
+                for a, b in neighbours
             )
             wanted = near if ground.cells[r, c] != FREE else r * columns + c in reached
             assert got[r, c] == wanted

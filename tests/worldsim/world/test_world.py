@@ -215,12 +215,12 @@ def test_finds_are_in_the_observation_of_the_step_that_made_them() -> None:
     """At every reading of the observation, until the next step."""
     there = world((8.0, 0.0))
     step_record(there, 1, (4.0, 0.0))
-    told = [there.observe("r1").detected for _ in range(2)]
+    observed = [there.observe("r1").detected for _ in range(2)]
     step_record(there, 1, (4.0, 0.0))
-    told.append(there.observe("r1").detected)
+    observed.append(there.observe("r1").detected)
     step_record(there, 2, (4.0, 0.0))
 
-    assert told == [(0,), (0,), (0,)]
+    assert observed == [(0,), (0,), (0,)]
     assert there.observe("r1").detected == ()
 
 
@@ -232,7 +232,7 @@ def test_only_the_end_of_a_move_counts_for_detection() -> None:
 
 
 def test_the_supervisor_detects_nothing() -> None:
-    """It has no sensor."""
+    """The supervisor has no sensor."""
     there = world((50.0, 50.0), overrides=("coordination=centralized",))
 
     assert SUPERVISOR not in there.first_look()
@@ -417,7 +417,7 @@ def test_corners_are_not_cut() -> None:
 def test_a_bump_is_reported_of_the_last_step_alone() -> None:
     """A step that is refused for its speed meets no wall; a stale one changes nothing."""
     there = on(ROOM, (0.5, 2.5))
-    told = []
+    observed = []
     for step, place in [
         (1, (2.0, 2.5)),
         (1, (0.5, 2.5)),
@@ -426,9 +426,9 @@ def test_a_bump_is_reported_of_the_last_step_alone() -> None:
         (4, (0.5, 2.5)),
     ]:
         verdict = there.accept("r1", step * PERIOD_NS, Outputs(step, Pose(*place)))
-        told.append((verdict.violations, verdict.bumped, there.observe("r1").bumped))
+        observed.append((verdict.violations, verdict.bumped, there.observe("r1").bumped))
 
-    assert told == [
+    assert observed == [
         ((), True, True),
         (("step",), False, True),
         (("speed",), False, False),
@@ -466,7 +466,7 @@ def test_each_scan_has_noise_of_its_own() -> None:
 
 
 def test_the_supervisor_is_in_no_cell() -> None:
-    """It has no scanner, and may stand in a wall."""
+    """The supervisor has no scanner, and may stand in a wall."""
     there = on(
         ROOM, (0.5, 0.5), overrides=("coordination=centralized", "supervisor.pose_m=[1.5, 1.5]")
     )

@@ -35,9 +35,9 @@ class ProcessEventKind(StrEnum):
     IMPOSTOR_ADMITTED = "let in"
     """A second process asked to join under its id, and was admitted, which must not happen."""
     LEAVE = "leave"
-    """It left the bus although no fault is the cause."""
+    """The process left the bus although no fault is the cause."""
     JOIN = "join"
-    """It is back on the bus after it left, or joined late, although no fault is the cause."""
+    """The process is back on the bus after it left, or joined late, although no fault is the cause."""
 
 
 class EventRules(NamedTuple):
