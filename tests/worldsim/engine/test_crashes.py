@@ -1,4 +1,4 @@
-"""Missions whose processes fail: what is lost, what is not, and what the record says of it."""
+"""Missions whose processes fail: losses, recovery, and the record of both."""
 
 import functools
 from collections import Counter
@@ -70,16 +70,16 @@ def batches(records: list[Record]) -> list[Batch]:
     return [record for record in records if isinstance(record, Batch)]
 
 
-def incidents(records: list[Record]) -> list[ProcessEvent]:
+def process_events(records: list[Record]) -> list[ProcessEvent]:
     return [record for record in records if isinstance(record, ProcessEvent)]
 
 
 def step_records(records: list[Record], name: ParticipantId) -> list[StepRecord]:
     """A participant's answered steps."""
-    told = (step_record for batch in batches(records) for step_record in batch.step_records)
+    recorded = (step_record for batch in batches(records) for step_record in batch.step_records)
     return [
         step_record
-        for step_record in told
+        for step_record in recorded
         if step_record.name == name and step_record.outputs is not None
     ]
 
@@ -96,26 +96,26 @@ def kill(who: str, from_s: float, until_s: float | None, *more: str) -> str:
 
 
 def is_sound(records: list[Record]) -> bool:
-    """Steps without a gap, no message twice, nobody beyond its energy, no rule broken."""
-    all_acts = [
+    """Steps without a gap, no message twice, no robot beyond its energy, no rule broken."""
+    answered = [
         step_record
         for batch in batches(records)
         for step_record in batch.step_records
         if step_record.outputs
     ]
     sent = Counter(
-        (e.source, e.sequence) for step_record in all_acts for e in outputs(step_record).outbox
+        (e.source, e.sequence) for step_record in answered for e in outputs(step_record).outbox
     )
-    spent = Counter(step_record.name for step_record in all_acts if outputs(step_record).spent)
+    spent = Counter(step_record.name for step_record in answered if outputs(step_record).spent)
     steps: dict[ParticipantId, list[int]] = {}
-    for step_record in all_acts:
+    for step_record in answered:
         steps.setdefault(step_record.name, []).append(outputs(step_record).step)
     return (
-        all(told == list(range(1, len(told) + 1)) for told in steps.values())
+        all(numbers == list(range(1, len(numbers) + 1)) for numbers in steps.values())
         and set(sent.values()) == {1}
         and all(count <= 60 for count in spent.values())
         and not any(
-            step_record.verdict.violations for step_record in all_acts if step_record.verdict
+            step_record.verdict.violations for step_record in answered if step_record.verdict
         )
     )
 
@@ -123,7 +123,7 @@ def is_sound(records: list[Record]) -> bool:
 # Killed and started again.
 
 MOMENTS = st.integers(1, 4_500).map(lambda at_ms: at_ms / 1000 + 0.000_300_017)
-"""Seconds; nobody is due just then, and nothing arrives."""
+"""Seconds; at these times no participant is due and no message arrives."""
 
 
 @examples(25)
@@ -132,24 +132,24 @@ MOMENTS = st.integers(1, 4_500).map(lambda at_ms: at_ms / 1000 + 0.000_300_017)
     who=st.sampled_from(["r1", "r3"]),
     moments_s=st.lists(MOMENTS, min_size=1, max_size=4, unique=True),
 )
-def test_restart_with_the_snapshot_is_as_if_nothing_had_been(
+def test_a_restart_with_the_snapshot_changes_no_batch(
     pace: str, who: str, moments_s: list[float]
 ) -> None:
     """Killed and started at once at any moments, however often: every batch is the same."""
     overrides = (*LOSSY, *PACES[pace])
     kills = [kill(who, at_s, at_s + 1e-9) for at_s in sorted(moments_s)]
     records = run(*kills, overrides=overrides)
-    starts = [incident for incident in incidents(records) if incident.kind == "start"]
+    starts = [event for event in process_events(records) if event.kind == "start"]
 
     assert batches(records) == batches(undisturbed(overrides))
-    assert all(incident.incarnation == 0 for incident in starts)
-    assert [(incident.who, incident.kind) for incident in incidents(records)] == [
-        (who, what) for _ in starts for what in ("kill", "start")
+    assert all(event.incarnation == 0 for event in starts)
+    assert [(event.who, event.kind) for event in process_events(records)] == [
+        (who, kind) for _ in starts for kind in ("kill", "start")
     ]
 
 
-def test_what_reaches_a_dead_robot_is_lost() -> None:
-    """What arrives while it is away, and only that; the rest it hears when it goes on."""
+def test_a_message_that_reaches_a_dead_robot_is_lost() -> None:
+    """Messages that arrive while it is dead are lost, and only they; it receives the others when it goes on."""
     records = run(kill("r2", 1.05, 2.05), overrides=("radio.delay_s=0.08",))
     heard = {
         reference for step_record in step_records(records, "r2") for reference in step_record.heard
@@ -176,13 +176,13 @@ def test_what_reaches_a_dead_robot_is_lost() -> None:
 
 @pytest.mark.parametrize("until_s", [1.35, 1.8])
 @pytest.mark.parametrize("pace", list(PACES))
-def test_step_between_its_note_and_its_answer_is_neither_lost_nor_made_twice(
+def test_a_step_between_its_log_entry_and_its_answer_is_neither_lost_nor_made_twice(
     pace: str, until_s: float
 ) -> None:
-    """It spends once: on record before anybody hears of it, told when the robot is back."""
+    """The robot spends once: logged before any participant receives it, reported when it is back."""
     overrides = (*LOSSY, *PACES[pace])
     records = run(kill("r2", 1.22, until_s, "mid_step = true"), overrides=overrides)
-    start = next(incident for incident in incidents(records) if incident.kind == "start")
+    start = next(event for event in process_events(records) if event.kind == "start")
     plain = step_records(undisturbed(overrides), "r2")
     silent = [batch for batch in batches(records) if batch.absent]
     answer = next(
@@ -200,7 +200,7 @@ def test_step_between_its_note_and_its_answer_is_neither_lost_nor_made_twice(
     assert is_sound(records)
 
 
-def test_who_has_no_step_to_die_in_dies_anyway() -> None:
+def test_a_robot_without_a_step_in_the_window_dies_anyway() -> None:
     """A window between two steps; the robot goes on with its snapshot."""
     records = run(kill("r2", 1.22, 1.28, "mid_step = true"))
 
@@ -210,46 +210,50 @@ def test_who_has_no_step_to_die_in_dies_anyway() -> None:
 @pytest.mark.parametrize("mid_step", [False, True])
 @pytest.mark.parametrize("disk", ["torn", "lost"])
 @pytest.mark.parametrize("pace", list(PACES))
-def test_who_forgot_comes_back_as_another(pace: str, disk: str, mid_step: bool) -> None:  # noqa: FBT001
-    """Its steps, messages and energy go on where the world saw them last, in a log of its own."""
+def test_a_robot_without_its_state_comes_back_as_a_new_incarnation(
+    pace: str,
+    disk: str,
+    mid_step: bool,  # noqa: FBT001
+) -> None:
+    """Its steps, messages and energy go on from the last that the world accepted, in a log of its own."""
     more = (f'disk = "{disk}"', *(("mid_step = true",) if mid_step else ()))
     kills = [kill("r1", 1.02, 1.42, *more), kill("r1", 2.02, 2.42, *more)]
     records = run(*kills, overrides=(*LOSSY, *PACES[pace]))
-    starts = [incident for incident in incidents(records) if incident.kind == "start"]
-    told = step_records(records, "r1")
+    starts = [event for event in process_events(records) if event.kind == "start"]
+    made = step_records(records, "r1")
     incarnations = {
         outputs(step_record).step: decode_gossip(envelope.body).incarnation
-        for step_record in told
+        for step_record in made
         for envelope in outputs(step_record).outbox
     }
 
-    assert [incident.incarnation for incident in starts] == [1, 2]
+    assert [event.incarnation for event in starts] == [1, 2]
     assert all(incarnations[start.step] == start.incarnation - 1 for start in starts)
     assert all(incarnations[start.step + 1] == start.incarnation for start in starts)
     assert is_sound(records)
-    assert outputs(told[-1]).energy_spent == sum(
-        bool(outputs(step_record).spent) for step_record in told
+    assert outputs(made[-1]).energy_spent == sum(
+        bool(outputs(step_record).spent) for step_record in made
     )
 
 
 @pytest.mark.parametrize("disk", ["kept", "torn", "lost"])
-def test_who_never_acted_is_nobody_else(disk: str) -> None:
+def test_a_robot_that_never_stepped_keeps_its_incarnation(disk: str) -> None:
     """Killed before or in its first step, it begins as it would have begun."""
     records = run(
         kill("r1", 0.01, 0.52, f'disk = "{disk}"', "mid_step = true"),
         kill("r2", 0.01, 0.52, f'disk = "{disk}"'),
     )
-    starts = {i.who: (i.incarnation, i.step) for i in incidents(records) if i.kind == "start"}
+    starts = {i.who: (i.incarnation, i.step) for i in process_events(records) if i.kind == "start"}
 
     assert starts == {"r1": (0, int(disk == "kept")), "r2": (0, 0)}
     assert is_sound(records)
 
 
-# Not there, or not at work.
+# Late, paused or slow.
 
 
-def test_late_joiner_takes_part() -> None:
-    """It does nothing and hears nothing before it is there; then its first step is its first."""
+def test_a_late_joiner_takes_part() -> None:
+    """The robot neither steps nor receives before it joins; then its first step has number 1."""
     records = run('kind = "late"; who = ["r3"]; until_s = 1.55')
     first = step_records(records, "r3")[0]
     sent_ns = {
@@ -258,7 +262,7 @@ def test_late_joiner_takes_part() -> None:
         for decision in batch.decisions
     }
 
-    assert incidents(records) == [ProcessEvent(1550 * MS, "r3", "start", 0)]
+    assert process_events(records) == [ProcessEvent(1550 * MS, "r3", "start", 0)]
     assert (first.now_ns, outputs(first).step) == (1600 * MS, 1)
     heard = [
         reference for step_record in step_records(records, "r3") for reference in step_record.heard
@@ -268,14 +272,14 @@ def test_late_joiner_takes_part() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("fault", "kinds"),
     [
         ('kind = "pause"; who = ["r2"]; from_s = 1.0; until_s = 1.5', ("pause", "resume")),
         ('kind = "full-disk"; who = ["r2"]; from_s = 1.0; until_s = 1.5', ("fill", "free")),
     ],
 )
-def test_what_is_sent_to_an_idle_robot_waits(fault: str, told: tuple[str, str]) -> None:
-    """It takes no step and sends nothing; then it hears all that came, in order of arrival."""
+def test_messages_to_an_idle_robot_wait(fault: str, kinds: tuple[str, str]) -> None:
+    """The robot takes no step and sends nothing; then it receives all that arrived, in order of arrival."""
     records = run(fault)
     r2 = step_records(records, "r2")
     back = next(step_record for step_record in r2 if step_record.now_ns == 1500 * MS)
@@ -286,27 +290,27 @@ def test_what_is_sent_to_an_idle_robot_waits(fault: str, told: tuple[str, str]) 
         if decision.target == "r2" and 900 * MS <= batch.now_ns < 1500 * MS
     )
 
-    assert tuple(incident.kind for incident in incidents(records)) == told
+    assert tuple(event.kind for event in process_events(records)) == kinds
     assert [step_record.now_ns // MS for step_record in r2][8:11] == [900, 1500, 1600]
     assert back.heard == tuple((source, sequence) for _, source, sequence in waiting)
     assert not any(batch.absent for batch in batches(records))
     assert is_sound(records)
 
 
-def test_slow_robot_gets_to_some_of_its_steps() -> None:
+def test_a_slow_robot_makes_some_of_its_steps() -> None:
     """One in four while it is slow, and no step number is left out."""
     records = run('kind = "slow"; who = ["r2"]; from_s = 1.0; until_s = 2.5; every = 4')
     times_ms = [step_record.now_ns // MS for step_record in step_records(records, "r2")]
 
     assert times_ms[8:15] == [900, 1200, 1600, 2000, 2400, 2500, 2600]
-    assert [incident.kind for incident in incidents(records)] == ["slow", "quicken"]
+    assert [event.kind for event in process_events(records)] == ["slow", "quicken"]
     assert is_sound(records)
 
 
 @pytest.mark.parametrize("offset_s", [-7.0, -0.25, 0.25, 7.0])
 @pytest.mark.parametrize("pace", ["concurrent", "turn", "supervised"])
-def test_wrong_clock_is_on_record_and_breaks_no_rule(pace: str, offset_s: float) -> None:
-    """The machine reads the wrong time, the world goes by the right one."""
+def test_a_wrong_clock_is_on_record_and_breaks_no_rule(pace: str, offset_s: float) -> None:
+    """The robot reads the wrong time, the world uses the right one."""
     clock = f'kind = "clock"; who = ["r2"]; from_s = 1.0; until_s = 2.0; offset_s = {offset_s}'
     records = run(clock, overrides=(*LOSSY, *PACES[pace]))
     wrong = [
@@ -317,9 +321,9 @@ def test_wrong_clock_is_on_record_and_breaks_no_rule(pace: str, offset_s: float)
     step_record = next(
         step_record for step_record in step_records(records, "r2") if step_record.skew_ns
     )
-    mailbag = EnvelopeIndex()
+    index = EnvelopeIndex()
     for batch in batches(records):
-        mailbag.add(batch)
+        index.add(batch)
 
     assert wrong
     assert all(
@@ -327,23 +331,23 @@ def test_wrong_clock_is_on_record_and_breaks_no_rule(pace: str, offset_s: float)
         for step_record in wrong
     )
     assert {step_record.skew_ns for step_record in step_records(records, "r1")} == {0}
-    assert mailbag.inputs(step_record).now_ns == step_record.now_ns + step_record.skew_ns >= 0
+    assert index.inputs(step_record).now_ns == step_record.now_ns + step_record.skew_ns >= 0
     assert is_sound(records)
 
 
-def test_impostor_is_refused() -> None:
-    """Somebody else plays that robot."""
+def test_an_impostor_is_refused() -> None:
+    """Another process already has that robot."""
     records = run('kind = "impostor"; who = ["r2"]; from_s = 1.0')
 
-    assert incidents(records) == [ProcessEvent(1000 * MS, "r2", "pretend", 0)]
+    assert process_events(records) == [ProcessEvent(1000 * MS, "r2", "pretend", 0)]
     assert batches(records) == batches(undisturbed(()))
 
 
 # The end.
 
 
-def test_who_is_dead_for_good_is_not_waited_for() -> None:
-    """The mission is done when the others rest; who comes back is waited for."""
+def test_a_robot_that_is_dead_for_good_is_not_waited_for() -> None:
+    """The mission is done when the others rest; a robot that comes back is waited for."""
     gone = run(kill("r2", 0.52, None))
     away = run(kill("r2", 0.52, 11.0))
 
@@ -353,24 +357,24 @@ def test_who_is_dead_for_good_is_not_waited_for() -> None:
     assert gone[-1].now_ns < 11_000 * MS <= away[-1].now_ns
 
 
-def test_nobody_left_is_a_deserted_mission() -> None:
-    """It ends with the last death."""
+def test_a_mission_without_a_robot_left_is_deserted() -> None:
+    """The mission ends with the last death."""
     records = run(kill("r1", 0.5, None), kill("r2", 0.7, None), kill("r3", 0.7, None))
 
     assert records[-1] == Ending(700 * MS, "deserted")
 
 
-def test_limit_holds_for_deeds_too() -> None:
-    """What would be done after the limit is not done."""
+def test_the_limit_holds_for_process_faults_too() -> None:
+    """A process fault after the limit is not carried out."""
     records = run(kill("r2", 0.52, 2.5), overrides=("limit_s=2.0",))
 
-    assert [incident.kind for incident in incidents(records)] == ["kill"]
+    assert [event.kind for event in process_events(records)] == ["kill"]
     assert records[-1] == Ending(2000 * MS, "limit")
 
 
 # World-sim.
 
-STORMS = (
+LINK_FAULTS = (
     'kind = "replay"; probability = 0.3; age_s = 1.0',
     'kind = "bandwidth"; bytes_per_s = 4000',
     'kind = "duplicate"; probability = 0.3; copies = 2; delay_s = 0.3',
@@ -388,7 +392,7 @@ STORMS = (
 def test_world_sim_goes_on_from_its_record(
     pace: str, from_ms: int, span_ms: int, others: tuple[float, float] | None
 ) -> None:
-    """Killed at any moment, every batch is as if it had only stood still, in the worst of weathers too.
+    """Killed at any moment, every batch is as after a pause, under many link faults too.
 
     others: a robot dies in a step, so long after the outage or before it, and comes back after it.
     """
@@ -401,7 +405,7 @@ def test_world_sim_goes_on_from_its_record(
     killed, paused = (
         run(
             f'kind = "{kind}"; who = ["worldsim"]; {window}',
-            *STORMS,
+            *LINK_FAULTS,
             *crashes,
             overrides=(*LOSSY, *PACES[pace], "targets.count=20"),
         )
@@ -413,13 +417,13 @@ def test_world_sim_goes_on_from_its_record(
         b for b in paused if not isinstance(b, ProcessEvent)
     ][1:]
     assert not any(batch.now_ns in during for batch in batches(killed))
-    told = [(i.now_ns, i.kind) for i in incidents(killed) if i.who == WORLD_SIM]
-    assert told == [(during.start, "kill"), (during.stop, "start")][: len(told)]
+    outage = [(i.now_ns, i.kind) for i in process_events(killed) if i.who == WORLD_SIM]
+    assert outage == [(during.start, "kill"), (during.stop, "start")][: len(outage)]
 
 
 @pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
-def test_world_with_a_map_goes_on_from_its_record(coordination: str) -> None:
-    """What range finders measured, who bumped where: all of it follows from what robots did."""
+def test_a_world_with_a_map_goes_on_from_its_record(coordination: str) -> None:
+    """Scans and bumps are computed again from the recorded steps of the robots."""
     scenario = exploration(
         "robots.count=2",
         f"coordination={coordination}",
@@ -438,7 +442,7 @@ def test_world_with_a_map_goes_on_from_its_record(coordination: str) -> None:
         play(replace(scenario, faults=(lost, outage)), 1, site, [records.append])
         assert isinstance(records[-1], Ending)
         assert records[-1].reason == "done"
-        assert [incident.incarnation for incident in incidents(records) if incident.step] == [1]
+        assert [event.incarnation for event in process_events(records) if event.step] == [1]
         return batches(records)
 
     window = {"who": (WORLD_SIM,), "from_s": 1.2, "until_s": 1.5}
@@ -446,34 +450,34 @@ def test_world_with_a_map_goes_on_from_its_record(coordination: str) -> None:
     assert explored(Kill(**window)) == explored(Pause(**window))  # type: ignore[arg-type]
 
 
-MORTALS = (
+CRASHES = (
     kill("r1", 0.72, 1.32, "mid_step = true"),
     kill("r2", 0.52, 0.92, 'disk = "lost"'),
     kill("r3", 1.22, 2.02, 'disk = "torn"', "mid_step = true"),
     'kind = "clock"; who = ["r1"]; from_s = 1.0; offset_s = -0.5',
     'kind = "pause"; who = ["r2"]; from_s = 1.3; until_s = 2.3',
-    *STORMS,
+    *LINK_FAULTS,
 )
 
 
-def everybody_mortal(scenario: Scenario, site: WorldSetup) -> dict[ParticipantId, KillableNode]:
-    def mortal(name: ParticipantId) -> KillableNode:
+def killable_team(scenario: Scenario, site: WorldSetup) -> dict[ParticipantId, KillableNode]:
+    def killable_node(name: ParticipantId) -> KillableNode:
         place = Simulation(scenario, 1, site, []).body(name).pose
         build = functools.partial(participant, name, scenario, 1, site)
         return KillableNode(build, Body(place))
 
-    return {name: mortal(name) for name in scenario.roster}
+    return {name: killable_node(name) for name in scenario.roster}
 
 
 @pytest.mark.parametrize("pace", ["concurrent", "ahead", "jitter", "supervised"])
-def test_mission_goes_on_from_any_record(pace: str) -> None:
-    """Stopped anywhere, resumed from what was told, with the robots as they are: the same record."""
-    scenario = troubled(*MORTALS, overrides=(*LOSSY, *PACES[pace], "limit_s=3"))
+def test_a_mission_goes_on_from_any_record(pace: str) -> None:
+    """Stopped at any record and resumed from the records, with the robots as they are: the same record."""
+    scenario = troubled(*CRASHES, overrides=(*LOSSY, *PACES[pace], "limit_s=3"))
     site = WorldSetup.of(scenario, 1)
     whole: list[Record] = []
     play(scenario, 1, site, [whole.append])
     for asks in range(1, 60, 2):
-        exchange = InProcessExchange(everybody_mortal(scenario, site))
+        exchange = InProcessExchange(killable_team(scenario, site))
         left = iter(range(asks))
         records: list[Record] = []
         simulation = Simulation(scenario, 1, site, [records.append])
@@ -488,7 +492,7 @@ def test_mission_goes_on_from_any_record(pace: str) -> None:
 
 
 def test_records_that_do_not_follow_are_refused() -> None:
-    """A journal of another version, or one that was changed, is named with its place."""
+    """A journal of another version, or one that was changed, is refused with the number of the record."""
     scenario = troubled(overrides=LOSSY)
     site = WorldSetup.of(scenario, 1)
     records = run(overrides=LOSSY)
@@ -518,12 +522,12 @@ def test_records_that_do_not_follow_are_refused() -> None:
         Simulation.resumed(scenario, 1, site, records, [])
 
 
-def test_only_what_was_heard_is_taken_from_what_is_under_way() -> None:
-    """A stage that is resumed holds exactly what nobody has heard yet."""
+def test_only_received_envelopes_are_removed_from_those_in_flight() -> None:
+    """A simulation that is resumed holds exactly the envelopes that were not received yet."""
     scenario = troubled(overrides=LOSSY)
     records = run(overrides=LOSSY)[:30]
     simulation = Simulation.resumed(scenario, 1, WorldSetup.of(scenario, 1), records, [])
-    under_way = Counter(
+    in_flight = Counter(
         (v.target, v.source, v.sequence)
         for batch in batches(records)
         for v in batch.decisions
@@ -531,12 +535,12 @@ def test_only_what_was_heard_is_taken_from_what_is_under_way() -> None:
     )
     for batch in batches(records):
         for step_record in batch.step_records:
-            under_way.subtract((step_record.name, *reference) for reference in step_record.heard)
+            in_flight.subtract((step_record.name, *reference) for reference in step_record.heard)
     held = Counter(
         (name, envelope.source, envelope.sequence)
         for name in scenario.roster
         for envelope in simulation.channel.collect(name, 2**62)
     )
 
-    assert held == +under_way
+    assert held == +in_flight
     assert held.total() > 0

@@ -1,4 +1,4 @@
-"""The virtual loop: the order of events, and records that are the same every time."""
+"""The loop in virtual time: the order of events, and reproducible records."""
 
 import os
 import subprocess
@@ -60,7 +60,7 @@ def run(
     stopped: Callable[[], bool] = lambda: False,
     prepare: Callable[[Simulation], None] = lambda simulation: None,
 ) -> list[Record]:
-    """The records of a mission whose exchange, stop or stage is meddled with."""
+    """The records of a mission with another exchange, stop condition or simulation."""
     site = WorldSetup.of(scenario, 1)
     records: list[Record] = []
     simulation = Simulation(scenario, 1, site, [records.append])
@@ -72,7 +72,7 @@ def run(
 # Same seed, same record.
 
 
-def test_same_seed_gives_the_same_record() -> None:
+def test_the_same_seed_gives_the_same_record() -> None:
     """Twice the same digest; another seed, another one."""
     scenario = mission("coordination=centralized", *LOSSY)
     first, second = (digest(tuple(run(scenario))) for _ in range(2))
@@ -105,28 +105,28 @@ for coordination in ("centralized", "decentralized"):
 
 
 @pytest.mark.processes
-def test_record_does_not_depend_on_the_hash_seed() -> None:
+def test_a_record_does_not_depend_on_the_hash_seed() -> None:
     """No set or dictionary order of the interpreter reaches a record."""
     from support.strategies import SMALL
 
-    told = set()
+    digests = set()
     for hash_seed in ("0", "1", "4711"):
         command = [sys.executable, "-c", DIGESTS, SMALL, *LOSSY]
         environment = os.environ | {"PYTHONHASHSEED": hash_seed}
-        told.add(subprocess.check_output(command, env=environment, text=True))
+        digests.add(subprocess.check_output(command, env=environment, text=True))
     here = [
         digest(tuple(run(mission(f"coordination={coordination}", *LOSSY))))
         for coordination in ("centralized", "decentralized")
     ]
 
-    assert told == {"\n".join(here) + "\n"}
+    assert digests == {"\n".join(here) + "\n"}
 
 
 # The order of events.
 
 
 def by_definition(scenario: Scenario, seed: int) -> list[Record]:
-    """What simulate stands for: one moment after the other, without looking ahead."""
+    """The definition of `simulate`: one moment after the other, without looking ahead."""
     site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
     simulation = Simulation(scenario, seed, site, [records.append])
@@ -151,10 +151,10 @@ def by_definition(scenario: Scenario, seed: int) -> list[Record]:
 @pytest.mark.parametrize("pace", list(PACES))
 @pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
 @pytest.mark.parametrize("delay_s", [0.0, 0.03, 0.1, 0.45])
-def test_looking_ahead_changes_nothing(
+def test_looking_ahead_changes_no_record(
     played: Play, pace: str, coordination: str, delay_s: float
 ) -> None:
-    """A batch of all who are due within the radio's delay gives the record of the definition."""
+    """A batch of all participants that are due within the radio's delay gives the record of the definition."""
     overrides = (
         "samples.count=60",
         "energy.points=90",
@@ -175,7 +175,7 @@ def test_looking_ahead_changes_nothing(
     lookahead_ms=st.integers(0, 100),
     seed=SEEDS,
 )
-def test_agenda_is_in_order_and_complete(
+def test_the_agenda_is_in_order_and_complete(
     periods_ms: list[int], phases_ms: list[int], lookahead_ms: int, seed: int
 ) -> None:
     """Every step of every clock comes, once, in the order of time, none beyond the look-ahead."""
@@ -214,10 +214,10 @@ def test_agenda_is_in_order_and_complete(
     jitter_ms=st.integers(0, 400),
     seed=SEEDS,
 )
-def test_everything_is_heard_once_at_the_first_step_after_it_is_due(
+def test_an_envelope_is_received_once_at_the_first_step_after_it_is_due(
     played: Play, pace: str, coordination: str, delay_ms: int, jitter_ms: int, seed: int
 ) -> None:
-    """Nobody hears anything before it is due, and nothing that is due is withheld."""
+    """No envelope is received before it is due, and none that is due is withheld."""
     records = played(
         f"coordination={coordination}",
         *LOSSY,
@@ -247,8 +247,8 @@ def test_everything_is_heard_once_at_the_first_step_after_it_is_due(
 # The exchange.
 
 
-def test_messages_pass_the_codec() -> None:
-    """In process too, nothing is shared: a robot gets values of its own, equal to what was sent."""
+def test_inputs_and_outputs_pass_the_codec() -> None:
+    """In process too, nothing is shared: a robot receives copies, equal to the values that were sent."""
     given, returned = [], []
 
     class Echo:
@@ -286,7 +286,7 @@ def without(name: ParticipantId, since_ns: int) -> Callable[[Exchange], Exchange
 
 
 @pytest.mark.parametrize("merge", [("merge=ledger",), ("merge=min", "claims=false")])
-def test_others_go_on_without_a_missing_robot(merge: tuple[str, ...]) -> None:
+def test_other_robots_go_on_without_a_missing_one(merge: tuple[str, ...]) -> None:
     """A missing output is recorded as an absence; the others finish, and no rule is broken."""
     scenario = mission("energy.steps=60", *merge)
     records = run(scenario, exchange=without("r2", 350 * MS))
@@ -311,8 +311,8 @@ def test_others_go_on_without_a_missing_robot(merge: tuple[str, ...]) -> None:
     assert check(records).complaints == []
 
 
-def test_robot_that_has_left_is_not_waited_for() -> None:
-    """When whoever runs the robots knows that one is gone, the mission ends with the others."""
+def test_a_robot_that_has_left_is_not_waited_for() -> None:
+    """When a robot is known to be gone, the mission ends with the others."""
 
     def leave(simulation: Simulation) -> None:
         simulation._gone = {"r2"}
@@ -323,8 +323,8 @@ def test_robot_that_has_left_is_not_waited_for() -> None:
     assert records[-1].reason == "done"
 
 
-def test_robot_that_was_late_goes_on() -> None:
-    """A robot that was asked and did not answer answers that first; its step numbers have no gap."""
+def test_a_robot_that_was_late_goes_on() -> None:
+    """A robot that did not answer a request answers that one first; its step numbers have no gap."""
     scenario = mission("energy.steps=60")
 
     def napping(plain: Exchange) -> Exchange:
@@ -355,8 +355,8 @@ def test_robot_that_was_late_goes_on() -> None:
 # The end.
 
 
-def test_limit_ends_the_record() -> None:
-    """Nothing happens after the limit; what is due at it still does."""
+def test_the_limit_ends_the_record() -> None:
+    """No step is made after the limit; those that are due at it are made."""
     records = run(mission("energy.steps=60", "energy.points=3000", "limit_s=1.5"))
 
     assert records[-1] == Ending(1500 * MS, "limit")
@@ -364,8 +364,8 @@ def test_limit_ends_the_record() -> None:
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.45])
-def test_limit_holds_within_a_batch(delay_s: float) -> None:
-    """However far the loop looks ahead, the record ends at the limit."""
+def test_the_limit_holds_within_a_batch(delay_s: float) -> None:
+    """With any look-ahead of the loop, the record ends at the limit."""
     overrides = ("clock.order=turn", f"radio.delay_s={delay_s}", "limit_s=1.0", "energy.points=900")
     records = run(mission(*overrides))
 
@@ -373,7 +373,7 @@ def test_limit_holds_within_a_batch(delay_s: float) -> None:
     assert batches(records)[-1].now_ns == 1000 * MS
 
 
-def test_interruption_ends_the_record() -> None:
+def test_an_interruption_ends_the_record() -> None:
     """A mission that is stopped leaves a record that is closed, and sound up to there."""
     asked = iter(range(1000))
     records = run(mission(), stopped=lambda: next(asked) >= 4)
@@ -384,8 +384,8 @@ def test_interruption_ends_the_record() -> None:
     assert check(records).complaints == []
 
 
-def test_interruption_before_the_first_step() -> None:
-    """Even then there is an opening and an ending."""
+def test_an_interruption_before_the_first_step_leaves_a_closed_record() -> None:
+    """The record is an opening and an ending."""
     records = run(mission(), stopped=lambda: True)
 
     assert len(records) == 2

@@ -1,4 +1,4 @@
-"""Process faults as time goes by: what is done when, and who is idle meanwhile."""
+"""Process faults over time: their schedule, and the participants that are idle."""
 
 import itertools
 
@@ -30,11 +30,11 @@ BEHIND = 'kind = "clock"; who = ["r3"]; from_s = 2.0; offset_s = -2.5'
 ASKS = 'kind = "impostor"; who = ["r1"]; from_s = 2.0'
 
 
-def test_what_ends_comes_before_what_begins() -> None:
+def test_ends_of_faults_come_before_beginnings() -> None:
     """In order of time, then ends, then of the list: a robot can be started and paused at once."""
-    deeds = schedule_of(troubled(PAUSE, FOR_GOOD, ASKS, KILL))
+    schedule = schedule_of(troubled(PAUSE, FOR_GOOD, ASKS, KILL))
 
-    assert deeds == [
+    assert schedule == [
         ScheduledProcessFault(1000 * MS, 3, "r1", "kill", "torn", mid_step=True),
         ScheduledProcessFault(2000 * MS, 3, "r1", "start", "torn", mid_step=True),
         ScheduledProcessFault(2000 * MS, 0, "r1", "pause"),
@@ -47,12 +47,12 @@ def test_what_ends_comes_before_what_begins() -> None:
 
 
 def test_world_sim_comes_first_and_goes_last() -> None:
-    """Whoever starts, or stops, at the same moment is seen by it."""
+    """World-sim observes each participant that starts or stops at the same moment."""
     outage = 'kind = "kill"; who = ["worldsim"]; from_s = 1.0; until_s = 2.0'
     pause = 'kind = "pause"; who = ["r3"]; from_s = 1.0; until_s = 2.0'
-    deeds = schedule_of(troubled(outage, pause))
+    schedule = schedule_of(troubled(outage, pause))
 
-    assert [(deed.who, deed.kind) for deed in deeds] == [
+    assert [(scheduled.who, scheduled.kind) for scheduled in schedule] == [
         ("r3", "pause"),
         ("worldsim", "kill"),
         ("worldsim", "start"),
@@ -82,22 +82,22 @@ def test_world_sim_comes_first_and_goes_last() -> None:
         ("r3", 8000, False),
     ],
 )
-def test_who_is_idle_when(who: str, at_ms: int, idle: bool) -> None:  # noqa: FBT001
-    """From the beginning of a window up to its end; everybody is while world-sim is."""
+def test_a_participant_is_idle_within_its_windows(who: str, at_ms: int, idle: bool) -> None:  # noqa: FBT001
+    """From the beginning of a window up to its end; all participants are while world-sim is."""
     outages = ProcessFaults(troubled(KILL, FOR_GOOD, PAUSE, DARK, SLOW))
 
     assert outages.idle(who, at_ms * MS) == idle
 
 
-def test_nobody_is_idle_or_dies_while_it_is_quiet() -> None:
+def test_no_participant_is_idle_or_dies_while_it_is_quiet() -> None:
     """Before the first window and after the last; windows of clocks and of links do not count."""
     outages = ProcessFaults(troubled(KILL, PAUSE, AHEAD))
     quiet = [outages.quiet(at_ms * MS, (at_ms + 99) * MS) for at_ms in range(0, 9000, 100)]
 
     for i, is_quiet in enumerate(quiet):
         for name, at_ms in itertools.product(("r1", "r2", "r3"), (100 * i, 100 * i + 99)):
-            struck = outages.idle(name, at_ms * MS) or outages.dies(name, at_ms * MS)
-            assert not (is_quiet and struck)
+            affected = outages.idle(name, at_ms * MS) or outages.dies(name, at_ms * MS)
+            assert not (is_quiet and affected)
     assert quiet[0]
     assert quiet[-1]
     assert not all(quiet)
@@ -115,7 +115,7 @@ def test_nobody_is_idle_or_dies_while_it_is_quiet() -> None:
     ],
 )
 def test_faults_of_a_clock_add_up(at_ms: int, skew_ns: int) -> None:
-    """It jumps, runs wrong, and jumps back."""
+    """The clock jumps, runs wrong, and jumps back."""
     assert ProcessFaults(troubled(AHEAD, BEHIND)).skew_ns("r3", at_ms * MS) == skew_ns
 
 
@@ -126,8 +126,8 @@ def test_no_clock_shows_a_time_before_the_start() -> None:
     assert ProcessFaults(troubled(early)).skew_ns("r3", 1000 * MS) == -1000 * MS
 
 
-def test_who_dies_in_a_step() -> None:
-    """A step to die in is any within the window."""
+def test_a_robot_dies_in_a_step_within_the_window() -> None:
+    """Any step within the window is one in which it may die."""
     outages = ProcessFaults(troubled(KILL, FOR_GOOD))
 
     assert [outages.dies("r1", at_ms * MS) for at_ms in (999, 1000, 2000)] == [False, True, False]
@@ -135,12 +135,12 @@ def test_who_dies_in_a_step() -> None:
 
 
 @pytest.mark.parametrize("done", range(10))
-def test_every_deed_is_handed_out_once(done: int) -> None:
-    """One by one, when it is due, from the beginning or from where somebody left off."""
+def test_every_scheduled_fault_is_returned_once(done: int) -> None:
+    """One by one, when it is due, from the beginning or from the point that was reached before."""
     scenario = troubled(KILL, ASKS, PAUSE, DARK)
     outages, left = ProcessFaults(scenario, done), schedule_of(scenario)[done:]
 
-    for deed in left:
-        assert outages.next_ns == deed.at_ns
-        assert outages.pop() == deed
+    for scheduled in left:
+        assert outages.next_ns == scheduled.at_ns
+        assert outages.pop() == scheduled
     assert outages.next_ns is None

@@ -1,4 +1,4 @@
-"""What a run folder holds for a world-sim that comes after one that was killed."""
+"""Resuming: the contents of a run folder for a world-sim that follows one that was killed."""
 
 import json
 import os
@@ -55,13 +55,13 @@ def cut_short() -> Iterator[Cut]:
 
 
 def drop(recording: Recording) -> None:
-    """As the operating system does with the files of whoever is killed."""
+    """Close the files, as the operating system does for a killed process."""
     recording.journal._drop_file()
     if recording._table is not None:
         recording._table.close()
 
 
-def test_a_run_that_was_cut_short_is_found_as_it_was(
+def test_a_run_that_was_cut_short_is_read_as_it_was(
     cut_short: Cut, records: tuple[Record, ...], tmp_path: Path
 ) -> None:
     recording = cut_short(tmp_path, records[:20])
@@ -154,7 +154,7 @@ def test_an_interrupted_mission_can_be_resumed_and_one_that_is_over_cannot(
         Past.of(tmp_path / "done")
 
 
-def test_an_ending_without_a_result_is_reached_again(
+def test_an_ending_without_a_result_is_left_out(
     cut_short: Cut, records: tuple[Record, ...], tmp_path: Path
 ) -> None:
     """World-sim was killed between the last record and the result."""
@@ -165,7 +165,7 @@ def test_an_ending_without_a_result_is_reached_again(
     assert not (tmp_path / RESULT).exists()
 
 
-def test_what_is_no_run_is_refused_with_a_line(
+def test_a_folder_without_a_run_is_refused_in_one_line(
     cut_short: Cut, records: tuple[Record, ...], tmp_path: Path
 ) -> None:
     with pytest.raises(ResumeError, match="no run to go on with"):

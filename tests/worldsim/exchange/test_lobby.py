@@ -1,4 +1,4 @@
-"""Admission of processes, with a bus that the test plays."""
+"""The lobby: admission of processes, with a simulated bus."""
 
 from typing import cast
 
@@ -25,24 +25,24 @@ class Bus:
         self.now_s = 0.0
 
     def monotonic(self) -> float:
-        """Seconds."""
+        """The simulated time in seconds."""
         return self.now_s
 
     def next(self, timeout_s: float) -> Event | None:
-        """The next event; without one time passes."""
+        """The next event; without one, time passes."""
         if self.events:
             return self.events.pop(0)
         self.now_s += timeout_s
         return None
 
     def send(self, name: str, payload: bytes, *, blocking: bool) -> None:
-        """Note it."""
+        """Keep a message."""
         assert blocking
         self.sent.append((name, payload))
 
 
-def test_who_is_there_and_silent_is_told_its_mission_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Behind a site's router a process may be seen before it can be reached: it is told once in RETRY_S."""
+def test_a_silent_participant_is_sent_its_mission_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind a site's router a process may be visible before it can be reached: the mission is sent once in RETRY_S."""
     bus, scenario = Bus(), mission()
     monkeypatch.setattr("kantor_worldsim.exchange.lobby.time", bus)
     setup = WorldSetup.of(scenario, 0)
@@ -60,7 +60,7 @@ def test_who_is_there_and_silent_is_told_its_mission_again(monkeypatch: pytest.M
     while bus.now_s < 3.5 * RETRY_S:
         lobby.next(0.1 * RETRY_S)
 
-    told = [decode_to_participant(payload) for _, payload in bus.sent]
+    received = [decode_to_participant(payload) for _, payload in bus.sent]
     assert {name for name, _ in bus.sent} == {"r1"}
-    assert len(told) == 4
-    assert all(isinstance(message, Mission) and message.nonce == "nonce" for message in told)
+    assert len(received) == 4
+    assert all(isinstance(message, Mission) and message.nonce == "nonce" for message in received)

@@ -1,4 +1,4 @@
-"""Who plays whom: doubles, successors, predecessors that wake up."""
+"""Membership: the process of each participant; doubles, successors, predecessors that wake up."""
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -8,38 +8,38 @@ from support.strategies import examples
 
 
 def test_a_second_process_is_refused_while_the_first_is_there() -> None:
-    admission = Membership(("r1", "r2"))
-    assert admission.join("r1", "one") is JoinDecision.NEW
-    assert admission.join("r1", "other") is JoinDecision.TAKEN
-    assert not admission.leave("r1", "other")
-    assert admission.player("r1") == "one"
-    assert admission.join("r2", "two") is JoinDecision.NEW
+    membership = Membership(("r1", "r2"))
+    assert membership.join("r1", "one") is JoinDecision.NEW
+    assert membership.join("r1", "other") is JoinDecision.TAKEN
+    assert not membership.leave("r1", "other")
+    assert membership.player("r1") == "one"
+    assert membership.join("r2", "two") is JoinDecision.NEW
 
 
-def test_a_process_that_comes_back_with_nobody_in_between_goes_on() -> None:
-    admission = Membership(("r1",))
-    admission.join("r1", "one")
-    assert admission.leave("r1", "one")
-    assert admission.player("r1") is None
-    assert admission.join("r1", "one") is JoinDecision.BACK
+def test_a_process_that_comes_back_without_a_successor_goes_on() -> None:
+    membership = Membership(("r1",))
+    membership.join("r1", "one")
+    assert membership.leave("r1", "one")
+    assert membership.player("r1") is None
+    assert membership.join("r1", "one") is JoinDecision.BACK
 
 
-def test_a_frozen_predecessor_is_refused_for_ever() -> None:
-    admission = Membership(("r1",))
-    admission.join("r1", "one")
-    admission.leave("r1", "one")
-    assert admission.join("r1", "two") is JoinDecision.NEW
-    assert admission.join("r1", "one") is JoinDecision.FENCED
-    admission.leave("r1", "two")
-    assert admission.join("r1", "one") is JoinDecision.FENCED
-    assert admission.join("r1", "two") is JoinDecision.BACK
+def test_a_frozen_predecessor_is_refused_forever() -> None:
+    membership = Membership(("r1",))
+    membership.join("r1", "one")
+    membership.leave("r1", "one")
+    assert membership.join("r1", "two") is JoinDecision.NEW
+    assert membership.join("r1", "one") is JoinDecision.FENCED
+    membership.leave("r1", "two")
+    assert membership.join("r1", "one") is JoinDecision.FENCED
+    assert membership.join("r1", "two") is JoinDecision.BACK
 
 
-def test_nobody_plays_who_is_not_in_the_team() -> None:
-    admission = Membership(("r1",))
-    assert admission.join("r2", "one") is JoinDecision.UNKNOWN
-    assert not admission.leave("r2", "one")
-    assert admission.player("r1") is None
+def test_an_unknown_participant_is_refused() -> None:
+    membership = Membership(("r1",))
+    assert membership.join("r2", "one") is JoinDecision.UNKNOWN
+    assert not membership.leave("r2", "one")
+    assert membership.player("r1") is None
     assert set(REFUSALS) == set(JoinDecision) - {JoinDecision.NEW, JoinDecision.BACK}
 
 
@@ -51,21 +51,21 @@ EVENTS = st.lists(
 
 @given(EVENTS)
 @examples(300)
-def test_one_plays_at_a_time_and_who_was_succeeded_never_again(
+def test_one_process_at_a_time_and_never_one_that_was_succeeded(
     events: list[tuple[bool, str, str]],
 ) -> None:
-    """Against the rule in words: the history of those let in never returns to an earlier one."""
-    admission = Membership(("r1", "r2"))
+    """Against the stated rule: the history of admitted processes never returns to an earlier one."""
+    membership = Membership(("r1", "r2"))
     history: dict[str, list[str]] = {"r1": [], "r2": [], "r3": []}
     here: dict[str, str] = {}
     for comes, name, letter in events:
         nonce = f"{name}{letter}"
         if not comes:
-            assert admission.leave(name, nonce) == (here.get(name) == nonce)
+            assert membership.leave(name, nonce) == (here.get(name) == nonce)
             if here.get(name) == nonce:
                 del here[name]
             continue
-        entry = admission.join(name, nonce)
+        entry = membership.join(name, nonce)
         past = history[name]
         if entry is JoinDecision.NEW:
             assert name not in here
@@ -82,4 +82,4 @@ def test_one_plays_at_a_time_and_who_was_succeeded_never_again(
             assert nonce in past[:-1]
         else:
             assert name == "r3"
-        assert admission.player(name) == here.get(name)
+        assert membership.player(name) == here.get(name)

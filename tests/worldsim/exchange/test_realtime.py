@@ -22,10 +22,10 @@ NUMBERS = st.lists(st.integers(0, 5), max_size=12)
 
 @given(handed=NUMBERS, kept=st.lists(st.booleans(), min_size=12, max_size=12))
 @examples(300)
-def test_whatever_part_of_what_was_handed_out_arrived_is_believed(
+def test_any_reported_part_of_the_handed_out_inbox_is_accepted(
     handed: list[int], kept: list[bool]
 ) -> None:
-    """A full queue drops some; the rest is in order. Numbers come twice, as duplicates do."""
+    """A full queue drops some; the rest is in order. Numbers may occur twice, as duplicates do."""
     outbox = Outbox()
     outbox.waiting += [envelope(number) for number in handed]
     assert [e.sequence for e in outbox.hand()] == handed
@@ -37,22 +37,22 @@ def test_whatever_part_of_what_was_handed_out_arrived_is_believed(
     assert len(outbox.handed) <= len(handed) - len(arrived)
 
 
-@given(handed=NUMBERS, told=NUMBERS)
+@given(handed=NUMBERS, reported=NUMBERS)
 @examples(300)
-def test_nothing_else_is_believed(handed: list[int], told: list[int]) -> None:
-    """Against the rule in words: an inbox is a subsequence of what was handed out."""
+def test_no_other_reported_inbox_is_accepted(handed: list[int], reported: list[int]) -> None:
+    """Against the stated rule: an inbox is a subsequence of what was handed out."""
     outbox = Outbox()
     outbox.waiting += [envelope(number) for number in handed]
     outbox.hand()
     rest = iter(handed)
-    possible = all(number in rest for number in told)
+    possible = all(number in rest for number in reported)
 
-    assert (outbox.received(tuple(("r1", number) for number in told)) is not None) == possible
+    assert (outbox.received(tuple(("r1", number) for number in reported)) is not None) == possible
     if not possible:
         assert [e.sequence for e in outbox.handed] == handed
 
 
-def test_what_waits_for_who_does_not_listen_is_bounded() -> None:
+def test_the_outbox_of_a_silent_participant_is_bounded() -> None:
     outbox = Outbox()
     outbox.waiting += [envelope(i) for i in range(3 * INBOX_MAX)]
     first = outbox.hand()
@@ -64,7 +64,7 @@ def test_what_waits_for_who_does_not_listen_is_bounded() -> None:
     assert len(outbox.waiting) == 0
 
 
-def beset(*faults: str) -> Scenario:
+def with_faults(*faults: str) -> Scenario:
     return mission(f"faults=[{', '.join(faults)}]")
 
 
@@ -74,18 +74,18 @@ CLOCK = '{kind="clock", who=["r2"], offset_s=3}'
 DROP = '{kind="drop", probability=0.5}'
 
 
-def test_faults_of_real_processes_need_hands() -> None:
-    """Turn by turn a pause needs none; a clock is set by a message."""
-    assert needs_process_control(beset(DROP, CLOCK), "wall") is None
-    assert needs_process_control(beset(DROP, PAUSE), "lockstep") is None
-    assert needs_process_control(beset(DROP, PAUSE), "wall") == "faults[1]: pause"
-    assert needs_process_control(beset(CLOCK, DROP, KILL), "lockstep") == "faults[2]: kill"
+def test_faults_of_real_processes_need_process_control() -> None:
+    """In lockstep a pause needs none; a clock is set by a message."""
+    assert needs_process_control(with_faults(DROP, CLOCK), "wall") is None
+    assert needs_process_control(with_faults(DROP, PAUSE), "lockstep") is None
+    assert needs_process_control(with_faults(DROP, PAUSE), "wall") == "faults[1]: pause"
+    assert needs_process_control(with_faults(CLOCK, DROP, KILL), "lockstep") == "faults[2]: kill"
 
 
-def test_a_killed_world_sim_knows_when_it_was_to_come_back() -> None:
-    """Other schedule may be due before."""
+def test_a_killed_world_sim_knows_the_time_of_its_restart() -> None:
+    """Other scheduled faults may be due before."""
     schedule = schedule_of(
-        beset(
+        with_faults(
             '{kind="kill", who=["worldsim"], from_s=3, until_s=5}',
             '{kind="pause", who=["r2"], from_s=2, until_s=4}',
         )

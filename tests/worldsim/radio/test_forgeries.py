@@ -1,4 +1,4 @@
-"""Forged envelopes: what comes beside real ones, and that nobody takes any of it in."""
+"""Forged envelopes: extra envelopes with real ones, which every receiver refuses."""
 
 import itertools
 from collections import Counter
@@ -54,8 +54,8 @@ BODY = encode_gossip(GossipMessage(1, 7, 1.0, 2.0, b"\1\2\3\4\5\6", b"\0\0\1\1\2
 NAMES = ("r1", "r2", "r3")
 
 
-class Air:
-    """A radio with everybody in one place."""
+class HostileRadio:
+    """A radio with all participants in one place."""
 
     def __init__(self, *faults: Hostile | Partition | Delay | Drop, seed: int = 1) -> None:
         self.scenario = msgspec.structs.replace(mission(), faults=faults)
@@ -64,15 +64,15 @@ class Air:
         for name in self.scenario.roster:
             self.channel.place(name, Pose(0.0, 0.0))
 
-    def say(self, *sent: Sent) -> tuple[list[DeliveryDecision], list[DeliveryDecision]]:
-        """What becomes of envelopes, and of what comes beside them."""
+    def transmit(self, *sent: Sent) -> tuple[list[DeliveryDecision], list[DeliveryDecision]]:
+        """Decisions on envelopes, and on the forgeries that arrive with them."""
         decisions = self.channel.transmit(sent)[0]
-        beside = [v for v in decisions if v.sequence >= FORGED_SEQUENCE_MIN]
-        return [v for v in decisions if v.sequence < FORGED_SEQUENCE_MIN], beside
+        extra = [v for v in decisions if v.sequence >= FORGED_SEQUENCE_MIN]
+        return [v for v in decisions if v.sequence < FORGED_SEQUENCE_MIN], extra
 
 
-def chatter(count: int) -> list[Sent]:
-    """Everybody speaks to everybody `count` times, 100 ms apart."""
+def broadcasts(count: int) -> list[Sent]:
+    """`count` broadcasts of each participant, 100 ms apart."""
     return [
         Sent(100 * MS * i, Envelope(name, i, EVERYBODY, BODY))
         for i in range(1, count + 1)
@@ -80,49 +80,51 @@ def chatter(count: int) -> list[Sent]:
     ]
 
 
-# What is injected.
+# Injected envelopes.
 
 
-def test_what_is_sent_is_ruled_as_if_there_were_none() -> None:
-    air = Air(Hostile(probability=0.5))
+def test_forgeries_change_no_decision_on_sent_envelopes() -> None:
+    radio = HostileRadio(Hostile(probability=0.5))
 
-    assert air.say(*chatter(50))[0] == Air().say(*chatter(50))[0]
+    assert radio.transmit(*broadcasts(50))[0] == HostileRadio().transmit(*broadcasts(50))[0]
 
 
 @pytest.mark.parametrize("probability", [0.1, 0.9])
 def test_forgeries_come_at_their_rate(probability: float) -> None:
-    air = Air(Hostile(probability=probability))
-    beside = air.say(*chatter(300))[1]
-    (stats,) = air.faults.pop_stats()
+    radio = HostileRadio(Hostile(probability=probability))
+    extra = radio.transmit(*broadcasts(300))[1]
+    (stats,) = radio.faults.pop_stats()
 
-    assert abs(len(beside) - 1800 * probability) < 5 * (1800 * 0.09) ** 0.5
-    assert stats.forged == len(beside)
+    assert abs(len(extra) - 1800 * probability) < 5 * (1800 * 0.09) ** 0.5
+    assert stats.forged == len(extra)
 
 
-def test_a_forgery_arrives_with_what_it_comes_beside_and_has_a_number_of_its_own() -> None:
-    """It is for that receiver, in the sender's name or a stranger's, and it is on record."""
-    air = Air(Hostile(probability=1.0))
-    decisions, beside = air.say(*chatter(100))
-    forgeries = air.faults.pop_forged()
+def test_a_forgery_arrives_with_its_message_and_has_a_sequence_number_of_its_own() -> None:
+    """A forgery is for the same receiver, in the sender's name or a stranger's, and it is on record."""
+    radio = HostileRadio(Hostile(probability=1.0))
+    decisions, extra = radio.transmit(*broadcasts(100))
+    forgeries = radio.faults.pop_forged()
 
-    assert [v.sequence for v in beside] == list(
+    assert [v.sequence for v in extra] == list(
         range(FORGED_SEQUENCE_MIN, FORGED_SEQUENCE_MIN + 600)
     )
-    assert [(v.source, v.sequence, v.target) for v in beside] == [
+    assert [(v.source, v.sequence, v.target) for v in extra] == [
         (e.source, e.sequence, e.target) for e in forgeries
     ]
-    for own, other in zip(decisions, beside, strict=True):
+    for own, other in zip(decisions, extra, strict=True):
         assert (own.target, own.due_ns) == (other.target, other.due_ns)
         assert other.source == own.source or other.source in strangers(NAMES)
-    assert air.faults.pop_forged() == ()
-    assert air.say(*chatter(1))[1][0].sequence == FORGED_SEQUENCE_MIN + 600
+    assert radio.faults.pop_forged() == ()
+    assert radio.transmit(*broadcasts(1))[1][0].sequence == FORGED_SEQUENCE_MIN + 600
 
 
-def test_forgeries_share_the_fate_of_links() -> None:
-    """A cut severs them as well, losses strike them by themselves, delays hold them up."""
-    halves = Air(Hostile(probability=1.0), Partition(shape="halves")).say(*chatter(50))
-    lossy = Air(Hostile(probability=1.0), Drop(probability=0.5)).say(*chatter(200))
-    late = Air(Delay(delay_s=0.5), Hostile(probability=1.0)).say(*chatter(1))
+def test_other_link_faults_apply_to_forgeries() -> None:
+    """A cut severs them as well, losses are drawn for each alone, delays apply to them."""
+    halves = HostileRadio(Hostile(probability=1.0), Partition(shape="halves")).transmit(
+        *broadcasts(50)
+    )
+    lossy = HostileRadio(Hostile(probability=1.0), Drop(probability=0.5)).transmit(*broadcasts(200))
+    late = HostileRadio(Delay(delay_s=0.5), Hostile(probability=1.0)).transmit(*broadcasts(1))
 
     for own, other in zip(*halves, strict=True):
         assert own.due_ns == other.due_ns
@@ -134,33 +136,33 @@ def test_forgeries_share_the_fate_of_links() -> None:
 @examples(40)
 @given(st.data())
 def test_forgeries_depend_on_the_message_alone(data: st.DataObject) -> None:
-    """All but their numbers: in any portions, with others in between or not."""
-    talk = chatter(20)
+    """All but their sequence numbers: in any portions, with others in between or not."""
+    talk = broadcasts(20)
     some = [talk[i] for i in sorted(data.draw(st.sets(st.integers(0, len(talk) - 1))))]
     made = []
     for portions in ([talk], [some], [[each] for each in some]):
-        air = Air(Hostile(probability=0.5))
+        radio = HostileRadio(Hostile(probability=0.5))
         made.append([])
         for portion in portions:
-            air.say(*portion)
-        for envelope in air.faults.pop_forged():
+            radio.transmit(*portion)
+        for envelope in radio.faults.pop_forged():
             made[-1].append((envelope.source, envelope.target, envelope.body))
 
     assert made[1] == made[2]
     assert not Counter(made[1]) - Counter(made[0])
 
 
-# What is forged.
+# The catalogue.
 
 
-def test_nobody_is_called_like_a_stranger() -> None:
+def test_no_participant_has_the_name_of_a_stranger() -> None:
     for scenario in (mission(), mission("coordination=centralized")):
         assert not set(strangers(scenario.roster)) & set(scenario.roster)
         assert EVERYBODY in strangers(scenario.roster)
     assert SUPERVISOR in strangers(NAMES)
 
 
-def test_every_entry_of_the_catalogue_comes_and_the_oversized_are_rare() -> None:
+def test_every_entry_of_the_catalogue_occurs_and_oversized_ones_are_rare() -> None:
     made = [
         forge(ForgeryDraws(1, 5, i, 0), Envelope("r1", i, "", BODY), ("x",)) for i in range(8000)
     ]
@@ -181,7 +183,7 @@ def test_every_entry_of_the_catalogue_comes_and_the_oversized_are_rare() -> None
     seed=SEEDS,
     which=st.integers(0, len(FORGERS) - 1),
 )
-def test_forgers_are_total_and_forge_the_same_again(
+def test_forgers_are_total_and_deterministic(
     news: GossipMessage, noise: bytes, seed: int, which: int
 ) -> None:
     for body in (encode_gossip(news), noise, b""):
@@ -191,7 +193,7 @@ def test_forgers_are_total_and_forge_the_same_again(
         assert first == second
 
 
-def _is_news(body: bytes) -> bool:
+def _is_gossip(body: bytes) -> bool:
     try:
         decode_gossip(body)
     except RefusedError:
@@ -199,11 +201,11 @@ def _is_news(body: bytes) -> bool:
     return True
 
 
-def test_some_forgeries_are_only_found_out_by_what_they_say() -> None:
-    """So the door is not all that is tested."""
-    found_out = [f for f in FORGERS if _is_news(forged(f, ForgeryDraws(1, 1, 1, 1), BODY))]
+def test_some_forgeries_decode_and_are_refused_by_their_contents() -> None:
+    """So the decoder is not the only check that is tested."""
+    decoded = [f for f in FORGERS if _is_gossip(forged(f, ForgeryDraws(1, 1, 1, 1), BODY))]
 
-    assert len(found_out) >= 8
+    assert len(decoded) >= 8
 
 
 # Whole missions.
@@ -260,22 +262,22 @@ def _clean(record: Record) -> Record:
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_nobody_takes_in_anything_of_the_catalogue(
+def test_every_participant_refuses_every_entry_of_the_catalogue(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Everybody does what it does without forgeries, and counts each that reaches it.
+    """Each participant acts as without forgeries, and counts each that reaches it.
 
     Every forger, and every stranger, in turn.
     """
     made: Counter[object] = Counter()
 
     def in_turn(
-        dice: ForgeryDraws, envelope: Envelope, names: tuple[str, ...]
+        draws: ForgeryDraws, envelope: Envelope, names: tuple[str, ...]
     ) -> tuple[str, bytes]:
         which = made.total() % (len(FORGERS) + len(names))
         made[which] += 1
         if which < len(FORGERS):
-            return envelope.source, forged(FORGERS[which], dice, envelope.body)
+            return envelope.source, forged(FORGERS[which], draws, envelope.body)
         return names[which - len(FORGERS)], envelope.body
 
     monkeypatch.setattr(injection, "forge", in_turn)
@@ -296,18 +298,20 @@ def test_nobody_takes_in_anything_of_the_catalogue(
     assert without_forgeries(records) == without_forgeries(recorded(scenario))
 
 
-def test_inboxes_with_forgeries_can_be_opened_again() -> None:
+def test_inboxes_with_forgeries_can_be_rebuilt() -> None:
     """From the records as they are kept, also when they have to be encoded first."""
     scenario = msgspec.structs.replace(mission(), faults=3 * (Hostile(probability=0.5),))
-    mailbag = EnvelopeIndex()
-    heard = 0
+    index = EnvelopeIndex()
+    received = 0
     for record in recorded(scenario):
         again = decode_record(encode_record(record))
         assert again == record
         if isinstance(again, Batch):
             for step_record in again.step_records:
-                inputs = mailbag.inputs(step_record)
-                heard += sum(envelope.sequence >= FORGED_SEQUENCE_MIN for envelope in inputs.inbox)
-            mailbag.add(again)
+                inputs = index.inputs(step_record)
+                received += sum(
+                    envelope.sequence >= FORGED_SEQUENCE_MIN for envelope in inputs.inbox
+                )
+            index.add(again)
 
-    assert heard > 50
+    assert received > 50

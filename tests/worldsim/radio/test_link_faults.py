@@ -1,4 +1,4 @@
-"""Link faults: what each does to the radio's verdicts, what they do together, and whole missions under them."""
+"""Link faults: the effect of each on the radio's decisions, of several together, and whole missions under them."""
 
 import itertools
 import math
@@ -56,8 +56,8 @@ S = 1_000 * MS
 # A radio with faults.
 
 
-class Air:
-    """A channel under faults, with everybody in one place unless told otherwise."""
+class FaultyRadio:
+    """A channel under faults, with all participants in one place but for those in `at`."""
 
     def __init__(
         self,
@@ -73,13 +73,13 @@ class Air:
         for name in self.scenario.roster:
             self.channel.place(name, Pose(*(at or {}).get(name, (0.0, 0.0))))
 
-    def say(self, *sent: Sent) -> list[DeliveryDecision]:
-        """What becomes of envelopes."""
+    def transmit(self, *sent: Sent) -> list[DeliveryDecision]:
+        """Decisions on envelopes."""
         return self.channel.transmit(sent)[0]
 
     @property
     def fault_stats(self) -> dict[int, dict[str, int]]:
-        """What each fault did, without what it did not."""
+        """Effects of each fault, without counters that are zero."""
         return {
             stats.fault: {
                 k: n for k, n in msgspec.structs.asdict(stats).items() if n and k != "fault"
@@ -88,21 +88,21 @@ class Air:
         }
 
 
-def said(
+def sent_by(
     source: ParticipantId,
     sequence: int,
     now_ns: int = 0,
     target: ParticipantId = EVERYBODY,
     size: int = 0,
 ) -> Sent:
-    """An envelope on the air."""
+    """An envelope on the radio."""
     return Sent(now_ns, Envelope(source, sequence, target, bytes(size)))
 
 
-def chatter(count: int, roster: Sequence[str] = ("r1", "r2", "r3"), size: int = 0) -> list[Sent]:
-    """Everybody speaks to everybody `count` times, 100 ms apart."""
+def broadcasts(count: int, roster: Sequence[str] = ("r1", "r2", "r3"), size: int = 0) -> list[Sent]:
+    """`count` broadcasts of each participant, 100 ms apart."""
     return [
-        said(name, sequence, 100 * MS * sequence, size=size)
+        sent_by(name, sequence, 100 * MS * sequence, size=size)
         for sequence in range(1, count + 1)
         for name in roster
     ]
@@ -113,14 +113,14 @@ def dues(decisions: Sequence[DeliveryDecision]) -> list[int]:
 
 
 def reached(decisions: Sequence[DeliveryDecision]) -> set[str]:
-    """Links over which something passed, as source>target."""
+    """Links over which a copy passed, as source>target."""
     return {f"{v.source}>{v.target}" for v in decisions if v.due_ns != DROPPED}
 
 
 ALL = {f"{one}>{other}" for one, other in itertools.permutations(("r1", "r2", "r3"), 2)}
 
 
-def within_luck(hits: int, trials: int, rate: float) -> bool:
+def within_five_sigma(hits: int, trials: int, rate: float) -> bool:
     """Whether a count is within five standard deviations of a binomial one."""
     return abs(hits - trials * rate) <= 5.0 * math.sqrt(trials * rate * (1.0 - rate)) + 0.5
 
@@ -131,18 +131,18 @@ def within_luck(hits: int, trials: int, rate: float) -> bool:
 @pytest.mark.parametrize(
     ("now_ns", "lost"), [(0, False), (S - 1, False), (S, True), (2 * S - 1, True), (2 * S, False)]
 )
-def test_a_window_has_its_beginning_and_not_its_end(*, now_ns: int, lost: bool) -> None:
-    air = Air(Drop(probability=1.0, from_s=1.0, until_s=2.0))
+def test_a_window_includes_its_beginning_and_excludes_its_end(*, now_ns: int, lost: bool) -> None:
+    radio = FaultyRadio(Drop(probability=1.0, from_s=1.0, until_s=2.0))
 
-    assert dues(air.say(said("r1", 1, now_ns))) == 2 * [DROPPED if lost else now_ns]
+    assert dues(radio.transmit(sent_by("r1", 1, now_ns))) == 2 * [DROPPED if lost else now_ns]
 
 
-def test_named_robots_have_their_links_struck_both_ways() -> None:
-    air = Air(Drop(probability=1.0, robots=("r2",)))
+def test_named_robots_have_their_links_affected_in_both_directions() -> None:
+    radio = FaultyRadio(Drop(probability=1.0, robots=("r2",)))
 
-    assert reached(air.say(*chatter(1))) == {"r1>r3", "r3>r1"}
-    assert air.fault_stats == {0: {"dropped": 4}}
-    assert air.fault_stats == {}
+    assert reached(radio.transmit(*broadcasts(1))) == {"r1>r3", "r3>r1"}
+    assert radio.fault_stats == {0: {"dropped": 4}}
+    assert radio.fault_stats == {}
 
 
 # Loss.
@@ -150,24 +150,24 @@ def test_named_robots_have_their_links_struck_both_ways() -> None:
 
 @pytest.mark.parametrize("probability", [0.05, 0.5, 0.95])
 def test_copies_drop_at_their_rate(probability: float) -> None:
-    decisions = Air(Drop(probability=probability)).say(*chatter(500))
+    decisions = FaultyRadio(Drop(probability=probability)).transmit(*broadcasts(500))
 
-    assert within_luck(dues(decisions).count(DROPPED), 3000, probability)
+    assert within_five_sigma(dues(decisions).count(DROPPED), 3000, probability)
 
 
-def test_faults_have_luck_of_their_own() -> None:
-    """Two of the same kind, and the radio beside them, lose more than one."""
-    decisions = Air(*2 * [Drop(probability=0.5)], scenario=mission("radio.drop=0.5")).say(
-        *chatter(500)
-    )
+def test_faults_have_independent_draws() -> None:
+    """Two of the same kind, together with the radio, lose more than one."""
+    decisions = FaultyRadio(
+        *2 * [Drop(probability=0.5)], scenario=mission("radio.drop=0.5")
+    ).transmit(*broadcasts(500))
 
-    assert within_luck(dues(decisions).count(DROPPED), 3000, 7 / 8)
+    assert within_five_sigma(dues(decisions).count(DROPPED), 3000, 7 / 8)
 
 
 @examples(40)
 @given(seed=SEEDS, shape=st.sampled_from([(0.1, 0.1), (0.02, 0.1), (0.1, 0.01), (0.5, 0.5)]))
-def test_bursts_are_a_chain_of_two_states(seed: int, shape: tuple[float, float]) -> None:
-    """Looked up in any slot, they are what a chain gives that is walked from the start."""
+def test_bursts_are_a_markov_chain_of_two_states(seed: int, shape: tuple[float, float]) -> None:
+    """The state in any slot is that of a chain that is followed from the start."""
     to_bad, to_good = shape
     bad = False
     for slot in range(300):
@@ -177,11 +177,12 @@ def test_bursts_are_a_chain_of_two_states(seed: int, shape: tuple[float, float])
         assert in_burst(seed, 7, 3, slot, to_bad, to_good) == bad
 
 
-def test_bursts_last_as_long_as_they_should() -> None:
+def test_bursts_have_their_mean_length() -> None:
     """A link is bad for half a second after two good ones, on average."""
-    air = Air(Burst(good_s=2.0, bad_s=0.5))
+    radio = FaultyRadio(Burst(good_s=2.0, bad_s=0.5))
     lost = [
-        air.say(said("r1", i, i * 50 * MS, "r2"))[0].due_ns == DROPPED for i in range(1, 40_001)
+        radio.transmit(sent_by("r1", i, i * 50 * MS, "r2"))[0].due_ns == DROPPED
+        for i in range(1, 40_001)
     ]
     spells = [len(list(run)) for bad, run in itertools.groupby(lost) if bad]
 
@@ -190,17 +191,17 @@ def test_bursts_last_as_long_as_they_should() -> None:
 
 
 def test_each_direction_has_bursts_of_its_own() -> None:
-    air = Air(Burst(good_s=1.0, bad_s=1.0, drop_good=0.1, drop_bad=0.9))
-    fates = [tuple(due == DROPPED for due in dues(air.say(*each))) for each in _rounds(400)]
+    radio = FaultyRadio(Burst(good_s=1.0, bad_s=1.0, drop_good=0.1, drop_bad=0.9))
+    fates = [tuple(due == DROPPED for due in dues(radio.transmit(*each))) for each in _rounds(400)]
     there, back = zip(*fates, strict=True)
 
-    assert within_luck(sum(there), 400, 0.5) or 100 < sum(there) < 300
+    assert within_five_sigma(sum(there), 400, 0.5) or 100 < sum(there) < 300
     assert there != back
 
 
 def _rounds(count: int) -> list[tuple[Sent, Sent]]:
     return [
-        (said("r1", i, i * 100 * MS, "r2"), said("r2", i, i * 100 * MS, "r1"))
+        (sent_by("r1", i, i * 100 * MS, "r2"), sent_by("r2", i, i * 100 * MS, "r1"))
         for i in range(1, count + 1)
     ]
 
@@ -209,48 +210,52 @@ def _rounds(count: int) -> list[tuple[Sent, Sent]]:
 
 
 def test_delays_add_up() -> None:
-    """Those of faults, and the radio's."""
-    air = Air(Delay(delay_s=0.5), Delay(delay_s=0.25), scenario=mission("radio.delay_s=0.125"))
+    """Delays of faults, and the radio's."""
+    radio = FaultyRadio(
+        Delay(delay_s=0.5), Delay(delay_s=0.25), scenario=mission("radio.delay_s=0.125")
+    )
 
-    assert dues(air.say(said("r1", 1, S))) == 2 * [S + 875 * MS]
-    assert air.fault_stats == {0: {"delayed": 2}, 1: {"delayed": 2}}
+    assert dues(radio.transmit(sent_by("r1", 1, S))) == 2 * [S + 875 * MS]
+    assert radio.fault_stats == {0: {"delayed": 2}, 1: {"delayed": 2}}
 
 
 def test_jitter_is_within_its_bounds_and_spreads() -> None:
-    decisions = Air(Delay(delay_s=0.5, jitter_s=0.2)).say(*[said("r1", i) for i in range(1, 400)])
+    decisions = FaultyRadio(Delay(delay_s=0.5, jitter_s=0.2)).transmit(
+        *[sent_by("r1", i) for i in range(1, 400)]
+    )
 
     assert all(500 * MS <= due < 700 * MS for due in dues(decisions))
     assert max(dues(decisions)) - min(dues(decisions)) > 190 * MS
     assert len(set(dues(decisions))) > 700
 
 
-def test_some_are_held_back_so_that_others_overtake() -> None:
-    air = Air(Reorder(probability=0.25, hold_s=1.0))
-    decisions = air.say(*[said("r1", i, i * MS, "r2") for i in range(1, 1001)])
+def test_some_messages_are_held_back_so_that_others_overtake() -> None:
+    radio = FaultyRadio(Reorder(probability=0.25, hold_s=1.0))
+    decisions = radio.transmit(*[sent_by("r1", i, i * MS, "r2") for i in range(1, 1001)])
     held = [v.due_ns - v.sequence * MS for v in decisions if v.due_ns > v.sequence * MS]
 
-    assert within_luck(len(held), 1000, 0.25)
+    assert within_five_sigma(len(held), 1000, 0.25)
     assert 0 < min(held) < 100 * MS < 900 * MS < max(held) < S
     assert dues(decisions) != sorted(dues(decisions))
 
 
-def test_a_clog_bursts_in_order_when_it_ends() -> None:
-    air = Air(Clog(from_s=1.0, until_s=2.0), Delay(delay_s=0.3, jitter_s=0.2))
-    air.say(*[said(name, i, i * 100 * MS) for i in range(1, 25) for name in ("r1", "r2")])
-    before = air.channel.collect("r3", 2 * S - 1)
-    burst = air.channel.collect("r3", 2 * S)
+def test_a_clog_delivers_in_order_when_it_ends() -> None:
+    radio = FaultyRadio(Clog(from_s=1.0, until_s=2.0), Delay(delay_s=0.3, jitter_s=0.2))
+    radio.transmit(*[sent_by(name, i, i * 100 * MS) for i in range(1, 25) for name in ("r1", "r2")])
+    before = radio.channel.collect("r3", 2 * S - 1)
+    burst = radio.channel.collect("r3", 2 * S)
 
     assert {envelope.sequence for envelope in before} == set(range(1, 10))
     held = [(e.source, e.sequence) for e in burst if 10 <= e.sequence < 15]
     assert held == [(name, i) for name in ("r1", "r2") for i in range(10, 15)]
 
 
-def test_bandwidth_lets_the_excess_wait() -> None:
-    """Each sender for itself; a message takes its time on the air, whoever hears it."""
-    air = Air(Bandwidth(bytes_per_s=1000.0))
-    first, second, third = (air.say(said("r1", i, 0, size=500)) for i in (1, 2, 3))
-    other = air.say(said("r2", 1, 0, size=100))
-    later = air.say(said("r1", 4, 2 * S, size=500))
+def test_messages_beyond_the_bandwidth_wait() -> None:
+    """Each sender has a queue; a message takes its time on the radio, for any number of receivers."""
+    radio = FaultyRadio(Bandwidth(bytes_per_s=1000.0))
+    first, second, third = (radio.transmit(sent_by("r1", i, 0, size=500)) for i in (1, 2, 3))
+    other = radio.transmit(sent_by("r2", 1, 0, size=100))
+    later = radio.transmit(sent_by("r1", 4, 2 * S, size=500))
 
     assert dues(first) == 2 * [500 * MS]
     assert dues(second) == 2 * [1000 * MS]
@@ -263,22 +268,27 @@ def test_bandwidth_lets_the_excess_wait() -> None:
     ("queue_bytes", "arriving"), [(0, 1), (499, 1), (500, 2), (1000, 3), (None, 4)]
 )
 def test_a_full_queue_drops(queue_bytes: int | None, arriving: int) -> None:
-    air = Air(Bandwidth(bytes_per_s=1000.0, queue_bytes=queue_bytes))
-    decisions = air.say(*[said("r1", i, 0, "r2", size=500) for i in (1, 2, 3, 4)])
+    radio = FaultyRadio(Bandwidth(bytes_per_s=1000.0, queue_bytes=queue_bytes))
+    decisions = radio.transmit(*[sent_by("r1", i, 0, "r2", size=500) for i in (1, 2, 3, 4)])
 
     assert dues(decisions) == [500 * i * MS if i <= arriving else DROPPED for i in range(1, 5)]
 
 
-def test_bandwidth_is_the_named_senders() -> None:
-    air = Air(Bandwidth(bytes_per_s=10.0, robots=("r2",)))
+def test_bandwidth_limits_the_named_senders() -> None:
+    radio = FaultyRadio(Bandwidth(bytes_per_s=10.0, robots=("r2",)))
 
-    assert dues(air.say(said("r1", 1, size=10), said("r2", 1, size=10))) == [0, 0, S, S]
+    assert dues(radio.transmit(sent_by("r1", 1, size=10), sent_by("r2", 1, size=10))) == [
+        0,
+        0,
+        S,
+        S,
+    ]
 
 
-def test_what_never_arrives_can_be_recorded() -> None:
+def test_a_copy_that_never_arrives_can_be_recorded() -> None:
     """A queue of centuries: the time of arrival stays a number that records hold."""
-    air = Air(Bandwidth(bytes_per_s=1e-3), *20 * [Delay(delay_s=1e6)])
-    decisions = [air.say(said("r1", i, size=10**6))[0] for i in range(1, 30)]
+    radio = FaultyRadio(Bandwidth(bytes_per_s=1e-3), *20 * [Delay(delay_s=1e6)])
+    decisions = [radio.transmit(sent_by("r1", i, size=10**6))[0] for i in range(1, 30)]
 
     assert all(0 < due < 2**63 for due in dues(decisions))
 
@@ -286,13 +296,13 @@ def test_what_never_arrives_can_be_recorded() -> None:
 # Copies.
 
 
-def test_copies_are_doubled_and_lost_each_by_itself() -> None:
-    air = Air(Duplicate(probability=1.0, copies=3, delay_s=0.5), Drop(probability=0.5))
-    decisions = air.say(*chatter(100))
+def test_copies_are_doubled_and_lost_independently() -> None:
+    radio = FaultyRadio(Duplicate(probability=1.0, copies=3, delay_s=0.5), Drop(probability=0.5))
+    decisions = radio.transmit(*broadcasts(100))
 
     assert len(decisions) == 4 * 600
-    assert within_luck(dues(decisions).count(DROPPED), 2400, 0.5)
-    assert air.fault_stats[0] == {"doubled": 1800}
+    assert within_five_sigma(dues(decisions).count(DROPPED), 2400, 0.5)
+    assert radio.fault_stats[0] == {"doubled": 1800}
     late = [v.due_ns - v.sequence * 100 * MS for v in decisions if v.due_ns != DROPPED]
     assert min(late) == 0
     assert 0 < max(late) < 500 * MS
@@ -301,16 +311,18 @@ def test_copies_are_doubled_and_lost_each_by_itself() -> None:
 
 @pytest.mark.parametrize("probability", [0.1, 0.9])
 def test_doubling_comes_at_its_rate(probability: float) -> None:
-    decisions = Air(Duplicate(probability=probability)).say(*chatter(200))
+    decisions = FaultyRadio(Duplicate(probability=probability)).transmit(*broadcasts(200))
 
-    assert within_luck(len(decisions) - 1200, 1200, probability)
+    assert within_five_sigma(len(decisions) - 1200, 1200, probability)
 
 
-def test_what_the_radio_has_lost_is_not_doubled() -> None:
+def test_a_copy_that_the_radio_has_lost_is_not_doubled() -> None:
     faults = (Duplicate(probability=1.0), Replay(probability=1.0, age_s=9.0))
-    decisions = Air(*faults, scenario=mission("radio.drop=0.5")).say(*chatter(100))
+    decisions = FaultyRadio(*faults, scenario=mission("radio.drop=0.5")).transmit(*broadcasts(100))
     fates: dict[tuple[str, int, str], list[int]] = {}
-    for decision in Air(faults[0], scenario=mission("radio.drop=0.5")).say(*chatter(100)):
+    for decision in FaultyRadio(faults[0], scenario=mission("radio.drop=0.5")).transmit(
+        *broadcasts(100)
+    ):
         fates.setdefault((decision.source, decision.sequence, decision.target), []).append(
             decision.due_ns
         )
@@ -322,13 +334,13 @@ def test_what_the_radio_has_lost_is_not_doubled() -> None:
     assert len(decisions) > sum(map(len, fates.values()))
 
 
-def test_an_older_message_of_the_same_sender_comes_again() -> None:
-    """To the same receivers, beside a new one, and no older than it may be."""
-    air = Air(Replay(probability=1.0, age_s=1.0))
+def test_an_older_message_of_the_same_sender_is_replayed() -> None:
+    """To the same receivers, together with a new one, and no older than its greatest age."""
+    radio = FaultyRadio(Replay(probability=1.0, age_s=1.0))
     replays = []
     for i in range(1, 101):
         now_ns = i * 100 * MS
-        decisions = air.say(said("r1", i, now_ns), said("r2", 1000 + i, now_ns, "r3"))
+        decisions = radio.transmit(sent_by("r1", i, now_ns), sent_by("r2", 1000 + i, now_ns, "r3"))
         replays += [(i, v) for v in decisions if v.sequence % 1000 != i]
         assert {v.due_ns for v in decisions} == {now_ns}
 
@@ -339,19 +351,21 @@ def test_an_older_message_of_the_same_sender_comes_again() -> None:
     assert {v.target for _, v in replays if v.source == "r1"} == {"r2", "r3"}
 
 
-def test_nothing_is_replayed_that_was_not_sent() -> None:
-    air = Air(Replay(probability=1.0, age_s=1.0))
+def test_only_sent_messages_are_replayed() -> None:
+    radio = FaultyRadio(Replay(probability=1.0, age_s=1.0))
 
-    assert len(air.say(said("r1", 1), said("r1", 2))) == 4
+    assert len(radio.transmit(sent_by("r1", 1), sent_by("r1", 2))) == 4
 
 
-def test_what_was_dropped_may_still_be_replayed() -> None:
-    """Its luck is not that of the first time, nor that of what it comes beside."""
-    air = Air(Drop(probability=0.5), Replay(probability=1.0, age_s=0.1))
+def test_a_dropped_message_may_still_be_replayed() -> None:
+    """Its draw is neither that of the first time nor that of the message with which it arrives."""
+    radio = FaultyRadio(Drop(probability=0.5), Replay(probability=1.0, age_s=0.1))
     own, again, alone = set(), set(), 0
     for i in range(1, 400):
         arrived = [
-            v.sequence for v in air.say(said("r1", i, i * 100 * MS, "r2")) if v.due_ns != DROPPED
+            v.sequence
+            for v in radio.transmit(sent_by("r1", i, i * 100 * MS, "r2"))
+            if v.due_ns != DROPPED
         ]
         own |= {i} & set(arrived)
         again |= set(arrived) - {i}
@@ -375,35 +389,35 @@ def test_what_was_dropped_may_still_be_replayed() -> None:
     ],
 )
 def test_nothing_passes_a_cut(fault: AnyFault, links: set[str]) -> None:
-    air = Air(fault)
+    radio = FaultyRadio(fault)
 
-    assert reached(air.say(*chatter(3))) == links
+    assert reached(radio.transmit(*broadcasts(3))) == links
     assert {f"{a}>{b}" for a, b in itertools.permutations(("r1", "r2", "r3"), 2) if not
-            air.faults.cuts(0, a, b)} == links  # fmt: skip
+            radio.faults.cuts(0, a, b)} == links  # fmt: skip
 
 
 def test_a_cut_holds_at_the_time_of_sending() -> None:
-    """What is under way arrives."""
-    air = Air(
+    """Copies in flight arrive."""
+    radio = FaultyRadio(
         Partition(shape="halves", from_s=1.0, until_s=2.0), scenario=mission("radio.delay_s=0.5")
     )
-    decisions = air.say(*[said("r1", i, i * 100 * MS, "r3") for i in range(1, 31)])
+    decisions = radio.transmit(*[sent_by("r1", i, i * 100 * MS, "r3") for i in range(1, 31)])
 
     assert [v.sequence for v in decisions if v.due_ns == DROPPED] == list(range(10, 20))
 
 
-def test_a_cut_comes_and_goes() -> None:
-    """In slots, for all links at once, as often as asked for."""
-    air = Air(Partition(shape="halves", flap_s=0.5, flap_share=0.25))
+def test_a_flapping_cut_opens_and_closes_in_slots() -> None:
+    """For all links at once, with the given share."""
+    radio = FaultyRadio(Partition(shape="halves", flap_s=0.5, flap_share=0.25))
     cut = [
-        (air.faults.cuts(i * 100 * MS, "r1", "r3"), air.faults.cuts(i * 100 * MS, "r3", "r2"))
+        (radio.faults.cuts(i * 100 * MS, "r1", "r3"), radio.faults.cuts(i * 100 * MS, "r3", "r2"))
         for i in range(5000)
     ]
     slots = [set(cut[i : i + 5]) for i in range(0, 5000, 5)]
 
     assert all(there == back for there, back in cut)
     assert all(len(slot) == 1 for slot in slots)
-    assert within_luck(sum(slot == {(True, True)} for slot in slots), 1000, 0.25)
+    assert within_five_sigma(sum(slot == {(True, True)} for slot in slots), 1000, 0.25)
 
 
 # Range.
@@ -422,10 +436,10 @@ PLACES = {"r2": (30.0, 0.0), "r3": (60.0, 0.0)}
         ((Range(range_m=10.0, from_s=1.0),), ALL),
     ],
 )
-def test_range_shrinks_for_those_concerned(faults: tuple[Range, ...], links: set[str]) -> None:
-    """The least range counts, its bound included; who is beyond is counted as out of range."""
-    air = Air(*faults, scenario=mission("radio.range_m=60"), at=PLACES)
-    decisions, out_of_range = air.channel.transmit(chatter(1)[:3])
+def test_range_shrinks_on_the_links_of_a_fault(faults: tuple[Range, ...], links: set[str]) -> None:
+    """The least range counts, its bound included; receivers beyond it are counted as out of range."""
+    radio = FaultyRadio(*faults, scenario=mission("radio.range_m=60"), at=PLACES)
+    decisions, out_of_range = radio.channel.transmit(broadcasts(1)[:3])
 
     now_ns = 100 * MS
     assert reached(decisions) == links
@@ -433,29 +447,33 @@ def test_range_shrinks_for_those_concerned(faults: tuple[Range, ...], links: set
     for link in ALL:
         one, other = link.split(">")
         apart_m = math.dist(PLACES.get(one, (0.0, 0.0)), PLACES.get(other, (0.0, 0.0)))
-        assert (apart_m <= air.faults.reach_m(now_ns, one, other)) == (link in links)
+        assert (apart_m <= radio.faults.reach_m(now_ns, one, other)) == (link in links)
 
 
-def test_supervisors_range_shrinks_too() -> None:
+def test_the_range_of_the_supervisor_shrinks_too() -> None:
     scenario = mission("coordination=centralized", "supervisor.range_m=100")
-    air = Air(Range(factor=0.5), scenario=scenario, at=PLACES)
+    radio = FaultyRadio(Range(factor=0.5), scenario=scenario, at=PLACES)
 
-    assert {v.target for v in air.say(said(SUPERVISOR, 1))} == {"r1", "r2"}
-    heard = air.say(*[said(name, 1, 0, SUPERVISOR) for name in ("r1", "r2", "r3")])
-    assert {v.source for v in heard} == {"r1", "r2"}
+    assert {v.target for v in radio.transmit(sent_by(SUPERVISOR, 1))} == {"r1", "r2"}
+    received = radio.transmit(*[sent_by(name, 1, 0, SUPERVISOR) for name in ("r1", "r2", "r3")])
+    assert {v.source for v in received} == {"r1", "r2"}
 
 
-def test_walls_shorten_what_is_left() -> None:
+def test_walls_shorten_the_range_that_faults_leave() -> None:
     """A wall of 2 m of range, 6 m apart: 8 m are enough and 7.9 m are not."""
     ground = drawn("..#....")
     scenario = exploration("robots.count=2", "radio.range_m=20", "radio.wall_loss_m=2")
     at = {"r1": (0.5, 0.5), "r2": (6.5, 0.5)}
-    heard = [
-        len(Air(Range(range_m=m), scenario=scenario, at=at, ground=ground).say(said("r1", 1)))
+    receivers = [
+        len(
+            FaultyRadio(Range(range_m=m), scenario=scenario, at=at, ground=ground).transmit(
+                sent_by("r1", 1)
+            )
+        )
         for m in (8.0, 7.9)
     ]
 
-    assert heard == [1, 0]
+    assert receivers == [1, 0]
 
 
 # Together.
@@ -465,7 +483,7 @@ FATES = st.builds(Fate, st.booleans(), st.integers(0, 10**15), st.integers(0, 10
 
 @examples(100)
 @given(FATES, FATES, FATES)
-def test_order_does_not_matter_and_a_drop_wins(a: Fate, b: Fate, c: Fate) -> None:
+def test_the_order_of_decisions_does_not_matter_and_a_drop_wins(a: Fate, b: Fate, c: Fate) -> None:
     assert a.joined(b) == b.joined(a)
     assert a.joined(b).joined(c) == a.joined(b.joined(c))
     assert a.joined(PASS) == a
@@ -491,12 +509,12 @@ FIXED: st.SearchStrategy[AnyFault] = st.sampled_from(
 
 @examples(60)
 @given(st.data())
-def test_order_of_what_is_not_drawn_does_not_matter(data: st.DataObject) -> None:
-    """Cuts, holds, fixed delays, queues and ranges, in whatever order they are listed."""
+def test_the_order_of_faults_without_draws_does_not_matter(data: st.DataObject) -> None:
+    """Cuts, holds, fixed delays, queues and ranges, in any order of the list."""
     schedule = data.draw(st.lists(FIXED, min_size=2, max_size=5))
     shuffled = data.draw(st.permutations(schedule))
     one, other = (
-        Air(*faults, scenario=mission(*LOSSY), at=PLACES).say(*TALK)
+        FaultyRadio(*faults, scenario=mission(*LOSSY), at=PLACES).transmit(*TALK)
         for faults in (schedule, shuffled)
     )
 
@@ -547,21 +565,21 @@ FAULTS = faults_of(list(PARTS))
 UNFORGED = faults_of([kind for kind in PARTS if kind is not Hostile])
 SCHEDULES = st.lists(FAULTS, max_size=5).map(tuple)
 LOSSY = ("radio.range_m=50", "radio.drop=0.2", "radio.duplicate=0.3", "radio.jitter_s=0.3")
-TALK = chatter(60, size=20)
+TALK = broadcasts(60, size=20)
 
 
 @examples(60)
 @given(schedule=SCHEDULES, seed=SEEDS)
 def test_windows_that_are_over_change_nothing(schedule: tuple[AnyFault, ...], seed: int) -> None:
-    """What is sent after the last of them is ruled as if there had been none."""
+    """Messages after the last of them have the decisions of a radio without faults."""
     over_ns = max((fault.until_ns or 0 for fault in schedule), default=0)
     scenario = mission(*LOSSY)
-    plain = Air(scenario=scenario, seed=seed, at=PLACES).say(*TALK)
-    told = Air(*schedule, scenario=scenario, seed=seed, at=PLACES)
-    told.say(*[sent for sent in TALK if sent.now_ns < over_ns])
+    plain = FaultyRadio(scenario=scenario, seed=seed, at=PLACES).transmit(*TALK)
+    faulty = FaultyRadio(*schedule, scenario=scenario, seed=seed, at=PLACES)
+    faulty.transmit(*[sent for sent in TALK if sent.now_ns < over_ns])
     after = [sent for sent in TALK if sent.now_ns >= over_ns]
 
-    assert told.say(*after) == [v for v in plain if v.sequence * 100 * MS >= over_ns]
+    assert faulty.transmit(*after) == [v for v in plain if v.sequence * 100 * MS >= over_ns]
 
 
 @examples(60)
@@ -573,28 +591,37 @@ def test_a_window_in_which_nothing_is_sent_changes_nothing(
     scenario = mission(*LOSSY)
     idle = msgspec.structs.replace(fault, from_s=0.0, until_s=0.05)
     later = msgspec.structs.replace(fault, from_s=1e5, until_s=1e6)
-    plain = Air(*schedule, scenario=scenario, seed=seed, at=PLACES).say(*TALK)
+    plain = FaultyRadio(*schedule, scenario=scenario, seed=seed, at=PLACES).transmit(*TALK)
 
-    assert Air(*schedule, idle, later, scenario=scenario, seed=seed, at=PLACES).say(*TALK) == plain
+    assert (
+        FaultyRadio(*schedule, idle, later, scenario=scenario, seed=seed, at=PLACES).transmit(*TALK)
+        == plain
+    )
 
 
 @examples(60)
 @given(schedule=SCHEDULES, seed=SEEDS)
 def test_a_certain_drop_wins_over_all(schedule: tuple[AnyFault, ...], seed: int) -> None:
-    air = Air(*schedule, Drop(probability=1.0), scenario=mission(*LOSSY), seed=seed, at=PLACES)
+    radio = FaultyRadio(
+        *schedule, Drop(probability=1.0), scenario=mission(*LOSSY), seed=seed, at=PLACES
+    )
 
-    assert set(dues(air.say(*TALK))) <= {DROPPED}
+    assert set(dues(radio.transmit(*TALK))) <= {DROPPED}
 
 
 @examples(60)
 @given(schedule=SCHEDULES, fault=FAULTS, seed=SEEDS)
-def test_one_fault_more_saves_nobody(
+def test_one_fault_more_delivers_no_lost_copy(
     schedule: tuple[AnyFault, ...], fault: AnyFault, seed: int
 ) -> None:
-    """What was lost is still lost, and what still arrives does so no sooner."""
+    """A copy that was lost is still lost, and one that still arrives does so no sooner."""
     scenario = mission(*LOSSY)
-    before = _arrivals(Air(*schedule, scenario=scenario, seed=seed, at=PLACES).say(*TALK))
-    after = _arrivals(Air(*schedule, fault, scenario=scenario, seed=seed, at=PLACES).say(*TALK))
+    before = _arrivals(
+        FaultyRadio(*schedule, scenario=scenario, seed=seed, at=PLACES).transmit(*TALK)
+    )
+    after = _arrivals(
+        FaultyRadio(*schedule, fault, scenario=scenario, seed=seed, at=PLACES).transmit(*TALK)
+    )
 
     if not isinstance(fault, Replay | Duplicate):
         assert set(after) <= set(before)
@@ -603,7 +630,7 @@ def test_one_fault_more_saves_nobody(
 
 
 def _arrivals(decisions: Sequence[DeliveryDecision]) -> dict[tuple[str, int, str], int]:
-    """When the first copy of each message that was sent arrives at each receiver."""
+    """Time of arrival of the first copy of each sent message at each receiver."""
     arrivals: dict[tuple[str, int, str], int] = {}
     for source, sequence, target, due_ns in map(msgspec.structs.astuple, decisions):
         if due_ns != DROPPED and sequence < FORGED_SEQUENCE_MIN:
@@ -621,31 +648,31 @@ def _arrivals(decisions: Sequence[DeliveryDecision]) -> dict[tuple[str, int, str
     ),
     spots=st.lists(st.tuples(st.floats(0.0, 60.0), st.floats(0.0, 60.0)), min_size=3, max_size=3),
 )
-def test_compiled_rules_are_the_plain_ones(
+def test_compiled_rules_agree_with_the_reference(
     schedule: tuple[AnyFault, ...],
     seed: int,
     overrides: tuple[str, ...],
     spots: list[tuple[float, float]],
 ) -> None:
-    """Verdict by verdict, and toll by toll."""
+    """Decision by decision, and counter by counter."""
     at = dict(zip(("r1", "r2", "r3"), spots, strict=True))
     scenario = mission(*overrides)
-    air = Air(*schedule, scenario=scenario, seed=seed, at=at)
-    plain = PlainFaults(air.scenario, seed)
-    reference = Channel(air.scenario, seed, None, plain.interfere)
+    radio = FaultyRadio(*schedule, scenario=scenario, seed=seed, at=at)
+    plain = PlainFaults(radio.scenario, seed)
+    reference = Channel(radio.scenario, seed, None, plain.interfere)
     for name in scenario.roster:
         reference.place(name, Pose(*at.get(name, (0.0, 0.0))))
     for i in range(1, 45):
         now_ns = 100 * MS * i
-        sent = [said(name, i, now_ns, size=20) for name in scenario.roster]
-        sent += [said("r1", 100 + i, now_ns, "r2", size=5)]
-        assert air.channel.transmit(sent) == reference.transmit(sent)
-        assert air.fault_stats == plain.pop_stats()
+        sent = [sent_by(name, i, now_ns, size=20) for name in scenario.roster]
+        sent += [sent_by("r1", 100 + i, now_ns, "r2", size=5)]
+        assert radio.channel.transmit(sent) == reference.transmit(sent)
+        assert radio.fault_stats == plain.pop_stats()
         for name in scenario.roster:
-            assert air.channel.collect(name, now_ns) == reference.collect(name, now_ns)
+            assert radio.channel.collect(name, now_ns) == reference.collect(name, now_ns)
         for one, other in itertools.permutations(scenario.roster, 2):
-            assert air.faults.cuts(now_ns, one, other) == plain.cuts(now_ns, one, other)
-            assert air.faults.reach_m(now_ns, one, other) == plain.reach_m(now_ns, one, other)
+            assert radio.faults.cuts(now_ns, one, other) == plain.cuts(now_ns, one, other)
+            assert radio.faults.reach_m(now_ns, one, other) == plain.reach_m(now_ns, one, other)
 
 
 _DRAWN_ALONE = (Drop, Burst, Delay, Duplicate, Reorder, OneWay, Partition, Clog, Range)
@@ -654,27 +681,27 @@ _DRAWN_ALONE = (Drop, Burst, Delay, Duplicate, Reorder, OneWay, Partition, Clog,
 @examples(60)
 @given(st.data())
 def test_draws_depend_on_the_message_alone(data: st.DataObject) -> None:
-    """In any portions, with others in between or not: every verdict is the same."""
+    """In any portions, with others in between or not: every decision is the same."""
     schedule = data.draw(
         SCHEDULES.filter(lambda faults: all(isinstance(f, _DRAWN_ALONE) for f in faults))
     )
-    whole = Air(*schedule, scenario=mission(*LOSSY), at=PLACES).say(*TALK)
+    whole = FaultyRadio(*schedule, scenario=mission(*LOSSY), at=PLACES).transmit(*TALK)
     some = [TALK[i] for i in sorted(data.draw(st.sets(st.integers(0, len(TALK) - 1))))]
     cut = data.draw(st.integers(0, len(some)))
-    air = Air(*schedule, scenario=mission(*LOSSY), at=PLACES)
-    told = [*air.say(*some[:cut]), *air.say(*some[cut:])]
+    radio = FaultyRadio(*schedule, scenario=mission(*LOSSY), at=PLACES)
+    in_portions = [*radio.transmit(*some[:cut]), *radio.transmit(*some[cut:])]
     spoken = {(sent.envelope.source, sent.envelope.sequence) for sent in some}
 
-    assert told == [v for v in whole if (v.source, v.sequence) in spoken]
+    assert in_portions == [v for v in whole if (v.source, v.sequence) in spoken]
 
 
-def test_tolls_are_the_verdicts() -> None:
+def test_fault_stats_agree_with_the_decisions() -> None:
     """Every copy that faults drop is counted, for each fault that drops it."""
     faults = (Partition(shape="halves"), Drop(probability=0.5), Delay(delay_s=1.0))
-    air = Air(*faults)
-    decisions = air.say(*chatter(50))
+    radio = FaultyRadio(*faults)
+    decisions = radio.transmit(*broadcasts(50))
     passed = [v.due_ns for v in decisions if v.due_ns != DROPPED]
-    fault_stats = air.fault_stats
+    fault_stats = radio.fault_stats
 
     assert fault_stats[0] == {"dropped": 200}
     assert fault_stats[1]["dropped"] > 100 - len(passed)
@@ -735,7 +762,7 @@ def result_of(records: Sequence[Record]) -> Result:
 
 
 def went_well(records: Sequence[Record], *faults: AnyFault) -> Result:
-    """The result of a mission that ended, in which no rule was broken and every fault has struck."""
+    """The result of a mission that ended, in which no rule was broken and every fault has had effects."""
     result = result_of(records)
 
     assert result.complaints == ()
@@ -747,10 +774,10 @@ def went_well(records: Sequence[Record], *faults: AnyFault) -> Result:
 
 @pytest.mark.parametrize("name", SCHEDULE)
 @pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
-def test_a_mission_on_a_density_outlives_every_fault(
+def test_a_mission_on_a_density_completes_under_every_fault(
     played: Play, coordination: str, name: str
 ) -> None:
-    """Nothing is lost but time: all mass is shipped, and nobody has shipped more than it knows of."""
+    """Only time is lost: all mass is shipped, and no robot has shipped more than it knows of."""
     narrow = ("supervisor.range_m=60",) if coordination == "centralized" else ()
     fault = SCHEDULE[name]
     if isinstance(fault, Range):
@@ -765,7 +792,7 @@ def test_a_mission_on_a_density_outlives_every_fault(
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", SCHEDULE)
 @pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
-def test_a_mission_on_a_map_outlives_every_fault(coordination: str, name: str) -> None:
+def test_a_mission_on_a_map_completes_under_every_fault(coordination: str, name: str) -> None:
     """The map is explored as far as it can be."""
     fault = SCHEDULE[name]
     place = ("supervisor.pose_m=[1.5, 1.5]",) if isinstance(fault, Range) else ()
@@ -787,7 +814,7 @@ STORM = (
 )
 
 
-def test_a_storm_of_everything_is_outlived(played: Play) -> None:
+def test_a_mission_completes_under_all_faults_together(played: Play) -> None:
     overrides = ("radio.range_m=95", "energy.steps=200", "energy.points=200", under(*STORM))
     result = went_well(played(*overrides), *STORM)
 
@@ -803,7 +830,7 @@ def test_a_storm_of_everything_is_outlived(played: Play) -> None:
     delay_s=st.sampled_from([0.0, 0.15]),
     seed=SEEDS,
 )
-def test_no_schedule_makes_a_sound_robot_break_a_rule(
+def test_under_no_schedule_does_a_sound_robot_break_a_rule(
     played: Play,
     schedule: tuple[AnyFault, ...],
     coordination: str,
@@ -825,7 +852,7 @@ def test_no_schedule_makes_a_sound_robot_break_a_rule(
     assert result.ended == "done"
 
 
-def test_same_seed_gives_the_same_record_under_faults() -> None:
+def test_the_same_seed_gives_the_same_record_under_faults() -> None:
     first, second, other = (
         result_of(explored.__wrapped__(under(*STORM[:8]), seed=seed)).digest for seed in (1, 1, 2)
     )
@@ -842,7 +869,7 @@ def without_scenario(records: Sequence[Record]) -> list[Record]:
 
 
 @pytest.mark.parametrize("name", SCHEDULE)
-def test_a_fault_that_comes_after_the_end_changes_nothing(played: Play, name: str) -> None:
+def test_a_fault_after_the_end_changes_nothing(played: Play, name: str) -> None:
     """Record by record, but for the scenario itself."""
     plain = played()
     assert isinstance(plain[-1], Ending)
@@ -852,14 +879,14 @@ def test_a_fault_that_comes_after_the_end_changes_nothing(played: Play, name: st
     assert without_scenario(played(under(fault))) == list(plain)
 
 
-def test_batches_tell_what_struck(played: Play) -> None:
+def test_batches_have_the_effects_of_faults(played: Play) -> None:
     """In the window, and not outside."""
     records = played(under(SCHEDULE["halves"]))
-    told = [r.now_ns for r in records if isinstance(r, Batch) and r.fault_stats]
+    times_ns = [r.now_ns for r in records if isinstance(r, Batch) and r.fault_stats]
 
-    assert (min(told), max(told)) == (500 * MS, 1900 * MS)
+    assert (min(times_ns), max(times_ns)) == (500 * MS, 1900 * MS)
 
 
-def test_a_scenario_without_link_faults_takes_no_trouble() -> None:
+def test_a_scenario_without_link_faults_has_no_interference() -> None:
     assert LinkFaults.of(mission(), 1) is None
     assert LinkFaults.of(from_tree(to_tree(mission(under(SCHEDULE["drop"]))), "t"), 1) is not None

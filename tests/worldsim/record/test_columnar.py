@@ -1,4 +1,4 @@
-"""Batches as tables: the same as the Structs they were read from, and total on whatever bytes."""
+"""Columnar batches: equal to the Structs from which they are decoded, and total on any bytes."""
 
 from collections.abc import Callable
 from typing import Any
@@ -42,7 +42,7 @@ ROSTER = ("r1", "r2", "r3")
 
 
 def place(name: str, roster: tuple[str, ...]) -> int:
-    """The place of a name, as tables have it."""
+    """Index of a name, as in columnar batches."""
     if name == "":
         return of.EVERYBODY_PLACE
     return roster.index(name) if name in roster else of.STRANGER
@@ -54,11 +54,11 @@ def pairs(packed: bytes, samples: int) -> list[list[int]] | None:
 
 
 def plain(batch: Batch, roster: tuple[str, ...], samples: int) -> list[Any]:
-    """What the tables hold, taken from the Structs."""
+    """Expected contents of the columns, taken from the Structs."""
     step_records: list[Any] = []
     for step_record in batch.step_records:
         out, verdict = step_record.outputs, step_record.verdict
-        told: list[Any] = [
+        values: list[Any] = [
             place(step_record.name, roster),
             step_record.now_ns,
             [[place(source, roster), sequence] for source, sequence in step_record.heard],
@@ -67,16 +67,16 @@ def plain(batch: Batch, roster: tuple[str, ...], samples: int) -> list[Any]:
         ]
         if out is not None and verdict is not None:
             refused = {"step", "energy", "units"} & set(verdict.violations)
-            told += [out.step, out.energy_spent, int(out.state), out.refused, len(verdict.found)]
-            fast = [i for i, what in enumerate(verdict.violations, 1) if what == "speed"]
-            told += [len(verdict.violations), bool(refused), max(fast, default=0)]
-            told += [len(out.weights)]
-            told += [sum(len(envelope.body) for envelope in out.outbox)]
-            told += [[verdict.pose.x_m, verdict.pose.y_m]]
-            told += [None if out.goal is None else [*out.goal], out.weights]
-            told += [pairs(out.spent, samples), pairs(out.lowered, samples)]
-            told += [[addressed(e, roster) for e in out.outbox]]
-        step_records.append(told)
+            values += [out.step, out.energy_spent, int(out.state), out.refused, len(verdict.found)]
+            fast = [i for i, rule in enumerate(verdict.violations, 1) if rule == "speed"]
+            values += [len(verdict.violations), bool(refused), max(fast, default=0)]
+            values += [len(out.weights)]
+            values += [sum(len(envelope.body) for envelope in out.outbox)]
+            values += [[verdict.pose.x_m, verdict.pose.y_m]]
+            values += [None if out.goal is None else [*out.goal], out.weights]
+            values += [pairs(out.spent, samples), pairs(out.lowered, samples)]
+            values += [[addressed(e, roster) for e in out.outbox]]
+        step_records.append(values)
     decisions = [
         [place(v.source, roster), v.sequence, place(v.target, roster), v.due_ns]
         for v in batch.decisions
@@ -85,13 +85,13 @@ def plain(batch: Batch, roster: tuple[str, ...], samples: int) -> list[Any]:
 
 
 def addressed(envelope: Envelope, roster: tuple[str, ...]) -> list[Any]:
-    """An envelope, names as places."""
+    """An envelope, with names as indices."""
     source, sequence, target, body = msgspec.structs.astuple(envelope)
     return [place(source, roster), sequence, place(target, roster), body]
 
 
-def tabled(columns: ColumnarBatch) -> list[Any]:
-    """The same from the tables."""
+def contents(columns: ColumnarBatch) -> list[Any]:
+    """The same contents, taken from the columns."""
 
     def rows(table: np.ndarray, first: int, count: int) -> list[list[int]] | None:
         return None if count == of.NOT_DECODED else table[first : first + count].tolist()
@@ -103,43 +103,43 @@ def tabled(columns: ColumnarBatch) -> list[Any]:
     for row in range(int(columns.sizes[of.ACTS])):
         step_record = columns.step_records[row].tolist()
         heard = rows(columns.heard, step_record[of.HEARD], step_record[of.HEARD_COUNT])
-        told: list[Any] = [step_record[of.PLACE], step_record[of.NOW_NS], heard]
-        told += [step_record[of.OBSERVED], step_record[of.SKEW_NS]]
+        values: list[Any] = [step_record[of.PLACE], step_record[of.NOW_NS], heard]
+        values += [step_record[of.OBSERVED], step_record[of.SKEW_NS]]
         if step_record[of.PRESENT]:
-            told += [
+            values += [
                 step_record[of.STEP],
                 step_record[of.ENERGY],
                 step_record[of.STATE],
                 step_record[of.REFUSED],
                 step_record[of.FINDS],
             ]
-            told += [
+            values += [
                 step_record[of.VIOLATIONS],
                 bool(step_record[of.VOID]),
                 step_record[of.TOO_FAST],
             ]
-            told += [step_record[of.WEIGHTS_BYTES]]
+            values += [step_record[of.WEIGHTS_BYTES]]
             *pose_m, goal_x_m, goal_y_m = columns.poses_m[row].tolist()
             begin, end = (
                 step_record[of.WEIGHTS],
                 step_record[of.WEIGHTS] + step_record[of.WEIGHTS_BYTES],
             )
-            told += [step_record[of.BODY_BYTES], pose_m]
-            told += [
+            values += [step_record[of.BODY_BYTES], pose_m]
+            values += [
                 [goal_x_m, goal_y_m] if step_record[of.HEADS] else None,
                 columns.payload[begin:end],
             ]
-            told += [rows(columns.pairs, step_record[of.SPENT], step_record[of.SPENT_COUNT])]
-            told += [rows(columns.pairs, step_record[of.LOWERED], step_record[of.LOWERED_COUNT])]
-            told += [bodies(rows(columns.sent, step_record[of.SENT], step_record[of.SENT_COUNT]))]
-        step_records.append(told)
+            values += [rows(columns.pairs, step_record[of.SPENT], step_record[of.SPENT_COUNT])]
+            values += [rows(columns.pairs, step_record[of.LOWERED], step_record[of.LOWERED_COUNT])]
+            values += [bodies(rows(columns.sent, step_record[of.SENT], step_record[of.SENT_COUNT]))]
+        step_records.append(values)
     decisions = rows(columns.decisions, 0, int(columns.sizes[of.VERDICTS]))
     injected = rows(columns.injected, 0, int(columns.sizes[of.INJECTED]))
     return [step_records, decisions, bodies(injected)]
 
 
 @pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
-def test_tables_hold_what_the_record_holds(played: Play, coordination: str) -> None:
+def test_columns_have_the_contents_of_the_record(played: Play, coordination: str) -> None:
     """Over a whole mission with loss and copies: every number of every batch, also from given bytes."""
     records = played(*LOSSY, f"coordination={coordination}")
     opening, decoder, given = records[0], ColumnarDecoder(), ColumnarDecoder()
@@ -148,12 +148,12 @@ def test_tables_hold_what_the_record_holds(played: Play, coordination: str) -> N
     given.decode(opening)
     for record in records:
         if isinstance(record, Batch):
-            told = plain(record, opening.scenario.roster, 60)
-            assert tabled(ColumnarBatch(*decoder.decode(record).columns)) == told
+            values = plain(record, opening.scenario.roster, 60)
+            assert contents(ColumnarBatch(*decoder.decode(record).columns)) == values
             payload = encode_record(record)
             assert (
-                tabled(ColumnarBatch(*given.decode(decode_record(payload), payload).columns))
-                == told
+                contents(ColumnarBatch(*given.decode(decode_record(payload), payload).columns))
+                == values
             )
 
 
@@ -190,19 +190,19 @@ ODD = Batch(
     out_of_range=3,
     injected=(Envelope("r1", 1 << 62, "", b"\x98"), Envelope("r1\x00", 3, "r2", bytes(70_000))),
 )
-"""Strangers, numbers of every width, a ruling in whole metres, pairs that do not decode."""
+"""Strangers, numbers of every width, a verdict in whole metres, pairs that do not decode."""
 
 
-def test_odd_values_are_read_too(played: Play) -> None:
-    """Whatever a record may hold, the tables hold it."""
+def test_odd_values_are_decoded_too(played: Play) -> None:
+    """Every content that a record may have is in the columns."""
     decoder = ColumnarDecoder()
     decoder.decode(played()[0])
 
-    assert tabled(ColumnarBatch(*decoder.decode(ODD).columns)) == plain(ODD, ROSTER, 60)
+    assert contents(ColumnarBatch(*decoder.decode(ODD).columns)) == plain(ODD, ROSTER, 60)
 
 
-def test_tables_grow_with_what_comes(played: Play) -> None:
-    """More pairs, verdicts and deliveries in one batch than there was room for."""
+def test_columns_grow_with_the_batch(played: Play) -> None:
+    """More pairs, decisions and deliveries in one batch than there was room for."""
     many = tuple(DeliveryDecision("r1", sequence, "r2", sequence) for sequence in range(5000))
     entries = Pairs().encode(np.arange(60).repeat(100), np.arange(6000), 6000)
     outputs = Outputs(1, Pose(0.0, 0.0), lowered=entries)
@@ -214,11 +214,11 @@ def test_tables_grow_with_what_comes(played: Play) -> None:
     decoder = ColumnarDecoder()
     decoder.decode(played()[0])
 
-    assert tabled(ColumnarBatch(*decoder.decode(batch).columns)) == plain(batch, ROSTER, 60)
+    assert contents(ColumnarBatch(*decoder.decode(batch).columns)) == plain(batch, ROSTER, 60)
 
 
-def test_record_is_decoded_once_for_all_observers_in_order(played: Play) -> None:
-    """Every observer is given the same object, the first observer first, and its bytes are the record's."""
+def test_a_record_is_decoded_once_for_all_observers_in_order(played: Play) -> None:
+    """Every observer receives the same object, the first observer first, and its bytes are the record's."""
     calls: list[tuple[str, DecodedRecord]] = []
 
     class Noting:
@@ -238,7 +238,7 @@ def test_record_is_decoded_once_for_all_observers_in_order(played: Play) -> None
     assert [decoded.record for _, decoded in calls[::2]] == list(records[:3])
 
 
-# Msgpack, beside the library.
+# Msgpack, compared with the library.
 
 VALUES: st.SearchStrategy[Any] = st.recursive(
     st.none()
@@ -255,8 +255,8 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
 
 @examples(200)
 @given(value=VALUES, more=st.binary(max_size=4), single=st.booleans())
-def test_any_value_is_passed_over(value: Any, more: bytes, *, single: bool) -> None:
-    """A value ends where the library says; cut short it has no end."""
+def test_any_value_is_skipped(value: Any, more: bytes, *, single: bool) -> None:
+    """A value ends at the position that the library gives; cut short it has no end."""
     packed = msgpack.packb(value, use_single_float=single)
 
     assert skip(packed + more, 0, 1) == len(packed)
@@ -264,7 +264,7 @@ def test_any_value_is_passed_over(value: Any, more: bytes, *, single: bool) -> N
 
 
 @given(value=st.integers(-(2**63), 2**63 - 1))
-def test_numbers_are_read_as_they_are(value: int) -> None:
+def test_numbers_of_every_width_are_decoded(value: int) -> None:
     """Every width, both signs."""
     packed = msgpack.packb(value)
 
@@ -273,13 +273,13 @@ def test_numbers_are_read_as_they_are(value: int) -> None:
 
 @examples(300)
 @given(payload=st.binary(max_size=60), at=st.integers(-2, 70), values=st.integers(0, 5))
-def test_noise_never_leads_outside(payload: bytes, at: int, values: int) -> None:
+def test_no_bytes_lead_outside_the_payload(payload: bytes, at: int, values: int) -> None:
     """A position is within the payload, or negative."""
     assert head_of(payload, at)[2] <= len(payload)
     assert values == 0 or skip(payload, at, values) <= len(payload)
 
 
-# News.
+# Gossip messages.
 
 
 def readable(body: bytes) -> tuple[int, bytes, bytes] | None:
@@ -292,13 +292,13 @@ def readable(body: bytes) -> tuple[int, bytes, bytes] | None:
 
 def parts(body: bytes) -> tuple[int, bytes, bytes] | None:
     framed = b"\xc0\xc0" + body + b"\xc0"
-    incarnation, version_vector, have_end, logs, logs_end = parts_of_gossip(
+    incarnation, version_vector, vector_end, logs, logs_end = parts_of_gossip(
         framed, 2, 2 + len(body)
     )
     return (
         None
         if logs_end < 0
-        else (incarnation, framed[version_vector:have_end], framed[logs:logs_end])
+        else (incarnation, framed[version_vector:vector_end], framed[logs:logs_end])
     )
 
 
@@ -310,11 +310,13 @@ _ALL_FIELDS = GossipMessage(1, 0, 0.0, 0.0, b"", b"", b"\x00", b"\x00")
     news=_ALL_FIELDS, at=len(encode(_ALL_FIELDS)) - 3, byte=0xA1, cut=0
 )  # a text for registers
 @given(news=NEWS, at=st.integers(0, 200), byte=st.integers(0, 255), cut=st.integers(0, 30))
-def test_news_is_read_as_the_codec_does(news: GossipMessage, at: int, byte: int, cut: int) -> None:
+def test_a_gossip_message_has_the_parts_that_the_codec_decodes(
+    news: GossipMessage, at: int, byte: int, cut: int
+) -> None:
     """Sound messages, messages with one byte changed, cut messages: the same parts or none.
 
-    The kernel may refuse what the codec still takes, such as a text in place of a number it skips;
-    it never takes what the codec refuses.
+    The kernel may refuse a message that the codec still decodes, such as a text in place of a number it skips;
+    it never accepts one that the codec refuses.
     """
     body = encode(news)
     changed = bytearray(body)
@@ -348,15 +350,17 @@ def test_news_is_read_as_the_codec_does(news: GossipMessage, at: int, byte: int,
     ],
 )
 @pytest.mark.parametrize("single", [False, True])
-def test_odd_news(tree: Any, *, single: bool) -> None:
+def test_odd_gossip_messages_have_the_parts_that_the_codec_decodes(
+    tree: Any, *, single: bool
+) -> None:
     """Whole metres, short floats, further fields, other versions, missing fields."""
     body = msgpack.packb(tree, use_single_float=single)
 
     assert parts(body) == readable(body)
 
 
-def test_record_holds_more_fields_some_day(played: Play) -> None:
-    """Fields that are added at the end are passed over."""
+def test_fields_added_to_a_record_are_skipped(played: Play) -> None:
+    """Fields that are added at the end do not change the columns."""
     decoder = ColumnarDecoder()
     decoder.decode(played()[0])
     tree = msgspec.msgpack.decode(encode_record(ODD))
@@ -370,18 +374,18 @@ def test_record_holds_more_fields_some_day(played: Play) -> None:
     for decision in tree[3]:
         decision.append(1.0)
     sizes, *tables = (table.copy() for table in ColumnarBatch(*decoder.decode(ODD).columns)[1:])
-    told = plain(ODD, ROSTER, 60)
+    values = plain(ODD, ROSTER, 60)
     payload = msgspec.msgpack.encode(tree)
     bits = tables[1].view(np.int64)
 
     assert of._read_batch(payload, sizes, *tables, bits, 3, of.STRANGER, 60) > 0
-    assert tabled(ColumnarBatch(payload, sizes, *tables)) == told
+    assert contents(ColumnarBatch(payload, sizes, *tables)) == values
 
 
 @examples(300)
 @given(changes=st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 255)), max_size=4))
-def test_garbled_batch_stays_within_its_tables(changes: list[tuple[int, int]]) -> None:
-    """No bytes lead outside: rows behind the tables stay as they were."""
+def test_a_garbled_batch_stays_within_its_arrays(changes: list[tuple[int, int]]) -> None:
+    """No bytes lead outside: rows after the arrays stay as they were."""
     small = msgspec.structs.replace(ODD, step_records=(ODD.step_records[0], ODD.step_records[2]))
     payload = bytearray(encode_record(small))
     for at, byte in changes:

@@ -59,7 +59,7 @@ def write(records: tuple[Record, ...], path: Path) -> Journal:
 
 
 def read_back(content: bytes, folder: Path) -> list[Record]:
-    """What a file with this content holds."""
+    """Records of a file with this content."""
     path = folder / "altered.mcap"
     path.write_bytes(content)
     return [record for _, record in read(path)]
@@ -73,7 +73,7 @@ def records(played: Play) -> tuple[Record, ...]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A place for files."""
+    """A folder for files."""
     return tmp_path_factory.mktemp("journals")
 
 
@@ -97,8 +97,8 @@ def run_in(folder: Path, *overrides: str) -> Result:
 # Whole.
 
 
-def test_records_come_back_as_they_went(records: tuple[Record, ...], folder: Path) -> None:
-    """What is read equals what was written, value for value and byte for byte."""
+def test_records_are_read_as_they_were_written(records: tuple[Record, ...], folder: Path) -> None:
+    """Records are equal to the written ones, value for value and byte for byte."""
     write(records, folder / "back.mcap")
     back = list(read(folder / "back.mcap"))
 
@@ -107,7 +107,7 @@ def test_records_come_back_as_they_went(records: tuple[Record, ...], folder: Pat
     assert [decode_record(encode_record(record)) for record in records] == list(records)
 
 
-def test_digest_is_the_same_with_and_without_a_file(
+def test_the_digest_is_the_same_with_and_without_a_file(
     records: tuple[Record, ...], folder: Path
 ) -> None:
     """The digest is of the records: no file, no metrics and no clock enter it."""
@@ -124,7 +124,7 @@ def test_digest_is_the_same_with_and_without_a_file(
     assert without.digest.records == len(records)
 
 
-def test_digest_tells_where_records_begin() -> None:
+def test_the_digest_depends_on_where_records_begin() -> None:
     """The same bytes cut into other records have another digest."""
     one, other = Digest(), Digest()
     one.add(b"ab")
@@ -135,7 +135,7 @@ def test_digest_tells_where_records_begin() -> None:
     assert one.hex != other.hex
 
 
-def test_any_mcap_reader_reads_the_file(records: tuple[Record, ...], folder: Path) -> None:
+def test_the_mcap_library_reads_the_file(records: tuple[Record, ...], folder: Path) -> None:
     """The library's own reader finds both topics, every message, and simulated time."""
     write(records, folder / "plain.mcap")
     with (folder / "plain.mcap").open("rb") as file:
@@ -154,7 +154,7 @@ def test_any_mcap_reader_reads_the_file(records: tuple[Record, ...], folder: Pat
 
 @examples(200)
 @given(st.data())
-def test_cut_file_reads_up_to_the_cut(
+def test_a_cut_file_is_read_up_to_the_cut(
     content: bytes, records: tuple[Record, ...], folder: Path, data: st.DataObject
 ) -> None:
     """Every record that is whole before the cut is read, and nothing else."""
@@ -171,10 +171,10 @@ def test_cut_file_reads_up_to_the_cut(
 
 @examples(200)
 @given(at=st.floats(0.0, 1.0, exclude_max=True), flip=st.integers(1, 255))
-def test_altered_byte_is_noticed_and_read_without_harm(
+def test_an_altered_byte_changes_the_digest_and_does_not_break_reading(
     content: bytes, folder: Path, at: float, flip: int
 ) -> None:
-    """The file's digest differs, wherever the byte is; reading ends early at the worst."""
+    """The file's digest differs for any position of the byte; reading ends early at the worst."""
     place = int(at * len(content))
     altered = bytearray(content)
     altered[place] ^= flip
@@ -187,7 +187,7 @@ def test_altered_byte_is_noticed_and_read_without_harm(
 
 @examples(50)
 @given(st.binary(max_size=400))
-def test_any_bytes_read_as_some_records(folder: Path, junk: bytes) -> None:
+def test_any_bytes_are_read_as_a_list_of_records(folder: Path, junk: bytes) -> None:
     """A file that is no journal holds no records; a journal's head does not change that."""
     assert read_back(junk, folder) == []
     assert read_back(b"\x89MCAP0\r\n" + junk, folder) == []
@@ -214,14 +214,14 @@ def small_disk(folder: Path, size: str) -> Iterator[Path]:
 
 
 def assert_cut_but_complete(folder: Path, result: Result, whole: Result) -> None:
-    """The mission went on to its end, and says where its record was cut."""
-    told = json.loads((folder / RESULT).read_bytes())
+    """The mission went on to its end, and its result has the time at which its record was cut."""
+    written = json.loads((folder / RESULT).read_bytes())
     manifest = json.loads((folder / MANIFEST).read_bytes())
     journal = [payload for payload, _ in read(folder / JOURNAL)]
 
     assert result.record.startswith("cut at t=")
-    assert told["record"] == manifest["record"] == result.record
-    assert (told["ended"], told["digest"]) == ("done", whole.digest)
+    assert written["record"] == manifest["record"] == result.record
+    assert (written["ended"], written["digest"]) == ("done", whole.digest)
     assert manifest["journal_blake2b"] == file_digest(folder / JOURNAL)
     assert len(journal) < manifest["records"]
     assert sorted(path.name for path in folder.iterdir()) == sorted(
@@ -236,8 +236,8 @@ def whole_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Result]:
     return folder, run_in(folder, *LONG)
 
 
-def test_run_leaves_a_whole_record(whole_run: tuple[Path, Result]) -> None:
-    """With room on the disk the record is whole and the folder has what it should."""
+def test_a_run_leaves_a_whole_record(whole_run: tuple[Path, Result]) -> None:
+    """With room on the disk the record is whole and the folder has all its files."""
     folder, result = whole_run
 
     assert result.record == "whole"
@@ -250,10 +250,10 @@ def test_run_leaves_a_whole_record(whole_run: tuple[Path, Result]) -> None:
 
 @pytest.mark.processes
 @pytest.mark.parametrize("size", ["100k", "400k", "700k", "1m"])
-def test_full_disk_cuts_the_record_not_the_mission(
+def test_a_full_disk_cuts_the_record_and_not_the_mission(
     whole_run: tuple[Path, Result], tmp_path: Path, size: str
 ) -> None:
-    """Whenever the disk fills up: the mission goes on to its end and leaves its result."""
+    """With a disk that fills up at any time, the mission goes on to its end and leaves its result."""
     with small_disk(tmp_path / "disk", size) as folder:
         result = run_in(folder, *LONG)
         journal = [payload for payload, _ in read(folder / JOURNAL)]
@@ -280,7 +280,7 @@ recording.finish()
 
 
 @pytest.mark.processes
-def test_file_size_limit_cuts_the_record(whole_run: tuple[Path, Result], tmp_path: Path) -> None:
+def test_a_file_size_limit_cuts_the_record(whole_run: tuple[Path, Result], tmp_path: Path) -> None:
     """A limit on the size of a file is a full disk for the journal alone."""
     source, result = whole_run
     limit = 500_000
@@ -288,10 +288,10 @@ def test_file_size_limit_cuts_the_record(whole_run: tuple[Path, Result], tmp_pat
     subprocess.run([sys.executable, "-c", LIMITED, *arguments], check=True)
     expected = [payload for payload, _ in read(source / JOURNAL)]
     journal = [payload for payload, _ in read(tmp_path / JOURNAL)]
-    told = json.loads((tmp_path / RESULT).read_bytes())
+    written = json.loads((tmp_path / RESULT).read_bytes())
 
-    assert told["record"].startswith("cut at t=")
-    assert told["digest"] == result.digest
+    assert written["record"].startswith("cut at t=")
+    assert written["digest"] == result.digest
     assert (tmp_path / JOURNAL).stat().st_size <= limit
     assert len(journal) > 300
     assert journal == expected[: len(journal)]
@@ -299,7 +299,7 @@ def test_file_size_limit_cuts_the_record(whole_run: tuple[Path, Result], tmp_pat
 
 # A killed writer.
 
-TOLD = """
+KILLED_WRITER = """
 import sys
 from pathlib import Path
 from kantor_worldsim.record.journal import Journal, read
@@ -314,13 +314,15 @@ sys.stdin.read()
 
 
 @pytest.mark.processes
-def test_killed_writer_loses_nothing_that_it_took(
+def test_a_killed_writer_loses_no_record_that_it_accepted(
     whole_run: tuple[Path, Result], tmp_path: Path
 ) -> None:
-    """What a journal has taken is in the file, even if nothing comes after it."""
+    """An accepted record is in the file, even if no other follows."""
     arguments = [str(whole_run[0] / JOURNAL), str(tmp_path / "killed.mcap")]
     with subprocess.Popen(
-        [sys.executable, "-c", TOLD, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", KILLED_WRITER, *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
     ) as writer:
         assert writer.stdout is not None
         assert writer.stdout.readline() == b"taken\n"
@@ -340,7 +342,7 @@ def test_folders_of_one_second_are_numbered(tmp_path: Path) -> None:
     assert all("_small_s7" in path.name for path in made)
 
 
-def test_result_is_replaced_whole(tmp_path: Path) -> None:
+def test_a_result_is_replaced_atomically(tmp_path: Path) -> None:
     """A run leaves no draft and no reserve, and its result can be read."""
     run_in(tmp_path)
     names = sorted(path.name for path in tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Samples, targets and starts: what is drawn from the scenario and the seed, and bad files."""
+"""Samples, targets and starts: draws from the scenario and the seed, and bad files."""
 
 import io
 import pickle
@@ -24,7 +24,7 @@ DOMAIN = ("domain.min_m=[-50.0, 0.0]", "domain.max_m=[50.0, 50.0]", "starts.rand
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A place for files."""
+    """A folder for files."""
     return tmp_path_factory.mktemp("densities")
 
 
@@ -72,7 +72,9 @@ def png(grey: npt.NDArray[np.uint8]) -> bytes:
     count=st.integers(1, 500),
     seed=st.integers(0, 2**63 - 1),
 )
-def test_every_component_gets_its_exact_share(weights: list[float], count: int, seed: int) -> None:
+def test_samples_of_each_component_are_its_exact_share(
+    weights: list[float], count: int, seed: int
+) -> None:
     """Samples are stratified: a component's number is its share, to the next whole sample."""
     components = [
         f"{{mean_m = [{1000.0 * i}, 0.0], variance_m2 = [1.0, 1.0], weight = {weight}}}"
@@ -87,7 +89,7 @@ def test_every_component_gets_its_exact_share(weights: list[float], count: int, 
     assert np.abs(got - shares).max() < 1.0 + 1e-6
 
 
-def test_equal_components_get_equal_numbers() -> None:
+def test_equal_components_have_equally_many_samples() -> None:
     """The paper's samples: exactly N / k in each component."""
     component = "{{mean_m = [{x}, 0.0], variance_m2 = [1.0, 1.0]}}"
     density = ", ".join(component.format(x=1000.0 * i) for i in range(3))
@@ -96,7 +98,7 @@ def test_equal_components_get_equal_numbers() -> None:
     assert np.bincount(np.rint(points[:, 0] / 1000.0).astype(int)).tolist() == [400, 400, 400]
 
 
-def test_component_has_its_mean_and_variance() -> None:
+def test_samples_of_a_component_have_its_mean_and_variance() -> None:
     """Diagonal covariance, by the axes."""
     density = "density=[{mean_m = [100.0, -50.0], variance_m2 = [400.0, 25.0]}]"
     points = samples_of(mission(density, "samples.count=20000"), 1)
@@ -117,7 +119,7 @@ def test_targets_are_independent_draws_of_the_same_density() -> None:
     assert not set(rows(targets_of(scenario, 1))) & set(rows(samples_of(scenario, 1)))
 
 
-def test_everything_is_drawn_by_the_seed() -> None:
+def test_samples_targets_and_starts_are_drawn_by_the_seed() -> None:
     """The same seed gives the same places; another seed gives others."""
     scenario = mission("targets.count=20", *DOMAIN)
     for draw in (samples_of, targets_of, starts_of):
@@ -125,7 +127,7 @@ def test_everything_is_drawn_by_the_seed() -> None:
         assert not np.array_equal(draw(scenario, 1), draw(scenario, 2))
 
 
-def test_number_of_targets_moves_no_sample() -> None:
+def test_the_number_of_targets_changes_no_sample() -> None:
     """Samples, targets and starts have draws of their own."""
     few, many = mission("targets.count=1", *DOMAIN), mission("targets.count=99", *DOMAIN)
 
@@ -144,7 +146,7 @@ def test_starts_are_given_or_random_in_the_domain() -> None:
     assert np.allclose(places.mean(axis=0), [0.0, 25.0], atol=5.0)
 
 
-def test_no_targets() -> None:
+def test_a_mission_without_targets_has_an_empty_table() -> None:
     """A mission without targets has an empty table of them."""
     assert targets_of(mission(), 1).shape == (0, 2)
 
@@ -165,13 +167,13 @@ def test_no_targets() -> None:
     ],
     ids=["plain", "no-end", "header", "windows", "mark", "remarks", "blanks"],
 )
-def test_csv_with_and_without_a_header(folder: Path, text: str | bytes) -> None:
+def test_csv_is_read_with_and_without_a_header(folder: Path, text: str | bytes) -> None:
     """Two columns; a first line without numbers is a header."""
     assert rows(from_text(folder, text)) == [(-3.0, 40.0), (1.5, 2.0)]
 
 
 @pytest.mark.parametrize("kind", ["<f8", ">f8", "<f4", "<i2", "u1"])
-def test_npy_of_any_numbers(folder: Path, kind: str) -> None:
+def test_npy_is_read_with_any_type_of_numbers(folder: Path, kind: str) -> None:
     """Any real or whole numbers, in any byte order."""
     path = folder / f"{kind[1:]}.npy"
     path.write_bytes(npy(np.array([[1, 2], [3, 40]], dtype=kind)))
@@ -179,7 +181,7 @@ def test_npy_of_any_numbers(folder: Path, kind: str) -> None:
     assert rows(sampled(path, "samples.count=9")) == [(1.0, 2.0), (3.0, 40.0)]
 
 
-def test_subset_of_a_file_is_seeded(folder: Path) -> None:
+def test_a_subset_of_a_file_is_drawn_by_the_seed(folder: Path) -> None:
     """Fewer than the file holds: a draw without repetition; as many or more: all of them."""
     path = folder / "many.npy"
     points = np.random.default_rng(1).random((200, 2))
@@ -194,7 +196,7 @@ def test_subset_of_a_file_is_seeded(folder: Path) -> None:
     assert rows(sampled(path, "samples.count=999")) == rows(points)
 
 
-def test_targets_from_a_file_of_their_own(folder: Path) -> None:
+def test_targets_are_read_from_a_file_of_their_own(folder: Path) -> None:
     """All of them in the file's order, or a seeded subset."""
     path = folder / "targets.csv"
     path.write_text("5,5\n1,1\n3,3\n")
@@ -207,8 +209,8 @@ def test_targets_from_a_file_of_their_own(folder: Path) -> None:
     assert targets("targets.count=2") == targets("targets.count=2")
 
 
-def test_targets_around_a_file_of_samples(folder: Path) -> None:
-    """Without a file of their own, targets come from the density that the points stand for."""
+def test_targets_without_a_file_follow_the_density_of_the_samples_file(folder: Path) -> None:
+    """Without a file of their own, targets are drawn from the density that the points represent."""
     path = folder / "cluster.npy"
     random = np.random.default_rng(3)
     path.write_bytes(npy(random.normal([100.0, -20.0], [10.0, 5.0], size=(2000, 2))))
@@ -231,7 +233,7 @@ def test_targets_around_a_file_of_samples(folder: Path) -> None:
     ],
     ids=["one", "identical", "two", "line"],
 )
-def test_targets_around_points_without_an_area(
+def test_targets_of_points_without_an_area_lie_on_the_points_or_their_line(
     folder: Path, text: str, through: tuple[float, float]
 ) -> None:
     """One point, identical points, points on a line: targets stand there, or on the line."""
@@ -257,7 +259,7 @@ def test_targets_around_points_without_an_area(
         (1, 2, (0.0, 0.0), (25.0, 25.0)),
     ],
 )
-def test_bright_pixel_is_where_it_is_seen(
+def test_a_bright_pixel_lies_at_its_place_in_the_image(
     folder: Path,
     row: int,
     column: int,
@@ -288,7 +290,7 @@ def test_density_is_proportional_to_brightness(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "CMYK", "I;16", "F"])
-def test_any_kind_of_image(folder: Path, mode: str) -> None:
+def test_an_image_of_any_mode_is_read(folder: Path, mode: str) -> None:
     """Colour is taken as brightness."""
     path = folder / "map.tif"
     Image.new("L", (4, 3), 255).convert("I" if mode == "I;16" else mode).convert(mode).save(path)
@@ -348,8 +350,8 @@ BAD_FILES: dict[str, tuple[str, bytes | None]] = {
 
 @pytest.mark.parametrize("key", ["samples", "targets"])
 @pytest.mark.parametrize("name", list(BAD_FILES))
-def test_bad_file_is_one_line(tmp_path: Path, name: str, key: str) -> None:
-    """Whatever is wrong with a file: one line says which key, which file and what."""
+def test_a_bad_file_is_refused_in_one_line(tmp_path: Path, name: str, key: str) -> None:
+    """For every defect of a file, one line names the key, the file and the defect."""
     file, content = BAD_FILES[name]
     path = tmp_path / file
     if content is not None:
@@ -366,13 +368,13 @@ def test_bad_file_is_one_line(tmp_path: Path, name: str, key: str) -> None:
     assert f"{key}.file: {path}" in line
 
 
-def test_row_that_is_not_finite_is_named(folder: Path) -> None:
+def test_a_row_that_is_not_finite_is_named(folder: Path) -> None:
     """The row counts from 1, without the header."""
     with pytest.raises(ScenarioError, match="row 2 is not finite"):
         from_text(folder, "x,y\n1,2\n3,inf\n")
 
 
-def test_object_array_is_never_unpickled(tmp_path: Path) -> None:
+def test_an_object_array_is_never_unpickled(tmp_path: Path) -> None:
     """A file must not run code: an array of objects is refused unread."""
     trace, path = tmp_path / "trace", tmp_path / "trap.npy"
     path.write_bytes(npy(np.array([[_Trap(trace), 1]], dtype=object), pickled=True))
@@ -390,10 +392,10 @@ def test_object_array_is_never_unpickled(tmp_path: Path) -> None:
     at=st.floats(0.0, 1.0, exclude_max=True),
     junk=st.binary(min_size=1, max_size=8),
 )
-def test_damaged_file_gives_points_or_one_line(
+def test_a_damaged_file_gives_points_or_one_line(
     folder: Path, kind: str, at: float, junk: bytes
 ) -> None:
-    """No damage to a file makes anything else of it than finite points or a refusal."""
+    """A damaged file gives finite points or a refusal, and nothing else."""
     sound = {
         "csv": b"x,y\n1.5,2\n3,4\n5,6e3\n",
         "npy": npy(np.arange(12.0).reshape(6, 2)),
@@ -416,8 +418,8 @@ def test_damaged_file_gives_points_or_one_line(
 # Numbers at the edge.
 
 
-def test_no_samples_at_all() -> None:
-    """N = 0 is refused, however it came about."""
+def test_a_density_without_samples_is_refused() -> None:
+    """N = 0 is refused, for every cause."""
     scenario = mission()
     none = msgspec.structs.replace(
         scenario, samples=msgspec.structs.replace(scenario.samples, count=0)
@@ -427,7 +429,7 @@ def test_no_samples_at_all() -> None:
 
 
 @pytest.mark.parametrize("text", ["7,8\n", "7,8\n" * 40], ids=["one", "identical"])
-def test_points_in_one_place(folder: Path, text: str) -> None:
+def test_points_in_one_place_are_accepted(folder: Path, text: str) -> None:
     """One point, or the same one many times, is a density."""
     points = from_text(folder, text)
 
@@ -464,7 +466,7 @@ def test_samples_lie_along_a_morton_curve(folder: Path) -> None:
 
 
 def test_neighbours_in_the_order_are_neighbours_in_space() -> None:
-    """The way along the samples is far shorter than in the order of drawing."""
+    """The path along the samples is far shorter than in the order of drawing."""
     points = samples_of(mission("samples.count=2000"), 1)
     shuffled = np.random.default_rng(1).permutation(points)
 

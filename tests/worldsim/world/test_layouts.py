@@ -1,4 +1,4 @@
-"""Generated maps: what each layout promises, in every size that it takes."""
+"""Generated maps: the properties of each layout, in every size that it accepts."""
 
 import itertools
 import math
@@ -29,7 +29,7 @@ def assert_sound(cells: Cells) -> None:
 
 
 def fits(name: str, columns: int, rows: int, resolution_m: float) -> bool:
-    """Whether a layout takes this size: cells each way, and metres of a cell."""
+    """Whether a layout accepts this size: cells each way, and metres of a cell."""
     if name == "office":
         return resolution_m <= 0.5 and min(columns, rows) >= round(8.0 / resolution_m)
     least, coarsest_m = {"blank": (3, 1e9), "unstructured": (24, 4.0), "cityblock": (36, 2.5)}[name]
@@ -42,7 +42,7 @@ def runs(line: Cells, kind: int) -> list[int]:
 
 
 @pytest.mark.parametrize("name", list(LAYOUTS))
-def test_layout_is_sound_by_default(name: str) -> None:
+def test_a_layout_is_sound_at_its_default_size(name: str) -> None:
     """The papers' sizes: 96 x 96 cells of 1 m, the office 27 x 20 m in cells of 0.2 m."""
     for seed in range(12):
         ground = layout(name, seed=seed)
@@ -55,7 +55,7 @@ def test_layout_is_sound_by_default(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SEEDED)
-def test_layout_is_drawn_by_the_seed(name: str) -> None:
+def test_a_layout_is_drawn_by_the_seed(name: str) -> None:
     """The same seed, the same map; another seed, another."""
     assert np.array_equal(layout(name, seed=3).cells, layout(name, seed=3).cells)
     assert not np.array_equal(layout(name, seed=3).cells, layout(name, seed=4).cells)
@@ -69,10 +69,10 @@ def test_layout_is_drawn_by_the_seed(name: str) -> None:
     resolution_m=st.sampled_from([0.05, 0.1, 0.2, 0.25, 0.3, 0.5, 0.6, 1.0, 2.0, 2.5, 4.0, 5.0]),
     seed=st.integers(0, 2**63 - 1),
 )
-def test_layout_of_any_size_is_sound_or_refused(
+def test_a_layout_of_any_size_is_sound_or_refused(
     name: str, columns: int, rows: int, resolution_m: float, seed: int
 ) -> None:
-    """Whatever the size: a sound map, or one line that says what the layout needs."""
+    """Any size gives a sound map, or one line with the size that the layout needs."""
     size_m = (columns * resolution_m, rows * resolution_m)
     if not fits(name, columns, rows, resolution_m):
         with pytest.raises(ScenarioError, match=r"^map\.size_m: .* needs"):
@@ -83,13 +83,13 @@ def test_layout_of_any_size_is_sound_or_refused(
         assert_sound(ground.cells)
 
 
-def test_blank_has_only_the_wall() -> None:
+def test_blank_has_only_the_surrounding_wall() -> None:
     """All inside is free."""
     assert (layout("blank", (5.0, 4.0)).cells[1:-1, 1:-1] == FREE).all()
 
 
-def test_unstructured_is_cluttered() -> None:
-    """About a fifth is taken, by many obstacles of very different sizes."""
+def test_unstructured_has_obstacles_on_a_fifth_of_the_map() -> None:
+    """About a fifth is occupied, by many obstacles of very different sizes."""
     for seed in range(8):
         cells = layout("unstructured", seed=seed).cells
         labels, sizes = parts(np.where(cells == FREE, OCCUPIED, FREE).astype(np.uint8))
@@ -100,7 +100,7 @@ def test_unstructured_is_cluttered() -> None:
         assert islands.max() > 10 * np.median(islands)
 
 
-def test_cityblock_has_streets_round_solid_blocks() -> None:
+def test_cityblock_has_streets_around_solid_blocks() -> None:
     """Streets run from wall to wall both ways; every block is a filled rectangle off the wall."""
     for seed in range(8):
         cells = layout("cityblock", seed=seed).cells
@@ -118,7 +118,7 @@ def test_cityblock_has_streets_round_solid_blocks() -> None:
             assert rows.max() < 94
 
 
-def test_office_is_an_office() -> None:
+def test_office_has_corridors_rooms_and_doors() -> None:
     """Two corridors of 1.8 m from wall to wall, about a dozen rooms, doors of 0.8 to 1 m, free space most of it."""
     for seed in range(12):
         cells = layout("office", seed=seed).cells
@@ -159,10 +159,10 @@ def test_office_is_an_office() -> None:
         ("blank", (5.0, 5.0), -1.0, "map.resolution_m"),
     ],
 )
-def test_layout_that_cannot_be(
+def test_a_layout_that_cannot_be_generated_is_refused(
     name: str, size_m: tuple[float, float] | None, resolution_m: float | None, words: str
 ) -> None:
-    """One line with the key and what would do."""
+    """One line with the key and the remedy."""
     with pytest.raises(ScenarioError) as caught:
         layout(name, size_m, resolution_m)
     assert words in str(caught.value)

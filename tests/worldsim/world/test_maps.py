@@ -36,13 +36,13 @@ MOVING_AI = "type octile\nheight 3\nwidth 4\nmap\n.G@O\nSTW.\n....\n"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A place for files."""
+    """A folder for files."""
     return tmp_path_factory.mktemp("maps")
 
 
-def nav2(folder: Path, image: bytes | None = PGM, /, **said: str | None) -> Path:
+def nav2(folder: Path, image: bytes | None = PGM, /, **changed: str | None) -> Path:
     """A YAML file with these keys changed (None: left out), and its image."""
-    keys = {**NAV2, **said}
+    keys = {**NAV2, **changed}
     if image is not None:
         (folder / (keys["image"] or "map.pgm")).write_bytes(image)
     path = folder / "map.yaml"
@@ -65,7 +65,7 @@ def encoded(pixels: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], kind: str = 
 
 
 def refusal(path: Path, resolution_m: float | None = None) -> str:
-    """What is said of a bad map, in one line."""
+    """The error of a bad map, which is one line."""
     with pytest.raises(ScenarioError) as caught:
         read(path, resolution_m)
     assert "\n" not in str(caught.value)
@@ -82,7 +82,7 @@ def ground_of(path: Path) -> Ground:
 # Nav2.
 
 
-def test_map_of_nav2_by_hand(folder: Path) -> None:
+def test_a_map_of_nav2_written_by_hand_is_read(folder: Path) -> None:
     """The image's top row is the highest; white is free, black occupied, 205 unknown."""
     ground = ground_of(nav2(folder))
 
@@ -92,7 +92,7 @@ def test_map_of_nav2_by_hand(folder: Path) -> None:
     assert ground.cells.tolist() == [[FREE, FREE, OCCUPIED], [FREE, UNKNOWN, OCCUPIED]]
 
 
-def test_plain_pgm_says_the_same(folder: Path) -> None:
+def test_plain_pgm_gives_the_same_map(folder: Path) -> None:
     """P2 and P5 are two ways to write one image."""
     text = b"P2\n3 2\n255\n254 205 0\n254 254 0\n"
 
@@ -144,7 +144,7 @@ THRESHOLDS = st.one_of(
     negate=st.booleans(),
     thresholds=st.tuples(THRESHOLDS, THRESHOLDS).map(sorted),
 )
-def test_grey_pixel_is_read_as_by_nav2(
+def test_a_grey_pixel_is_read_as_by_nav2(
     folder: Path, grey: list[int], mode: str, thresholds: list[float], *, negate: bool
 ) -> None:
     """Every mode against the loader's own lines, pixel by pixel."""
@@ -187,7 +187,7 @@ def test_grey_pixel_is_read_as_by_nav2(
     opacity=st.booleans(),
     thresholds=st.tuples(THRESHOLDS, THRESHOLDS).map(sorted),
 )
-def test_coloured_pixel_is_read_as_by_nav2(
+def test_a_coloured_pixel_is_read_as_by_nav2(
     folder: Path,
     colours: list[tuple[int, ...]],
     mode: str,
@@ -229,7 +229,7 @@ def test_opaque_black_is_a_wall_with_an_alpha_channel(folder: Path) -> None:
     assert ground_of(strict).cells.tolist() == [[UNKNOWN, FREE]]
 
 
-def test_what_is_transparent_is_unknown_in_scale_mode(folder: Path) -> None:
+def test_a_transparent_pixel_is_unknown_in_scale_mode(folder: Path) -> None:
     """As map_saver writes it; in trinary mode it is not, and that is worth a warning."""
     image = np.array([[[255, 255, 255, 255], [255, 255, 255, 0]]], dtype=np.uint8)
     scale = nav2(folder, encoded(image), image="map.png", mode="scale")
@@ -243,7 +243,7 @@ def test_what_is_transparent_is_unknown_in_scale_mode(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["P", "LA", "1", "CMYK", "I;16"])
-def test_image_of_any_kind(folder: Path, kind: str) -> None:
+def test_an_image_of_any_kind_is_read(folder: Path, kind: str) -> None:
     """Palettes, one bit, 16 bits: white stays free, black occupied."""
     black_and_white = Image.fromarray(np.array([[0, 255], [255, 255]], dtype=np.uint8))
     buffer = io.BytesIO()
@@ -267,54 +267,54 @@ def test_grey_of_16_bits_is_not_cut_to_8(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("free_thresh", "negate", "said"),
+    ("free_thresh", "negate", "read_as"),
     [("0.25", "0", "read as free"), ("0.1", "1", "read as occupied"), ("0.196", "0", None)],
 )
-def test_unknown_that_becomes_known_is_worth_a_warning(
-    folder: Path, free_thresh: str, negate: str, said: str | None
+def test_unknown_grey_that_is_read_as_free_or_occupied_gives_a_warning(
+    folder: Path, free_thresh: str, negate: str, read_as: str | None
 ) -> None:
     """205 is 0.196 occupied: a free_thresh of 0.25, long the default of map_saver, makes it free."""
     image = b"P5 4 1 255 " + bytes([254, 205, 205, 0])
     _, warnings = read(nav2(folder, image, free_thresh=free_thresh, negate=negate))
 
-    if said is None:
+    if read_as is None:
         assert warnings == []
     else:
         assert len(warnings) == 1
-        assert said in warnings[0]
+        assert read_as in warnings[0]
         assert "2 pixels" in warnings[0]
         assert "free_thresh: 0.196" in warnings[0]
 
 
 @pytest.mark.parametrize("value", ["5e-2", "'0.05'", ".05", "0.05 # metres"])
-def test_numbers_as_other_readers_of_yaml_take_them(folder: Path, value: str) -> None:
-    """PyYAML takes 5e-2 for text; the map means a number."""
+def test_numbers_are_read_as_by_other_yaml_readers(folder: Path, value: str) -> None:
+    """PyYAML reads 5e-2 as text; in a map it is a number."""
     assert ground_of(nav2(folder, resolution=value)).frame.resolution_m == 0.05
 
 
-def test_image_elsewhere(folder: Path) -> None:
-    """Beside the YAML file, below it, or anywhere by its full path."""
+def test_an_image_may_be_in_another_folder(folder: Path) -> None:
+    """In the folder of the YAML file, below it, or anywhere by its full path."""
     (folder / "below").mkdir(exist_ok=True)
     (folder / "below" / "b.pgm").write_bytes(PGM)
     for image in ("below/b.pgm", str(folder / "below" / "b.pgm")):
         assert ground_of(nav2(folder, None, image=image)).cells.shape == (2, 3)
 
 
-def test_other_keys_and_capitals(folder: Path) -> None:
+def test_unknown_keys_and_capitals_of_the_mode_are_ignored(folder: Path) -> None:
     """As Nav2, which ignores keys that it does not know and the case of the mode."""
     path = nav2(folder, mode="Trinary", author="somebody", negate="false")
 
     assert ground_of(path).cells.shape == (2, 3)
 
 
-def test_resolution_of_the_file_holds(folder: Path) -> None:
-    """It may be repeated, not contradicted."""
+def test_the_resolution_of_the_file_is_not_contradicted(folder: Path) -> None:
+    """The scenario may repeat it, not contradict it."""
     assert read(nav2(folder), 0.05)[0].frame.resolution_m == 0.05
     assert "leave it out" in refusal(nav2(folder), 0.1)
 
 
 @pytest.mark.parametrize(
-    ("said", "words"),
+    ("changed", "words"),
     [
         ({"image": None}, "`image`"),
         ({"resolution": None}, "`resolution`"),
@@ -344,9 +344,11 @@ def test_resolution_of_the_file_holds(folder: Path) -> None:
         ({"mode": "binary"}, "give trinary, scale or raw"),
     ],
 )
-def test_yaml_that_is_no_map(folder: Path, said: dict[str, str | None], words: str) -> None:
+def test_yaml_that_is_no_map_is_refused(
+    folder: Path, changed: dict[str, str | None], words: str
+) -> None:
     """One line with the file, the key and the remedy."""
-    line = refusal(nav2(folder, None, **said))
+    line = refusal(nav2(folder, None, **changed))
 
     assert line.startswith(f"map.file: {folder}")
     assert words in line
@@ -356,12 +358,12 @@ def test_yaml_that_is_no_map(folder: Path, said: dict[str, str | None], words: s
     "text",
     ["", "- 1\n", "map", "a: [", "a: b: c", "\x00", "1: 2", "[" * 5000, "&a [*a]", b"\xff\xfe\xff"],
 )
-def test_yaml_that_is_no_mapping(folder: Path, text: str | bytes) -> None:
-    """Whatever it is, it is refused in one line."""
+def test_yaml_that_is_no_mapping_is_refused(folder: Path, text: str | bytes) -> None:
+    """Every other content is refused in one line."""
     assert str(folder / "bad.yaml") in refusal(saved(folder, "bad.yaml", text))
 
 
-def test_missing_files(folder: Path) -> None:
+def test_missing_files_are_refused(folder: Path) -> None:
     """The map, and the image that a map names."""
     for name in ("none.yaml", "none.map", "none.png"):
         assert refusal(folder / name) == f"map.file: {folder / name}: no such file"
@@ -369,7 +371,7 @@ def test_missing_files(folder: Path) -> None:
     assert line == f"map.file: {folder / 'map.yaml'}: image {folder / 'none.pgm'}: no such file"
 
 
-def test_folder_is_no_map(folder: Path) -> None:
+def test_a_folder_is_refused_as_a_map(folder: Path) -> None:
     """A folder may have any name."""
     for name in ("a.yaml", "a.map", "a.png"):
         (folder / name).mkdir()
@@ -377,7 +379,7 @@ def test_folder_is_no_map(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["map", "map.txt", "map.world", "map.svg"])
-def test_unknown_kind(folder: Path, name: str) -> None:
+def test_a_file_of_unknown_kind_is_refused(folder: Path, name: str) -> None:
     """The line names the kinds that there are."""
     line = refusal(folder / name)
 
@@ -390,7 +392,7 @@ def test_unknown_kind(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["PNG", "PPM", "BMP", "TIFF", "JPEG"])
-def test_plain_image(folder: Path, kind: str) -> None:
+def test_a_plain_image_is_read(folder: Path, kind: str) -> None:
     """White is free, black occupied, mid grey unknown, and grey 205 too."""
     suffix = {"PPM": "pgm", "TIFF": "tif", "JPEG": "jpg"}.get(kind, kind.lower())
     grey = np.repeat(np.repeat(np.array([[255, 128], [205, 0]], np.uint8), 8, axis=0), 8, axis=1)
@@ -401,8 +403,8 @@ def test_plain_image(folder: Path, kind: str) -> None:
     assert read(folder / f"plain.{suffix}", 0.2)[0].frame.resolution_m == 0.2
 
 
-def test_what_is_transparent_is_unknown_in_a_plain_image(folder: Path) -> None:
-    """Whatever its colour; what is opaque counts by its colour alone."""
+def test_a_transparent_pixel_is_unknown_in_a_plain_image(folder: Path) -> None:
+    """For every colour; an opaque pixel counts by its colour alone."""
     grey = np.array([[255, 0, 255, 0, 205]], dtype=np.uint8)
     alpha = np.array([[255, 255, 254, 0, 255]], dtype=np.uint8)
     ground = ground_of(saved(folder, "clear.png", encoded(np.dstack([grey, grey, grey, alpha]))))
@@ -411,14 +413,14 @@ def test_what_is_transparent_is_unknown_in_a_plain_image(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("resolution_m", [0.0, -1.0, math.nan, math.inf, 1e-9])
-def test_resolution_that_is_none(folder: Path, resolution_m: float) -> None:
+def test_an_impossible_resolution_is_refused(folder: Path, resolution_m: float) -> None:
     """Refused before anything is read."""
     for name in ("none.png", "none.map"):
         assert "map.resolution_m" in refusal(folder / name, resolution_m)
 
 
-def test_map_without_free_cell(folder: Path) -> None:
-    """Nowhere to stand."""
+def test_a_map_without_a_free_cell_is_refused(folder: Path) -> None:
+    """A robot cannot stand anywhere."""
     assert "no free cell" in refusal(saved(folder, "black.pgm", b"P5 2 2 255 " + bytes(4)))
     assert "no free cell" in refusal(
         saved(folder, "black.map", "type octile\nheight 1\nwidth 1\nmap\n@\n")
@@ -426,7 +428,7 @@ def test_map_without_free_cell(folder: Path) -> None:
 
 
 def png_of_size(columns: int, rows: int) -> bytes:
-    """A PNG that says how large it is and has no pixels."""
+    """A PNG whose header has a size, without pixels."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return (
@@ -438,7 +440,7 @@ def png_of_size(columns: int, rows: int) -> bytes:
 
 
 @pytest.mark.parametrize("side", [4001, 10_000, 12_000, 20_000, 2_000_000])
-def test_image_too_large_is_not_decoded(
+def test_an_image_that_is_too_large_is_not_decoded(
     folder: Path, side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The size is in the header; Pillow's own limits are never reached."""
@@ -453,7 +455,7 @@ def test_image_too_large_is_not_decoded(
     assert decoded == []
 
 
-def test_largest_map(folder: Path) -> None:
+def test_the_largest_map_is_read(folder: Path) -> None:
     """4000 x 4000 cells are read."""
     pixels = np.full((4000, 4000), 255, dtype=np.uint8)
     pixels[0, 3999] = 0
@@ -464,8 +466,8 @@ def test_largest_map(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["PNG", "PPM", "BMP", "TIFF", "JPEG"])
-def test_truncated_image(folder: Path, kind: str) -> None:
-    """Half a map is none."""
+def test_a_truncated_image_is_refused(folder: Path, kind: str) -> None:
+    """A part of an image is not a map."""
     pixels = np.random.default_rng(1).integers(0, 256, (64, 64), dtype=np.uint8)
     whole = encoded(pixels, kind)
     suffix = {"PPM": "pgm", "TIFF": "tif", "JPEG": "jpg"}.get(kind, kind.lower())
@@ -479,7 +481,7 @@ def test_truncated_image(folder: Path, kind: str) -> None:
     kind=st.sampled_from(["PNG", "PPM", "BMP", "TIFF", "JPEG"]),
     edits=st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), min_size=1, max_size=6),
 )
-def test_mangled_image_is_read_or_refused(
+def test_a_mangled_image_is_read_or_refused(
     folder: Path, kind: str, edits: list[tuple[int, int]]
 ) -> None:
     """No other error and no warning of Pillow's comes out."""
@@ -497,8 +499,8 @@ def test_mangled_image_is_read_or_refused(
 # MovingAI.
 
 
-def test_map_of_moving_ai_by_hand(folder: Path) -> None:
-    """The first line is the top row; ., G and S are free; 1 m a cell unless said otherwise."""
+def test_a_map_of_moving_ai_written_by_hand_is_read(folder: Path) -> None:
+    """The first line is the top row; ., G and S are free; 1 m a cell unless the scenario has another resolution."""
     ground = ground_of(saved(folder, "hand.map", MOVING_AI))
 
     assert ground.frame == Frame(1.0, (0.0, 0.0), 3, 4)
@@ -520,8 +522,8 @@ def test_map_of_moving_ai_by_hand(folder: Path) -> None:
     ],
     ids=["windows", "no-end", "order", "blanks"],
 )
-def test_moving_ai_in_other_hands(folder: Path, old: str, new: str) -> None:
-    """What the benchmark's own files differ in."""
+def test_variants_of_moving_ai_files_are_read(folder: Path, old: str, new: str) -> None:
+    """Differences between the benchmark's own files."""
     other = saved(folder, "other.map", MOVING_AI.replace(old, new))
     plain = saved(folder, "plain.map", MOVING_AI)
 
@@ -549,7 +551,7 @@ def test_moving_ai_in_other_hands(folder: Path, old: str, new: str) -> None:
         (MOVING_AI, "\x00\xff" * 99, "not a MovingAI map"),
     ],
 )
-def test_bad_map_of_moving_ai(folder: Path, old: str, new: str, words: str) -> None:
+def test_a_bad_map_of_moving_ai_is_refused(folder: Path, old: str, new: str, words: str) -> None:
     """One line with the file, the line and the remedy."""
     line = refusal(saved(folder, "bad.map", MOVING_AI.replace(old, new)))
 
@@ -589,8 +591,8 @@ def test_parts_do_not_join_at_corners() -> None:
             assert labels[row, column] == labels[other_row, other_column]
 
 
-def test_no_parts() -> None:
-    """Without free cells there are none."""
+def test_a_map_without_free_cells_has_no_parts() -> None:
+    """Without free cells the number of parts is 0."""
     labels, sizes = parts(np.zeros((2, 3), dtype=np.uint8))
 
     assert sizes.tolist() == [0]

@@ -1,4 +1,4 @@
-"""Sight over the true map: ranges, noise, and walls between two places."""
+"""Sensing on the true map: ranges, noise, and walls between two places."""
 
 import math
 
@@ -25,7 +25,7 @@ Codes = npt.NDArray[np.uint16]
 def crossings(
     cells: Cells, u: float, v: float, du: float, dv: float
 ) -> list[tuple[float, int, int]]:
-    """Plainly: every border that a ray crosses on the map: (how far along, row and column beyond).
+    """Every border that a ray crosses on the map, computed directly: (distance along it, row and column beyond).
 
     In order; at a corner the column changes first.
     """
@@ -58,7 +58,7 @@ def is_wall(cells: Cells, row: int, column: int) -> bool:
 
 
 def plain_way(cells: Cells, u: float, v: float, angle_rad: float, range_cells: float) -> float:
-    """`way_to_wall`, plainly."""
+    """`way_to_wall`, computed directly."""
     for way, row, column in crossings(cells, u, v, math.cos(angle_rad), math.sin(angle_rad)):
         if is_wall(cells, row, column):
             return max(0.0, way) if way <= range_cells else math.inf
@@ -89,7 +89,7 @@ def scan_of(
 
 @examples(1000)
 @given(place=places(), angle_rad=HEADINGS, range_cells=st.floats(0.1, 20.0))
-def test_way_to_the_wall_is_the_plain_one(
+def test_the_distance_to_the_wall_is_that_of_the_direct_computation(
     place: Place, angle_rad: float, range_cells: float
 ) -> None:
     """Exactly, also from borders, along them and through corners."""
@@ -106,25 +106,25 @@ def test_way_to_the_wall_is_the_plain_one(
     view_deg=st.sampled_from([360.0, 90.0, 1.0]),
     range_m=st.floats(0.01, 30.0),
 )
-def test_scan_tells_ranges_in_parts_of_the_range(
+def test_a_scan_has_ranges_in_fractions_of_the_sensor_range(
     place: Place, beams: int, view_deg: float, range_m: float
 ) -> None:
     """Exactly: each beam to the nearest part, and nothing beyond the range."""
     ground, pose = place
     u, v = in_cells(ground, pose)
     range_cells = range_m / ground.frame.resolution_m
-    told = []
+    codes = []
     for beam in range(beams):
         angle_rad = beam_rad(pose.heading_rad, math.radians(view_deg), beams, beam)
         way = plain_way(ground.cells, u, v, angle_rad, range_cells)
-        told.append(NO_RETURN if way == math.inf else round(way / range_cells * CODES))
+        codes.append(NO_RETURN if way == math.inf else round(way / range_cells * CODES))
     sensor = SensorOptions(range_m=range_m, beams=beams, field_of_view_deg=view_deg)
 
-    assert scan_of(ground, sensor, pose).tolist() == told
+    assert scan_of(ground, sensor, pose).tolist() == codes
 
 
 def test_range_is_inclusive() -> None:
-    """A wall at exactly the range returns; what lies outside the map is one."""
+    """A wall at exactly the range returns; the outside of the map is a wall."""
     ground = drawn("....#")
     ahead = {"beams": 1, "field_of_view_deg": 1.0}
 
@@ -138,7 +138,7 @@ def test_range_is_inclusive() -> None:
 
 
 def test_unknown_cells_are_walls() -> None:
-    """The truth that a map leaves open is nothing to walk or look through."""
+    """A robot neither moves nor senses through a cell that the map leaves unknown."""
     ahead = SensorOptions(range_m=4.0, beams=1)
 
     assert scan_of(drawn("..?."), ahead, Pose(0.0, 0.5)).tolist() == [CODES // 2]
@@ -151,15 +151,17 @@ def test_unknown_cells_are_walls() -> None:
     v=st.floats(allow_nan=True, allow_infinity=True),
     angle_rad=st.floats(allow_nan=True, allow_infinity=True),
 )
-def test_beam_ends_wherever_it_begins(ground: Ground, u: float, v: float, angle_rad: float) -> None:
-    """The kernel is total: from anywhere, in any direction, it tells a range or none."""
+def test_a_beam_ends_from_any_place_and_in_any_direction(
+    ground: Ground, u: float, v: float, angle_rad: float
+) -> None:
+    """The kernel is total: from any place, in any direction, it returns a range or none."""
     assert 0.0 <= way_to_wall(ground.cells, u, v, angle_rad, 20.0) <= math.inf
 
 
 # Noise.
 
 
-def test_noise_is_keyed() -> None:
+def test_noise_depends_on_its_key_alone() -> None:
     """A draw depends on seed, robot, step and beam, and on nothing else."""
     ground = drawn(40 * ".")
     sensor = SensorOptions(range_m=50.0, beams=1, noise_m=2.0)
@@ -168,9 +170,9 @@ def test_noise_is_keyed() -> None:
         first, second = words[1] << 32 | words[0], words[3] << 32 | words[2]
         units = (first >> 11) * 2.0**-53, (second >> 11) * 2.0**-53
         normal = math.sqrt(-2.0 * math.log(1.0 - units[0])) * math.cos(math.tau * units[1])
-        told = scan_of(ground, sensor, Pose(10.0, 0.5), seed=seed, robot=robot, step=step)
+        codes = scan_of(ground, sensor, Pose(10.0, 0.5), seed=seed, robot=robot, step=step)
 
-        assert told.tolist() == [round((30.0 + 2.0 * normal) / 50.0 * CODES)]
+        assert codes.tolist() == [round((30.0 + 2.0 * normal) / 50.0 * CODES)]
 
 
 def test_noise_is_normal() -> None:
@@ -191,7 +193,7 @@ def test_noise_is_normal() -> None:
 @examples(50)
 @given(place=places(), seed=SEEDS, noise_m=st.floats(0.01, 100.0))
 def test_noise_stays_within_the_range(place: Place, seed: int, noise_m: float) -> None:
-    """A noisy range is clamped; what found nothing still finds nothing."""
+    """A noisy range is clamped; a beam without a return still has none."""
     ground, pose = place
     exact = SensorOptions(range_m=2.0, beams=60)
     noisy = SensorOptions(range_m=2.0, beams=60, noise_m=noise_m)
@@ -243,10 +245,10 @@ PLACES = st.tuples(
 
 @examples(1000)
 @given(ground=grounds(), one=PLACES, other=PLACES)
-def test_sight_is_mutual(
+def test_walls_are_the_same_from_either_end(
     ground: Ground, one: tuple[float, float], other: tuple[float, float]
 ) -> None:
-    """As many walls from either end, and none if a plain walk meets none."""
+    """As many walls from either end, and none if the direct computation meets none."""
     cells = ground.cells
     rows, columns = cells.shape
     walls = walls_between(cells, *one, *other)

@@ -1,4 +1,4 @@
-"""Where robots begin on a map, and what can be seen from there."""
+"""Starts of robots on a map, and the cells that are observable from them."""
 
 from collections import deque
 from typing import Any
@@ -37,7 +37,7 @@ TWO_ROOMS = plan("""
 
 
 def placed(ground: Ground, **changed: Any) -> npt.NDArray[np.float64]:
-    """Four random separate starts, but for what is changed."""
+    """Four random separate starts, with changed arguments."""
     asked: dict[str, Any] = {
         "poses_m": (),
         "random": True,
@@ -50,7 +50,7 @@ def placed(ground: Ground, **changed: Any) -> npt.NDArray[np.float64]:
 
 
 def cells_of(ground: Ground, starts_m: npt.NDArray[np.float64]) -> list[int]:
-    """Their cells; they stand in the middle of them."""
+    """The cells of starts, which are in the middle of them."""
     cells = [ground.frame.cell_of(x, y) for x, y in starts_m]
     assert [ground.frame.centre_of(cell) for cell in cells] == [tuple(xy) for xy in starts_m]
     return cells
@@ -113,8 +113,10 @@ def test_given_starts_are_taken_as_they_are() -> None:
         ((12.6, -3.1), "(12.6, -3.1) cannot be reached from r1's start; move it"),
     ],
 )
-def test_given_start_that_cannot_be(pose_m: tuple[float, float], words: str) -> None:
-    """One line with the start that is wrong and why."""
+def test_a_given_start_that_is_not_free_or_not_connected_is_refused(
+    pose_m: tuple[float, float], words: str
+) -> None:
+    """One line with the start that is wrong and the reason."""
     with pytest.raises(ScenarioError) as caught:
         placed(TWO_ROOMS, poses_m=((10.6, -3.1), pose_m), random=False, count=2)
     assert str(caught.value).startswith("starts.poses_m[1]: ")
@@ -122,7 +124,7 @@ def test_given_start_that_cannot_be(pose_m: tuple[float, float], words: str) -> 
 
 
 def test_given_starts_may_be_in_a_smaller_part() -> None:
-    """Only that they are together matters."""
+    """They need only be in the same part."""
     poses_m = ((13.8, -3.2), (12.8, -2.2))
 
     assert placed(TWO_ROOMS, poses_m=poses_m, random=False, count=2).shape == (2, 2)
@@ -139,10 +141,10 @@ def test_given_starts_may_be_in_a_smaller_part() -> None:
     count=st.integers(1, 6),
     seed=st.integers(0, 2**63 - 1),
 )
-def test_drawn_starts_are_cells_of_their_own_in_the_largest_part(
+def test_drawn_starts_are_distinct_cells_of_the_largest_part(
     ground: Ground, spread: str, kinds: int, count: int, seed: int
 ) -> None:
-    """In every way of drawing, on any map; or one line that says why not."""
+    """With every option of drawing, on any map; or one line with the reason why not."""
     room = len(largest(ground)) if (ground.cells == FREE).any() else 0
     few_spots = spread == "separate" and 0 < kinds < count
     asked = {"spread": spread, "spots": kinds, "count": count, "seed": seed}
@@ -172,7 +174,7 @@ def test_drawn_starts_are_drawn_by_the_seed() -> None:
     assert np.allclose(firsts.mean(axis=0), [13.5, 10.0], atol=2.0)
 
 
-def test_together_is_side_by_side() -> None:
+def test_a_team_together_starts_side_by_side() -> None:
     """A team fills the cells around its first robot."""
     blank = layout("blank", (21.0, 21.0))
     five = placed(blank, spread="together", count=5, seed=11)
@@ -180,7 +182,7 @@ def test_together_is_side_by_side() -> None:
     assert np.abs(five[1:] - five[0]).sum(axis=1).tolist() == [1.0] * 4
 
 
-def test_together_goes_round_walls() -> None:
+def test_a_team_together_starts_on_the_nearest_cells_around_walls() -> None:
     """The nearest on foot, not through the wall."""
     ground = plan("""
         ...#..
@@ -194,7 +196,7 @@ def test_together_goes_round_walls() -> None:
     assert [steps[cell] for cell in cells] == sorted(steps.values())
 
 
-def test_together_tries_every_spot_once() -> None:
+def test_a_team_together_tries_every_spot_once() -> None:
     """15 seeds in a row begin at 15 spots, each the first robot's (KME, V-A)."""
     where = spots(OFFICE, 15).tolist()
     firsts = [
@@ -205,8 +207,8 @@ def test_together_tries_every_spot_once() -> None:
     assert firsts == where
 
 
-def test_separate_draws_spots_without_replacement() -> None:
-    """Everybody has another spot; over the seeds each spot comes to each robot."""
+def test_separate_starts_are_spots_without_replacement() -> None:
+    """Each robot has another spot; over the seeds each spot comes to each robot."""
     where = set(spots(OFFICE, 15).tolist())
     seen = set()
     for seed in range(80):
@@ -231,8 +233,10 @@ def test_separate_draws_spots_without_replacement() -> None:
         ),
     ],
 )
-def test_more_than_there_is_room_for(asked: dict[str, Any], words: str) -> None:
-    """One line that counts."""
+def test_more_starts_than_free_cells_or_spots_are_refused(
+    asked: dict[str, Any], words: str
+) -> None:
+    """One line with both numbers."""
     with pytest.raises(ScenarioError) as caught:
         placed(TWO_ROOMS, **asked)
     assert words in str(caught.value)
@@ -243,7 +247,7 @@ def test_more_than_there_is_room_for(asked: dict[str, Any], words: str) -> None:
 
 @examples(80)
 @given(ground=GROUNDS, count=st.integers(1, 8))
-def test_next_spot_is_the_farthest(ground: Ground, count: int) -> None:
+def test_the_next_spot_is_the_farthest(ground: Ground, count: int) -> None:
     """Against a literal farthest-point rule."""
     free = sorted(largest(ground)) if (ground.cells == FREE).any() else []
     if len(free) < count:
@@ -273,11 +277,11 @@ def test_spots_are_spread_over_the_map() -> None:
     assert apart[~np.eye(15, dtype=bool)].min() > 20.0
 
 
-# What can be seen.
+# Observable cells.
 
 
-def test_observable_is_the_part_of_the_starts_and_its_walls() -> None:
-    """Free cells of the room, the walls beside them without corners, unknown cells like walls."""
+def test_observable_cells_are_the_part_of_the_starts_and_its_walls() -> None:
+    """Free cells of the room, the walls next to them without corners, unknown cells like walls."""
     left = observable(TWO_ROOMS, np.array([[10.6, -3.1]]))
     right = observable(TWO_ROOMS, np.array([[13.8, -3.2]]))
     inside = np.zeros((5, 9), dtype=bool)
@@ -289,8 +293,8 @@ def test_observable_is_the_part_of_the_starts_and_its_walls() -> None:
     assert (observable(TWO_ROOMS, np.array([[10.6, -3.1], [13.8, -3.2]])) == (left | right)).all()
 
 
-def test_observable_leaves_out_what_is_inside_of_blocks() -> None:
-    """Of a solid block only the outermost cells ever get a stamp."""
+def test_cells_inside_of_blocks_are_not_observable() -> None:
+    """Only the outermost cells of a solid block are observable."""
     city = layout("cityblock", seed=1)
     seen = observable(city, placed(city))
     solid = ~seen & (city.cells == OCCUPIED)
@@ -301,8 +305,10 @@ def test_observable_leaves_out_what_is_inside_of_blocks() -> None:
 
 @examples(80)
 @given(ground=GROUNDS, places=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), max_size=3))
-def test_observable_by_its_definition(ground: Ground, places: list[tuple[int, int]]) -> None:
-    """Every cell by itself; starts that are nowhere or not free reach nothing."""
+def test_observable_cells_are_those_of_the_definition(
+    ground: Ground, places: list[tuple[int, int]]
+) -> None:
+    """Each cell alone; starts that are outside or not free reach nothing."""
     rows, columns = ground.cells.shape
     starts_m = np.array([(-3.0 + 0.25 * c + 0.1, 5.0 + 0.25 * r + 0.1) for r, c in places])
     reached: set[int] = set()
@@ -313,9 +319,10 @@ def test_observable_by_its_definition(ground: Ground, places: list[tuple[int, in
 
     for r in range(rows):
         for c in range(columns):
-            beside = {(r - 1, c), (r + 1, c), (r, c - 1), (r, c + 1)}
+            neighbours = {(r - 1, c), (r + 1, c), (r, c - 1), (r, c + 1)}
             near = any(
-                0 <= a < rows and 0 <= b < columns and a * columns + b in reached for a, b in beside
+                0 <= a < rows and 0 <= b < columns and a * columns + b in reached
+                for a, b in neighbours
             )
             wanted = near if ground.cells[r, c] != FREE else r * columns + c in reached
             assert got[r, c] == wanted

@@ -1,4 +1,4 @@
-"""The truth: what the world lets happen, and what robots see."""
+"""The truth: the steps that the world accepts, and the targets that robots detect."""
 
 import math
 
@@ -25,7 +25,7 @@ from support.strategies import SEEDS, examples, mission
 
 PERIOD_NS = 100_000_000
 STEP_M = 10.0
-"""What a robot may move in a period."""
+"""Distance in metres that a robot may move in a period."""
 Place = tuple[float, float]
 
 SPENT = Pairs().encode(np.array([3, 4]), np.array([1, 1]), 2)
@@ -54,7 +54,7 @@ def step_record(
     name: str = "r1",
     now_ns: int | None = None,
 ) -> StepVerdict:
-    """A robot's step at its time, one a period unless told otherwise."""
+    """A robot's step at its time, one a period unless a time is given."""
     when = PERIOD_NS * step if now_ns is None else now_ns
     return there.accept(name, when, Outputs(step, Pose(*place), spent=spent))
 
@@ -74,7 +74,7 @@ def step_record(
         ((math.nan, 0.0), ("speed",)),
     ],
 )
-def test_move_is_no_longer_than_speed_times_time(place: Place, violations: tuple[str]) -> None:
+def test_a_move_is_no_longer_than_speed_times_time(place: Place, violations: tuple[str]) -> None:
     """A longer move is refused whole: the robot stays where it was."""
     there = world()
     verdict = step_record(there, 1, place)
@@ -84,7 +84,7 @@ def test_move_is_no_longer_than_speed_times_time(place: Place, violations: tuple
     assert there.observe("r1").pose == verdict.pose
 
 
-def test_time_that_has_passed_counts() -> None:
+def test_the_time_since_the_last_accepted_step_counts() -> None:
     """A robot that was silent may have moved on; one that was refused may not move twice as far."""
     there = world()
 
@@ -94,7 +94,7 @@ def test_time_that_has_passed_counts() -> None:
     assert step_record(there, 4, (40.0, 0.0), now_ns=6 * PERIOD_NS).violations == ()
 
 
-def test_supervisor_stands() -> None:
+def test_the_supervisor_does_not_move() -> None:
     """The supervisor cannot move at all."""
     there = world(overrides=("coordination=centralized",))
 
@@ -104,8 +104,8 @@ def test_supervisor_stands() -> None:
 
 
 @pytest.mark.parametrize(("step", "now_ns"), [(2, 9 * PERIOD_NS), (1, 9 * PERIOD_NS), (3, 1)])
-def test_stale_step_changes_nothing(step: int, now_ns: int) -> None:
-    """A step that was seen already, or lies in the past, is refused with all that is in it."""
+def test_a_stale_step_changes_nothing(step: int, now_ns: int) -> None:
+    """A step that was accepted already, or lies in the past, is refused as a whole."""
     there = world((8.0, 0.0), overrides=("energy.steps=1",))
     step_record(there, 2, (2.0, 0.0))
     stale = step_record(there, step, (8.0, 0.0), SPENT, now_ns=now_ns)
@@ -118,8 +118,8 @@ def test_stale_step_changes_nothing(step: int, now_ns: int) -> None:
 # Bodies.
 
 
-def test_body_outlives_whoever_drives_it() -> None:
-    """Pose, step and gauge go on through all incarnations; the world notes which one it is."""
+def test_a_body_outlives_the_incarnations_that_drive_it() -> None:
+    """Pose, step and energy go on through all incarnations; the world keeps the present one."""
     there = world(overrides=("energy.steps=2",))
     step_record(there, 1, (2.0, 0.0), SPENT)
     first = there.body("r1")
@@ -136,7 +136,7 @@ def test_body_outlives_whoever_drives_it() -> None:
 # Energy.
 
 
-def test_budget_is_not_exceeded() -> None:
+def test_the_energy_budget_is_not_exceeded() -> None:
     """A robot ships as many points as it has energy for, and no more."""
     there = world(overrides=("energy.steps=2",))
     verdicts = [step_record(there, step, spent=SPENT).violations for step in range(1, 5)]
@@ -157,8 +157,8 @@ def test_budget_is_not_exceeded() -> None:
     ],
     ids=["too-much", "nothing", "no-sample", "cut", "half-a-pair"],
 )
-def test_point_that_is_no_point_is_refused(spent: bytes) -> None:
-    """More units than a point holds, none, or what does not decode: no energy is spent on it."""
+def test_an_impossible_point_is_refused_and_costs_no_energy(spent: bytes) -> None:
+    """More units than a point holds, none, or bytes that do not decode: no energy is spent on it."""
     there = world(overrides=("energy.steps=1",))
 
     assert step_record(there, 1, spent=spent).violations == ("units",)
@@ -166,8 +166,8 @@ def test_point_that_is_no_point_is_refused(spent: bytes) -> None:
     assert step_record(there, 3, spent=SPENT).violations == ("energy",)
 
 
-def test_sound_parts_of_a_step_happen() -> None:
-    """What is wrong is refused, the rest stands: each part is judged alone."""
+def test_sound_parts_of_a_step_take_effect() -> None:
+    """The wrong parts are refused, the others take effect: each part is checked alone."""
     there = world((8.0, 0.0))
     unsound = step_record(there, 1, (99.0, 0.0), b"\x80")
 
@@ -185,15 +185,15 @@ def test_sound_parts_of_a_step_happen() -> None:
     ("target", "seen"),
     [((3.0, 4.0), 1), ((0.0, -5.0), 1), ((0.0, 0.0), 1), ((3.0, math.nextafter(4.0, 5.0)), 0)],
 )
-def test_sight_is_inclusive(target: Place, seen: int) -> None:
+def test_the_sensor_range_is_inclusive(target: Place, seen: int) -> None:
     """At exactly the range a target is detected."""
     found = world(target).first_look()["r1"]
 
     assert found == ((0, *target),) * seen
 
 
-def test_first_look_is_at_time_0() -> None:
-    """What stands beside a robot is detected before anybody moves, and told with its first step."""
+def test_the_first_look_is_at_time_0() -> None:
+    """A target near a robot is detected before any robot moves, and is in its first observation."""
     there = world((1.0, 0.0), (90.0, 21.0), (50.0, 50.0))
 
     assert there.first_look() == {"r1": ((0, 1.0, 0.0),), "r2": ((1, 90.0, 21.0),), "r3": ()}
@@ -201,7 +201,7 @@ def test_first_look_is_at_time_0() -> None:
     assert there.found.tolist() == [True, True, False]
 
 
-def test_target_is_found_once() -> None:
+def test_a_target_is_found_once() -> None:
     """Neither the robot that found it nor another finds it again."""
     there = world((8.0, 0.0), (9.0, 0.0), (80.0, 20.0))
     found = [step_record(there, step, (4.0, 0.0)).found for step in (1, 2)]
@@ -211,28 +211,28 @@ def test_target_is_found_once() -> None:
     assert there.found.tolist() == [True, True, False]
 
 
-def test_finds_are_told_with_the_step_that_made_them() -> None:
-    """However often one looks, and no longer than until the next step."""
+def test_finds_are_in_the_observation_of_the_step_that_made_them() -> None:
+    """At every reading of the observation, until the next step."""
     there = world((8.0, 0.0))
     step_record(there, 1, (4.0, 0.0))
-    told = [there.observe("r1").detected for _ in range(2)]
+    observed = [there.observe("r1").detected for _ in range(2)]
     step_record(there, 1, (4.0, 0.0))
-    told.append(there.observe("r1").detected)
+    observed.append(there.observe("r1").detected)
     step_record(there, 2, (4.0, 0.0))
 
-    assert told == [(0,), (0,), (0,)]
+    assert observed == [(0,), (0,), (0,)]
     assert there.observe("r1").detected == ()
 
 
-def test_only_where_a_robot_ends_up_counts() -> None:
-    """What it passes on the way is not seen: endpoints only."""
+def test_only_the_end_of_a_move_counts_for_detection() -> None:
+    """A target that is passed on the way is not detected: endpoints only."""
     there = world((5.0, 4.9), overrides=("sensor.range_m=5",))
 
     assert step_record(there, 1, (10.0, 0.0)).found == ()
 
 
-def test_supervisor_sees_nothing() -> None:
-    """It has no sensor."""
+def test_the_supervisor_detects_nothing() -> None:
+    """The supervisor has no sensor."""
     there = world((50.0, 50.0), overrides=("coordination=centralized",))
 
     assert SUPERVISOR not in there.first_look()
@@ -240,14 +240,14 @@ def test_supervisor_sees_nothing() -> None:
 
 
 def walked(*targets: Place, periods: int) -> list[Place]:
-    """Where targets are after so many periods, by their walk alone."""
+    """Positions of targets after a number of periods, by their walk alone."""
     walk = RandomWalk(np.array(targets), 3.0, PERIOD_NS, 1, Purpose.TARGET_WALK)
     walk.advance(periods * PERIOD_NS)
     return [(float(x), float(y)) for x, y in walk.xy_m]
 
 
-def test_walking_target_stands_where_it_was_found() -> None:
-    """Targets walk once a period; a find is where the target then was, and it is final."""
+def test_a_walking_target_has_the_position_where_it_was_found() -> None:
+    """Targets walk once a period; a find has the position of the target then, and is final."""
     start = (6.0, 0.0)
     there = world(start, overrides=("targets.diffusion_m=3.0", "sensor.range_m=4"))
     places = [walked(start, periods=step)[0] for step in range(1, 200)]
@@ -259,8 +259,8 @@ def test_walking_target_stands_where_it_was_found() -> None:
     assert finds == [(first + 1, ((0, *places[first]),))]
 
 
-def test_targets_walk_whether_anybody_acts_or_not() -> None:
-    """The walk depends on time alone: who was silent for long finds targets where they are."""
+def test_targets_walk_without_any_step() -> None:
+    """The walk depends on time alone: a robot that was silent for long finds targets where they are."""
     there = world((200.0, 0.0), (300.0, 0.0), overrides=("targets.diffusion_m=3.0",))
     place = walked((200.0, 0.0), (300.0, 0.0), periods=40)[0]
 
@@ -286,7 +286,7 @@ MOVES = st.lists(
 def test_no_robot_gets_around_the_rules(
     moves: list[tuple[int, int, float, float, bytes]], seed: int
 ) -> None:
-    """Whatever a robot sends: it keeps to its speed and its budget, and finds nothing twice."""
+    """With any outputs, a robot keeps to its speed and its budget, and finds no target twice."""
     scenario = mission("energy.steps=3", "targets.diffusion_m=2.0", "sensor.range_m=9")
     targets = [(float(x), float(y)) for x in range(-30, 31, 12) for y in range(-30, 31, 12)]
     there = World(scenario, seed, site(*targets))
@@ -340,8 +340,8 @@ def on(
 
 @examples(1000)
 @given(stand=places(), data=st.data())
-def test_nobody_ends_in_a_wall(stand: Stand, data: st.DataObject) -> None:
-    """Wherever robots want to go: they end in free cells, on their way, and are told if it was cut."""
+def test_no_robot_ends_in_a_wall(stand: Stand, data: st.DataObject) -> None:
+    """With any goal, robots end in free cells, on their way, and their observation reports a cut move."""
     ground, pose = stand
     side_m, (x_m, y_m) = ground.frame.resolution_m, ground.frame.origin_m
     lattice = st.integers(-4, 40).map(lambda k: k / 2)
@@ -365,8 +365,8 @@ def test_nobody_ends_in_a_wall(stand: Stand, data: st.DataObject) -> None:
 
 @examples(300)
 @given(stand=places(), share=st.floats(0.0, 1.0), heading=HEADINGS)
-def test_what_is_free_is_not_cut(stand: Stand, share: float, heading: float) -> None:
-    """A move that ends well before the next wall, corners included, happens as it was wanted."""
+def test_a_move_through_free_cells_is_not_cut(stand: Stand, share: float, heading: float) -> None:
+    """A move that ends well before the next wall, corners included, takes effect unchanged."""
     ground, pose = stand
     side_m, (x_m, y_m) = ground.frame.resolution_m, ground.frame.origin_m
     u, v = (pose.x_m - x_m) / side_m, (pose.y_m - y_m) / side_m
@@ -393,8 +393,8 @@ def test_what_is_free_is_not_cut(stand: Stand, share: float, heading: float) -> 
         ((0.995, 2.5), (1.5, 2.5), (0.995, 2.5)),
     ],
 )
-def test_wall_stops_a_move(start: Place, wanted: Place, end: Place | None) -> None:
-    """Just before the wall, or where it was; it is counted, told, and breaks no rule."""
+def test_a_wall_stops_a_move(start: Place, wanted: Place, end: Place | None) -> None:
+    """The robot ends just before the wall, or where it was; the bump is counted, reported, and breaks no rule."""
     there = on(ROOM, start)
     verdict = there.accept("r1", PERIOD_NS, Outputs(1, Pose(*wanted, 0.5, 9.0)))
     truth = Pose(*wanted, 0.5, 9.0) if end is None else Pose(*end, 0.5, 0.0)
@@ -414,10 +414,10 @@ def test_corners_are_not_cut() -> None:
     assert max(verdict.pose.x_m, verdict.pose.y_m) < 1.0
 
 
-def test_bump_is_told_of_the_last_step_alone() -> None:
-    """A step that is refused for its speed has met nothing; a stale one changes nothing."""
+def test_a_bump_is_reported_of_the_last_step_alone() -> None:
+    """A step that is refused for its speed meets no wall; a stale one changes nothing."""
     there = on(ROOM, (0.5, 2.5))
-    told = []
+    observed = []
     for step, place in [
         (1, (2.0, 2.5)),
         (1, (0.5, 2.5)),
@@ -426,9 +426,9 @@ def test_bump_is_told_of_the_last_step_alone() -> None:
         (4, (0.5, 2.5)),
     ]:
         verdict = there.accept("r1", step * PERIOD_NS, Outputs(step, Pose(*place)))
-        told.append((verdict.violations, verdict.bumped, there.observe("r1").bumped))
+        observed.append((verdict.violations, verdict.bumped, there.observe("r1").bumped))
 
-    assert told == [
+    assert observed == [
         ((), True, True),
         (("step",), False, True),
         (("speed",), False, False),
@@ -437,7 +437,7 @@ def test_bump_is_told_of_the_last_step_alone() -> None:
     ]
 
 
-def test_scan_is_told_until_the_next() -> None:
+def test_a_scan_is_in_the_observation_until_the_next_scan() -> None:
     """At time 0 and after every accepted step, from the true pose."""
     there = on(ROOM, (0.5, 2.5))
     finder = RangeFinder(exploration("sensor.range_m=8").sensor, ROOM, 1)
@@ -465,8 +465,8 @@ def test_each_scan_has_noise_of_its_own() -> None:
     assert on(ROOM, (0.5, 2.5), overrides=noisy).observe("r1").scan == scans[0]
 
 
-def test_supervisor_is_in_no_cell() -> None:
-    """It has no scanner, and may stand in a wall."""
+def test_the_supervisor_is_in_no_cell() -> None:
+    """The supervisor has no scanner, and may stand in a wall."""
     there = on(
         ROOM, (0.5, 0.5), overrides=("coordination=centralized", "supervisor.pose_m=[1.5, 1.5]")
     )
@@ -477,7 +477,7 @@ def test_supervisor_is_in_no_cell() -> None:
 
 
 @pytest.mark.parametrize("start", [(1.5, 2.5), (1.0, 1.5), (-0.1, 0.5), (8.0, 0.5)])
-def test_start_in_a_wall_is_refused(start: Place) -> None:
+def test_a_start_in_a_wall_is_refused(start: Place) -> None:
     """Also on the lower borders of one, and outside."""
     with pytest.raises(ScenarioError, match=r"r1 at .* is in no free cell"):
         on(ROOM, start)
@@ -495,14 +495,14 @@ def test_start_in_a_wall_is_refused(start: Place) -> None:
         ((7.5, 5.5), 0),
     ],
 )
-def test_targets_are_seen_within_range_and_in_sight(target: Place, seen: int) -> None:
+def test_targets_are_detected_within_range_and_in_sight(target: Place, seen: int) -> None:
     """On a map nothing is found through walls."""
     there = on(ROOM, (0.5, 2.5), target, overrides=("sensor.range_m=6.5",))
 
     assert there.first_look() == {"r1": ((0, *target),) * seen}
 
 
-def test_nothing_can_be_shipped_on_a_map() -> None:
+def test_no_mass_can_be_shipped_on_a_map() -> None:
     """There is no mass, so there is no energy to spend on it."""
     there = on(ROOM, (0.5, 0.5))
 
@@ -511,7 +511,7 @@ def test_nothing_can_be_shipped_on_a_map() -> None:
     )
 
 
-def test_site_of_a_map() -> None:
+def test_the_setup_of_a_map_has_starts_and_no_samples() -> None:
     """The layout, starts in its free cells, no samples; targets only from a file."""
     scenario = exploration("robots.count=4", "map.size_m=[20.0, 10.0]")
     site_of_map = WorldSetup.of(scenario, 3)
@@ -525,8 +525,8 @@ def test_site_of_a_map() -> None:
     World(scenario, 3, site_of_map)
 
 
-def test_opening_holds_the_map() -> None:
-    """What was recorded is what a replay stands on; without a map nothing is added."""
+def test_the_opening_holds_the_map() -> None:
+    """A replay has the recorded map; without a map nothing is added."""
     scenario = exploration()
     there = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), np.array([[0.5, 0.5]]), ROOM)
     opening = decode_record(encode_record(opening_of(scenario, 1, there, {"r1": ()})))
@@ -542,8 +542,8 @@ def test_opening_holds_the_map() -> None:
     assert (plain.ground, plain.frame, plain.site.ground) == (None, None, None)
 
 
-def test_map_that_does_not_fit_its_frame_is_refused() -> None:
-    """A forged opening is no use, and crashes nothing."""
+def test_a_map_that_does_not_fit_its_frame_is_refused() -> None:
+    """A forged opening is refused without a crash."""
     there = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), np.array([[0.5, 0.5]]), ROOM)
     opening = opening_of(exploration(), 1, there, {"r1": ()})
     frame = Frame(1.0, (0.0, 0.0), 8, 6)

@@ -2,7 +2,7 @@
 
 Range is measured between true poses at the time of sending, which is the beginning of a step: after the inbox was
 processed, before the move. On a map, walls between two poses may shorten the range or block the link. Every draw is
-keyed by (seed, purpose, link, sequence, copy): it depends on nothing that happened before, so one more message or one
+keyed by (seed, purpose, link, sequence, copy) and independent of what happened before, so one more message or one
 more robot changes no other draw.
 """
 
@@ -50,7 +50,7 @@ class Sent(NamedTuple):
 
 
 class LinkGeometry(NamedTuple):
-    """Poses and walls, from which kernels decide which links stand; see `hears`."""
+    """Poses and walls, by which kernels decide whether a link is up; see `hears`."""
 
     left_m: float
     bottom_m: float
@@ -142,7 +142,7 @@ def _in_range(
     range_m: float,
     through: bool,
 ) -> bool:
-    """Whether a link stands. xy_m: (n, 2); through: walls do not matter."""
+    """Whether a link is up. xy_m: (n, 2); through: walls do not matter."""
     dx = xy_m[other, 0] - xy_m[one, 0]
     dy = xy_m[other, 1] - xy_m[one, 1]
     if not dx * dx + dy * dy <= range_m * range_m:  # also false for a participant without a pose
@@ -164,9 +164,9 @@ def _in_range(
 
 @kernel
 def hears(geometry: LinkGeometry, one: int, other: int, range_m: float) -> bool:
-    """Whether the link between two participants (indices in the roster) stands at a range of range_m."""
+    """Whether the link between two participants (indices in the roster) is up at a range of range_m."""
     through = geometry.supervisor in (one, other) and not geometry.supervisor_placed
-    stands: bool = _in_range(
+    is_up: bool = _in_range(
         geometry.left_m,
         geometry.bottom_m,
         geometry.resolution_m,
@@ -179,7 +179,7 @@ def hears(geometry: LinkGeometry, one: int, other: int, range_m: float) -> bool:
         range_m,
         through,
     )
-    return stands
+    return is_up
 
 
 @kernel
@@ -340,7 +340,7 @@ class Channel:
         self._xy_m[row, 1] = pose.y_m
 
     def transmit(self, sent: Sequence[Sent]) -> tuple[list[DeliveryDecision], int]:
-        """Decisions on envelopes by the present poses, and the number of receivers out of range.
+        """Decide on envelopes by the present poses; returns the decisions and the number of receivers out of range.
 
         Copies stay in flight until they are collected.
         """
@@ -360,7 +360,7 @@ class Channel:
         return self._send(sent, decided), out_of_range
 
     def _send(self, on_air: Sequence[Sent], decided: Decisions) -> list[DeliveryDecision]:
-        """Put copies that are not lost in flight; all decisions."""
+        """Put the copies that are not lost in flight; returns all decisions."""
         places, boxes, flights, nowhere = (
             self._places,
             self._boxes,
@@ -445,7 +445,7 @@ class Channel:
 
 
 def links(xy_m: np.ndarray, range_m: float, walls: Walls = OPEN) -> int:
-    """Number of pairs of robots whose link stands. xy_m: (n, 2)."""
+    """Number of pairs of robots whose link is up. xy_m: (n, 2)."""
     return int(_links(*walls, xy_m, range_m))
 
 

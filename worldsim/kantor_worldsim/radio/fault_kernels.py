@@ -1,11 +1,11 @@
 """The link faults of a scenario as a table, and the kernels that apply it.
 
-Every fault is a rule. For a copy of an envelope, on a link, at the time of sending, its verdict is: pass, deliver
-later, or drop; some rules also send more copies, or shorten the range. Verdicts of several rules are combined: a
+Every fault is a rule. For a copy of an envelope, on a link, at the time of sending, its decision is: pass, deliver
+later, or drop; some rules also send more copies, or shorten the range. Decisions of several rules are combined: a
 drop wins, delays add up, and of several holds the longest counts. So their order does not matter.
 
-Every draw is keyed by (seed, purpose, link, sequence, fault and copy), or by a slot of time, and not by
-what happened before: one more message changes no other draw, and faults that are appended to a list
+Every draw is keyed by (seed, purpose, link, sequence, fault and copy), or by a slot of time, and
+independent of what happened before: one more message changes no other draw, and faults that are appended to a list
 leave those before them as they were.
 """
 
@@ -43,7 +43,7 @@ _SLOTS_IN_A_STATE = 10
 """Slots in the shorter mean time of a burst."""
 _FLAP_SHARE = 0.5
 
-# The last word of a draw's counter: which fault, and which of the copies that it may meet.
+# The last word of a draw's counter: index of the fault, and of the copy that it may affect.
 FAULT_SHIFT = 16
 _FIRST_EXTRA = 2  # the radio itself makes one copy, or two
 _FORGED = 1 << 14
@@ -71,7 +71,7 @@ _NUMBER_COLUMNS = 4
 # Columns of the counters, in the order of `FaultStats`.
 _DROPPED, _DELAYED, _DOUBLED, _REPLAYS, _FORGERIES = 0, 1, 2, 3, 4
 
-# Columns of what comes beside a message.
+# Columns of extra envelopes, see `find_extra`.
 _FIRST, _RULE, _LATEST_NS, ON_AIR = 0, 1, 2, 3
 
 
@@ -102,7 +102,7 @@ class _Hop(NamedTuple):
 
 @kernel
 def in_burst(seed: int, link: int, index: int, slot: int, to_bad: float, to_good: float) -> bool:
-    """Whether a link is bad in a slot, which it is not in slot 0. to_bad + to_good is at most 1.
+    """Whether a link is bad in a slot; in slot 0 it is good. to_bad + to_good is at most 1.
 
     A draw below to_bad makes a link bad in every state, one from 1 - to_good on makes it good, and any other
     leaves it as it is. So the last draw that decides is found by going back slot by slot.
@@ -118,7 +118,7 @@ def in_burst(seed: int, link: int, index: int, slot: int, to_bad: float, to_good
 
 
 @kernel
-def _about(table: FaultTable, rule: int, now_ns: int, source: int, target: int) -> bool:
+def _applies(table: FaultTable, rule: int, now_ns: int, source: int, target: int) -> bool:
     """Whether a fault's window holds and the fault applies to the link."""
     row = table.rules[rule]
     if not row[_FROM_NS] <= now_ns < row[_UNTIL_NS]:
@@ -153,13 +153,13 @@ def _is_in(table: FaultTable, source: int, target: int) -> bool:
 
 @kernel
 def severs(table: FaultTable, now_ns: int, source: int, target: int) -> bool:
-    """Whether nothing that is sent now gets from one place in the roster to another, however near."""
+    """Whether a cut severs the link between two indices in the roster now, whatever their distance."""
     if _is_in(table, source, target):
         for rule in range(table.rules.shape[0]):
             kind = table.rules[rule, _KIND]
             if (
                 kind in (_ONE_WAY, _PARTITION)
-                and _about(table, rule, now_ns, source, target)
+                and _applies(table, rule, now_ns, source, target)
                 and _cuts(table, rule, now_ns, source, target)
             ):
                 return True
@@ -168,18 +168,18 @@ def severs(table: FaultTable, now_ns: int, source: int, target: int) -> bool:
 
 @kernel
 def _reach_m(table: FaultTable, rule: int, whole_m: float) -> float:
-    """What one fault leaves of a range."""
+    """Range in metres that one fault leaves of whole_m."""
     range_m = table.numbers[rule, _RANGE_M]
     return min(whole_m, range_m) if range_m >= 0.0 else whole_m * table.numbers[rule, _FACTOR]
 
 
 @kernel
 def reach_m(table: FaultTable, now_ns: int, source: int, target: int, whole_m: float) -> float:
-    """What is left now of the range of a link between places in the roster, before walls."""
+    """Range in metres that faults leave now of a link between two indices in the roster, before walls."""
     least_m = whole_m
     if _is_in(table, source, target):
         for rule in range(table.rules.shape[0]):
-            if table.rules[rule, _KIND] == _RANGE and _about(table, rule, now_ns, source, target):
+            if table.rules[rule, _KIND] == _RANGE and _applies(table, rule, now_ns, source, target):
                 least_m = min(least_m, _reach_m(table, rule, whole_m))
     return least_m
 
@@ -193,14 +193,14 @@ def _is_lost(
     supervisors_m: float,
     effects: np.ndarray,
 ) -> bool:
-    """Whether a receiver is beyond what faults leave of the range; each that does so is counted."""
+    """Whether a receiver is beyond the range that faults leave; each fault that excludes it is counted."""
     lost = False
     by_supervisor = geometry.supervisor in (hop.source, hop.target)
     whole_m = supervisors_m if by_supervisor else robots_m
     for rule in range(table.rules.shape[0]):
         if table.rules[rule, _KIND] != _RANGE:
             continue
-        if not _about(table, rule, hop.now_ns, hop.source, hop.target):
+        if not _applies(table, rule, hop.now_ns, hop.source, hop.target):
             continue
         if not hears(geometry, hop.source, hop.target, _reach_m(table, rule, whole_m)):
             effects[rule, _DROPPED] += 1
@@ -210,12 +210,12 @@ def _is_lost(
 
 @kernel
 def _drops(table: FaultTable, rule: int, hop: _Hop, queued: np.ndarray) -> bool:
-    """Whether a fault drops a copy. queued: of its envelope, see `rule_on`."""
+    """Whether a fault drops a copy. queued: waiting times of its envelope, see `apply_rules`."""
     row, numbers = table.rules[rule], table.numbers[rule]
     kind = row[_KIND]
     if kind == _BANDWIDTH:
         return queued[row[_AT]] < 0
-    if kind > _PARTITION or not _about(table, rule, hop.now_ns, hop.source, hop.target):
+    if kind > _PARTITION or not _applies(table, rule, hop.now_ns, hop.source, hop.target):
         return False
     if kind in (_ONE_WAY, _PARTITION):
         return _cuts(table, rule, hop.now_ns, hop.source, hop.target)
@@ -229,12 +229,12 @@ def _drops(table: FaultTable, rule: int, hop: _Hop, queued: np.ndarray) -> bool:
 
 @kernel
 def _delays(table: FaultTable, rule: int, hop: _Hop, queued: np.ndarray) -> tuple[int, int]:
-    """How much later a fault has a copy arrive, and before when it does not."""
+    """Delay of a copy by a fault, and the earliest time at which the fault lets it arrive, in ns."""
     row, numbers = table.rules[rule], table.numbers[rule]
     kind = row[_KIND]
     if kind == _BANDWIDTH:
         return queued[row[_AT]], 0
-    if not _DELAY <= kind <= _CLOG or not _about(table, rule, hop.now_ns, hop.source, hop.target):
+    if not _DELAY <= kind <= _CLOG or not _applies(table, rule, hop.now_ns, hop.source, hop.target):
         return 0, 0
     if kind == _CLOG:
         return 0, row[_UNTIL_NS]
@@ -250,10 +250,10 @@ def _delays(table: FaultTable, rule: int, hop: _Hop, queued: np.ndarray) -> tupl
 
 
 @kernel
-def _judge(
+def _decide(
     table: FaultTable, hop: _Hop, due_ns: int, queued: np.ndarray, effects: np.ndarray
 ) -> int:
-    """When a copy arrives that the radio has due then, or DROPPED."""
+    """Time of arrival under all faults of a copy that the radio delivers at due_ns, or DROPPED."""
     if due_ns == DROPPED:
         return DROPPED
     dropped = False
@@ -287,7 +287,7 @@ def _with(hop: _Hop, copy: int) -> _Hop:
 
 @kernel
 def _end_of(decided: np.ndarray, count: int, first: int) -> int:
-    """The row behind the radio's verdicts on one envelope for one receiver."""
+    """The row after the radio's decisions on one envelope for one receiver."""
     end = first + 1
     while (
         end < count
@@ -300,7 +300,7 @@ def _end_of(decided: np.ndarray, count: int, first: int) -> int:
 
 @kernel
 def _arrival(decided: np.ndarray, first: int, end: int) -> int:
-    """When the first copy arrives that the radio itself does not drop; DROPPED if there is none."""
+    """Time of arrival of the first copy that the radio itself does not drop; DROPPED if there is none."""
     for row in range(first, end):
         if decided[row, 2] != DROPPED:
             return decided[row, 2]
@@ -325,11 +325,11 @@ def _double(
     made: int,
     out: np.ndarray,
 ) -> int:
-    """Make more copies of what arrives; how many verdicts there are then."""
+    """Decide on duplicates of an envelope that arrives; returns the number of decisions so far."""
     for rule in range(table.rules.shape[0]):
         if table.rules[rule, _KIND] != _DUPLICATE:
             continue
-        if not _about(table, rule, hop.now_ns, hop.source, hop.target):
+        if not _applies(table, rule, hop.now_ns, hop.source, hop.target):
             continue
         draw = _draw(table, rule, Purpose.FAULT_DUPLICATE.value, hop, 0)
         if draw >= table.numbers[rule, _PROBABILITY]:
@@ -339,7 +339,7 @@ def _double(
             effects[rule, _DOUBLED] += 1
             share = _draw(table, rule, Purpose.FAULT_DELAY.value, hop, copy)
             due_ns = arrival_ns + round(share * table.numbers[rule, _LATER_S] * 1e9)
-            due_ns = _judge(table, _with(hop, copy), due_ns, queued, effects)
+            due_ns = _decide(table, _with(hop, copy), due_ns, queued, effects)
             made = _put(out, made, hop.target, row, due_ns)
             copy += 1
     return made
@@ -369,10 +369,11 @@ def find_extra(
     effects: np.ndarray,
     extra: np.ndarray,
 ) -> int:
-    """What else comes beside what the radio delivers: an older message, or a forgery. How many there are.
+    """Find the extra envelopes that come with delivered ones: older messages and forgeries. Returns their number.
 
-    extra (rows, 4): first verdict on what it comes extra, rule, and how old an older message must be at
-    least, as the time by which it was sent. What finds no room is only counted. effects: room, see `rule_on`.
+    extra (rows, 4): row of the first decision on the delivered envelope, rule, the latest time of sending of an
+    older message, and a column that `LinkFaults` fills. Extra envelopes beyond its rows are only counted.
+    effects: scratch, see `apply_rules`.
     """
     table = FaultTable(seed, rules, numbers, named, severed)
     geometry = LinkGeometry(
@@ -398,7 +399,7 @@ def find_extra(
             continue
         for rule in range(rules.shape[0]):
             kind = rules[rule, _KIND]
-            if kind < _REPLAY or not _about(table, rule, hop.now_ns, hop.source, hop.target):
+            if kind < _REPLAY or not _applies(table, rule, hop.now_ns, hop.source, hop.target):
                 continue
             replays = kind == _REPLAY
             purpose = Purpose.FAULT_REPLAY.value if replays else Purpose.FAULT_HOSTILE.value
@@ -416,7 +417,7 @@ def find_extra(
 
 
 @kernel
-def rule_on(
+def apply_rules(
     seed: int,
     rules: np.ndarray,
     numbers: np.ndarray,
@@ -443,12 +444,12 @@ def rule_on(
     fault_stats: np.ndarray,
     out: np.ndarray,
 ) -> tuple[int, int]:
-    """Rule on what the radio has decided. How many verdicts there are, and how many receivers are lost.
+    """Apply the rules to the radio's decisions. Returns the number of decisions and of receivers out of range.
 
-    sent, decided, count: see `Interference`. queued (envelopes, queues): how long each waits in ns, or
-    DROPPED. extra (extras of its rows count): see `find_extra`; with the row on the air of each, or
-    less than 0 where there is none. effects (n, 5): room. tolls (n, 5): what each fault did is added.
-    out: the verdicts; if they do not fit, nothing else has changed.
+    sent, decided, count: see `Interference`. queued (envelopes, queues): waiting time of each envelope in ns, or
+    DROPPED. extra (the first `extras` rows are valid): see `find_extra`; with the index on the air of each, or
+    less than 0 where there is none. effects (n, 5): scratch. fault_stats (n, 5): the effects of each fault are
+    added. out (rows, 3): the decisions; if they do not fit, nothing else has changed.
     """
     table = FaultTable(seed, rules, numbers, named, severed)
     geometry = LinkGeometry(
@@ -476,7 +477,7 @@ def rule_on(
             lost += 1
             continue
         for i in range(first, end):
-            due_ns = _judge(table, _with(hop, i - first), decided[i, 2], queued[row], effects)
+            due_ns = _decide(table, _with(hop, i - first), decided[i, 2], queued[row], effects)
             made = _put(out, made, to, row, due_ns)
         arrival_ns = _arrival(decided, first, end)
         if arrival_ns == DROPPED:
@@ -489,22 +490,22 @@ def rule_on(
                 replays = rules[rule, _KIND] == _REPLAY
                 effects[rule, _REPLAYS if replays else _FORGERIES] += 1
                 copy = (_REPLAYED if replays else _FORGED) + rules[rule, FAULT]
-                due_ns = _judge(table, _with(hop, copy), arrival_ns, queued[row], effects)
+                due_ns = _decide(table, _with(hop, copy), arrival_ns, queued[row], effects)
                 made = _put(out, made, to, on_air, due_ns)
     if made <= out.shape[0]:
         for rule in range(rules.shape[0]):
-            for deed in range(effects.shape[1]):
-                fault_stats[rule, deed] += effects[rule, deed]
+            for counter in range(effects.shape[1]):
+                fault_stats[rule, counter] += effects[rule, counter]
     return made, lost
 
 
 def until_ns(fault: Fault) -> int:
-    """When it is over, or later than anything happens."""
+    """End of a fault's window; DUE_MAX_NS if it has none."""
     return DUE_MAX_NS if fault.until_ns is None else fault.until_ns
 
 
 class _Row(NamedTuple):
-    """What a table says of a fault by its kind."""
+    """Entries of the table that depend on the kind of a fault."""
 
     kind: int
     numbers: tuple[float, ...] = ()

@@ -1,8 +1,8 @@
-"""What the link faults of a scenario do to the radio's verdicts; the rules themselves are in `rules.py`.
+"""Link faults of a scenario, applied to the channel's decisions; the rules themselves are in `fault_kernels.py`.
 
-A mission has more verdicts than steps, so they are decided by kernels. What needs the envelopes themselves
-stays here, and takes its time only where a fault asks for it: only a queue (bandwidth), what is replayed
-and the numbers of forgeries depend on what was sent before.
+A mission has more delivery decisions than steps, so kernels make them. The parts that need the envelopes themselves
+are here, and cost time only where a fault asks for them: only a queue (bandwidth), replayed messages and the numbers
+of forgeries depend on what was sent before.
 """
 
 from collections import deque
@@ -25,9 +25,9 @@ from kantor_worldsim.radio.channel import DROPPED, Decisions, LinkGeometry, Sent
 from kantor_worldsim.radio.fault_kernels import (
     DUE_MAX_NS,
     KINDS,
+    apply_rules,
     find_extra,
     reach_m,
-    rule_on,
     severs,
     table_of,
     until_ns,
@@ -112,7 +112,7 @@ class LinkFaults:
         self._histories = {i: _History(f) for i, f in faults.items() if isinstance(f, Replay)}
         self._queues = [_Queue(fault) for fault in faults.values() if isinstance(fault, Bandwidth)]
         self._over_ns = max(map(until_ns, faults.values()), default=0)
-        """Messages that are sent from then on are not affected."""
+        """Messages that are sent from this time on are not affected."""
         self._has_extra = any(isinstance(f, Replay | Hostile) for f in faults.values())
         self._roster = scenario.roster
         self._strangers = strangers(scenario.roster)
@@ -158,11 +158,11 @@ class LinkFaults:
         if geometry is not self._geometry:
             self._geometry, self._constant = geometry, (*self.table, *geometry, *self._ranges_m)
         arguments = (*self._constant, rows, *decided)
-        on_air, extras = self._bring(sent, arguments) if self._has_extra else (sent, 0)
-        made, lost = self._judge(arguments, extras)
+        on_air, extras = self._add_extra(sent, arguments) if self._has_extra else (sent, 0)
+        made, lost = self._apply_rules(arguments, extras)
         if made > self._out.shape[0]:
             self._out = np.zeros((2 * made, 3), dtype=np.int64)
-            made, lost = self._judge(arguments, extras)
+            made, lost = self._apply_rules(arguments, extras)
         return on_air, Decisions(self._out, made), lost
 
     def pop_stats(self) -> tuple[FaultStats, ...]:
@@ -182,8 +182,8 @@ class LinkFaults:
     def _place(self, name: ParticipantId) -> int:
         return self._places.get(name, -1)
 
-    def _judge(self, arguments: tuple[Any, ...], extras: int) -> tuple[int, int]:
-        made, lost = rule_on(
+    def _apply_rules(self, arguments: tuple[Any, ...], extras: int) -> tuple[int, int]:
+        made, lost = apply_rules(
             *arguments, self._queued, self._extra, extras, self._effects, self._totals, self._out
         )
         return made, lost
@@ -198,8 +198,10 @@ class LinkFaults:
             for each in sent:
                 history.remember(each)
 
-    def _bring(self, sent: Sequence[Sent], arguments: tuple[Any, ...]) -> tuple[list[Sent], int]:
-        """Put on the air what comes beside messages: all that is there, and how many rows tell of it."""
+    def _add_extra(
+        self, sent: Sequence[Sent], arguments: tuple[Any, ...]
+    ) -> tuple[list[Sent], int]:
+        """Put extra envelopes on the air; returns all envelopes on the air and the number of rows of `_extra`."""
         found = find_extra(*arguments, self._effects, self._extra)
         if found > self._extra.shape[0]:
             self._extra = np.zeros((2 * found, 4), dtype=np.int64)
@@ -214,7 +216,7 @@ class LinkFaults:
         return on_air, found
 
     def _extra_envelope(self, sent: Sent, to: int, rule: int, latest_ns: int) -> Envelope | None:
-        """What comes beside an envelope, if anything."""
+        """The envelope that a rule sends with another one, or None."""
         fault = self._order[rule]
         if fault in self._histories:
             return self._histories[fault].older(sent.envelope, latest_ns)

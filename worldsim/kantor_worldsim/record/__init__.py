@@ -1,5 +1,5 @@
 """The record of a run: its Structs, the journal on disk, and the columns that observers read.
 
-What is not in a record did not happen: metrics, checkers, reports and replays read nothing else. How a run is judged
+The record is the only source: metrics, checkers, reports and replays read nothing else. How a run is judged
 is not decided here. Start with `records.py`.
 """

@@ -1,10 +1,10 @@
-"""Batches as referees read them: tables of numbers, taken in one compiled pass from the record's bytes.
+"""Columnar batches: arrays of numbers for observers, decoded in one compiled pass from the record's bytes.
 
-Metrics and checker follow every act of a run. Walking its Structs in Python costs more than the robots
-do; the encoded record, which the journal needs anyway, holds the same and is read in a microsecond.
-Whoever needs a text (a complaint, a name) still has the record itself.
+Metrics and checkers follow every step record of a run. Walking its Structs in Python costs more than the robots
+do; the encoded record, which the journal needs anyway, holds the same and is decoded in a microsecond.
+An observer that needs a text (the message of a violation, a name) has the record itself.
 
-The kernels here are total: whatever the bytes, they stay inside them and inside the tables.
+The kernels here are total: with any bytes, they stay inside them and inside the arrays.
 """
 
 from typing import Any, NamedTuple
@@ -21,61 +21,61 @@ from kantor_protocol.wire.weights import WeightsMessage
 from kantor_worldsim.record.records import Batch, Opening, Record, encode_record
 
 NOT_DECODED = -1
-"""Instead of a count: packed pairs that are malformed."""
+"""In place of a count: the packed pairs are malformed."""
 
 EVERYBODY_PLACE = -1
 STRANGER = -2
-"""The place of a name that is not in the roster."""
+"""The index of a name that is not in the roster."""
 
-# Columns of Reading.acts. Ranges of other tables are a first row and a count.
+# Columns of ColumnarBatch.step_records. Ranges of other arrays are a first row and a count.
 PLACE, NOW_NS, PRESENT, STEP, ENERGY, STATE, REFUSED = 0, 1, 2, 3, 4, 5, 6
 FINDS, VIOLATIONS, VOID, WEIGHTS_BYTES, BODY_BYTES = 7, 8, 9, 10, 11
 HEARD, HEARD_COUNT, SENT, SENT_COUNT = 12, 13, 14, 15
 SPENT, SPENT_COUNT, LOWERED, LOWERED_COUNT = 16, 17, 18, 19
 HEADS, WEIGHTS = 20, 21
 OBSERVED, SKEW_NS, TOO_FAST = 22, 23, 24
-_ACT_COLUMNS = 25
-"""PRESENT: it has outputs and a ruling; all columns from STEP on hold only then, but for HEARD, OBSERVED and
-SKEW_NS. OBSERVED: the step in the observation that it was given. TOO_FAST: 1 + which of the violations
-is of its speed, or 0.
-VOID: the world refused the step, its energy or its units, so that nothing was shipped. HEADS: it has a
-goal. WEIGHTS: where what it publishes begins in the payload."""
+_STEP_RECORD_COLUMNS = 25
+"""PRESENT: the step record has outputs and a verdict; all columns from STEP on are valid only then, but for HEARD,
+OBSERVED and SKEW_NS. OBSERVED: the step in the observation that the participant received. TOO_FAST: 1 + index of the
+violation that is of speed, or 0.
+VOID: the world refused the step, its energy or its units, so that nothing was shipped. HEADS: the outputs have a
+goal. WEIGHTS: position in the payload at which the published weights begin."""
 
-# Columns of Reading.heard, Reading.sent, Reading.injected and Reading.verdicts.
+# Columns of ColumnarBatch.heard, .sent, .injected and .decisions.
 SOURCE, SEQUENCE, TARGET, DUE_NS = 0, 1, 2, 3
 BODY, BODY_END = 3, 4
 
-# Columns of Reading.pairs.
+# Columns of ColumnarBatch.pairs.
 SAMPLE, UNITS = 0, 1
 
-# Slots of Reading.sizes: rows of acts, verdicts, heard, sent, pairs and injected.
+# Indices of ColumnarBatch.sizes: rows of step_records, decisions, heard, sent, pairs and injected.
 ACTS, VERDICTS, ALL_HEARD, ALL_SENT, PAIRS, INJECTED = 0, 1, 2, 3, 4, 5
 
 
 class ColumnarBatch(NamedTuple):
-    """One batch in tables; names are places in the roster. Valid until the next one is read."""
+    """One batch as arrays; names are indices in the roster. Valid until the next batch is decoded."""
 
     payload: bytes
     """The encoded record."""
     sizes: npt.NDArray[np.int64]
-    """(6,): how many rows of each table count."""
+    """(6,): number of valid rows of each array."""
     step_records: npt.NDArray[np.int64]
     """(rows, 25)"""
     poses_m: npt.NDArray[np.float64]
-    """(rows, 4): x and y of each ruling and of each goal, world frame."""
+    """(rows, 4): x and y of the pose in each verdict and of each goal, world frame."""
     heard: npt.NDArray[np.int64]
     """(rows, 2): source, sequence."""
     sent: npt.NDArray[np.int64]
-    """(rows, 5): source, sequence, target, where the body begins and ends in the payload."""
+    """(rows, 5): source, sequence, target, positions in the payload at which the body begins and ends."""
     decisions: npt.NDArray[np.int64]
     """(rows, 4): source, sequence, target, due_ns."""
     pairs: npt.NDArray[np.int64]
     """(rows, 2): sample, units."""
     injected: npt.NDArray[np.int64]
-    """(rows, 5): like sent; what nobody sent."""
+    """(rows, 5): like sent; envelopes that a fault injected."""
 
 
-# Msgpack. Kinds of a value by what its head says; SIMPLE: nil and truth values.
+# Msgpack. Kinds of a value by its head; SIMPLE: nil and truth values.
 SIMPLE, NUMBER, FLOAT, SINGLE, TEXT, BYTES, EXTENSION, ARRAY, MAP = 0, 1, 2, 3, 4, 5, 6, 7, 8
 _MALFORMED = -1
 _ANY = 1 << 32
@@ -91,10 +91,10 @@ def _big_endian(payload: bytes, at: int, size: int) -> int:
 
 @kernel
 def head_of(payload: bytes, at: int) -> tuple[int, int, int]:
-    """(kind, value, position after it) of what begins at `at`; the position is negative if malformed.
+    """(kind, value, position after it) of the head at `at`; the position is negative if malformed.
 
-    The value is a number, the bits of a float, the bytes of a content or the items of an array or map.
-    A content stands at the position after the head and ends within the payload.
+    The value is a number, the bits of a float, the size of a content in bytes or the items of an array or map.
+    A content begins at the position after the head and ends within the payload.
     """
     size = len(payload)
     if at < 0 or at >= size:
@@ -151,7 +151,7 @@ _KINDS = np.repeat(
 
 @kernel
 def skip(payload: bytes, at: int, values: int) -> int:
-    """The position after so many values, or a negative one."""
+    """The position after a number of values, or a negative one if malformed."""
     while values > 0 and at >= 0:
         kind, size, at = head_of(payload, at)
         values -= 1
@@ -180,7 +180,7 @@ def _array(payload: bytes, at: int, room: int) -> tuple[int, int]:
 
 
 class BatchColumns(NamedTuple):
-    """What a batch is read into, for the kernels; see Reading."""
+    """The arrays into which a batch is decoded, for the kernels; see `ColumnarBatch`."""
 
     payload: bytes
     sizes: npt.NDArray[np.int64]
@@ -195,20 +195,20 @@ class BatchColumns(NamedTuple):
     """The memory of poses_m as integers."""
     robots: int
     supervisor: int
-    """Its place, or STRANGER if there is none."""
+    """Its index in the roster, or STRANGER if there is none."""
 
 
 @kernel
-def _read_metres(tables: BatchColumns, row: int, axis: int, at: int) -> int:
-    kind, value, at = head_of(tables.payload, at)
+def _read_metres(columns: BatchColumns, row: int, axis: int, at: int) -> int:
+    kind, value, at = head_of(columns.payload, at)
     if kind == NUMBER:
-        tables.poses_m[row, axis] = float(value)
+        columns.poses_m[row, axis] = float(value)
     else:
-        tables.pose_bits[row, axis] = value
+        columns.pose_bits[row, axis] = value
     return at if kind in (NUMBER, FLOAT) else _MALFORMED
 
 
-_NEWS_TAG = GossipMessage.__struct_config__.tag
+_GOSSIP_TAG = GossipMessage.__struct_config__.tag
 _WEIGHTS_TAG = WeightsMessage.__struct_config__.tag
 _SUPERVISOR_TEXT = np.frombuffer(SUPERVISOR.encode(), dtype=np.uint8)
 _REFUSALS = tuple(np.frombuffer(text, dtype=np.uint8) for text in (b"step", b"energy", b"units"))
@@ -216,7 +216,7 @@ _SPEED = np.frombuffer(b"speed", dtype=np.uint8)
 
 
 @kernel
-def _reads(payload: bytes, at: int, size: int, text: np.ndarray) -> bool:
+def _equals(payload: bytes, at: int, size: int, text: np.ndarray) -> bool:
     same = size == text.shape[0]
     for i in range(text.shape[0] if same else 0):
         same = same and payload[at + i] == text[i]
@@ -224,17 +224,17 @@ def _reads(payload: bytes, at: int, size: int, text: np.ndarray) -> bool:
 
 
 @kernel
-def _place(tables: BatchColumns, at: int) -> tuple[int, int]:
-    """Place in the roster of the name at `at`, see `Scenario.roster`, and the position after it."""
-    payload = tables.payload
+def _place(columns: BatchColumns, at: int) -> tuple[int, int]:
+    """Index in the roster of the name at `at`, see `Scenario.roster`, and the position after it."""
+    payload = columns.payload
     kind, size, at = head_of(payload, at)
     if kind != TEXT or at < 0:
         return STRANGER, _MALFORMED
     after = at + size
     if size == 0:
         return EVERYBODY_PLACE, after
-    if _reads(payload, at, size, _SUPERVISOR_TEXT):
-        return tables.supervisor, after
+    if _equals(payload, at, size, _SUPERVISOR_TEXT):
+        return columns.supervisor, after
     if payload[at] != 114 or size > 5:  # r1, r2, …
         return STRANGER, after
     number = 0
@@ -243,53 +243,53 @@ def _place(tables: BatchColumns, at: int) -> tuple[int, int]:
         if not 0 <= digit <= 9 or (number == 0 and digit == 0):
             return STRANGER, after
         number = 10 * number + digit
-    return (number - 1 if 1 <= number <= tables.robots else STRANGER), after
+    return (number - 1 if 1 <= number <= columns.robots else STRANGER), after
 
 
 @kernel
-def _read_pairs(tables: BatchColumns, at: int, bound: int) -> tuple[int, int]:
+def _read_pairs(columns: BatchColumns, at: int, bound: int) -> tuple[int, int]:
     """Read a field of packed pairs: (count or NOT_DECODED, position after it)."""
-    kind, size, at = head_of(tables.payload, at)
+    kind, size, at = head_of(columns.payload, at)
     if kind != BYTES:
         return NOT_DECODED, _MALFORMED
     end = at + size
-    row, sample = tables.sizes[PAIRS], 0
+    row, sample = columns.sizes[PAIRS], 0
     while at < end:
-        step, at = read_int(tables.payload, at)
-        units, at = read_uint(tables.payload, at)
+        step, at = read_int(columns.payload, at)
+        units, at = read_uint(columns.payload, at)
         sample += step
         if at < 0 or at > end or sample < 0 or sample >= bound:
             return NOT_DECODED, end
-        if row >= tables.pairs.shape[0]:
+        if row >= columns.pairs.shape[0]:
             return NOT_DECODED, _MALFORMED
-        tables.pairs[row, SAMPLE], tables.pairs[row, UNITS] = sample, units
+        columns.pairs[row, SAMPLE], columns.pairs[row, UNITS] = sample, units
         row += 1
-    count = row - tables.sizes[PAIRS]
-    tables.sizes[PAIRS] = row
+    count = row - columns.sizes[PAIRS]
+    columns.sizes[PAIRS] = row
     return count, end
 
 
 @kernel
-def _read_heard(tables: BatchColumns, step_record: np.ndarray, at: int) -> int:
-    step_record[HEARD] = tables.sizes[ALL_HEARD]
+def _read_heard(columns: BatchColumns, step_record: np.ndarray, at: int) -> int:
+    step_record[HEARD] = columns.sizes[ALL_HEARD]
     step_record[HEARD_COUNT], at = _array(
-        tables.payload, at, tables.heard.shape[0] - step_record[HEARD]
+        columns.payload, at, columns.heard.shape[0] - step_record[HEARD]
     )
     for row in range(step_record[HEARD], step_record[HEARD] + step_record[HEARD_COUNT]):
-        _, at = _array(tables.payload, at, _ANY)
-        tables.heard[row, SOURCE], at = _place(tables, at)
-        tables.heard[row, SEQUENCE], at = _number(tables.payload, at)
-    tables.sizes[ALL_HEARD] += step_record[HEARD_COUNT]
+        _, at = _array(columns.payload, at, _ANY)
+        columns.heard[row, SOURCE], at = _place(columns, at)
+        columns.heard[row, SEQUENCE], at = _number(columns.payload, at)
+    columns.sizes[ALL_HEARD] += step_record[HEARD_COUNT]
     return at
 
 
 @kernel
-def _read_envelope(tables: BatchColumns, row: np.ndarray, at: int) -> int:
-    _, at = _array(tables.payload, at, _ANY)
-    row[SOURCE], at = _place(tables, at)
-    row[SEQUENCE], at = _number(tables.payload, at)
-    row[TARGET], at = _place(tables, at)
-    kind, size, at = head_of(tables.payload, at)
+def _read_envelope(columns: BatchColumns, row: np.ndarray, at: int) -> int:
+    _, at = _array(columns.payload, at, _ANY)
+    row[SOURCE], at = _place(columns, at)
+    row[SEQUENCE], at = _number(columns.payload, at)
+    row[TARGET], at = _place(columns, at)
+    kind, size, at = head_of(columns.payload, at)
     if kind != BYTES or at < 0:
         return _MALFORMED
     row[BODY], row[BODY_END] = at, at + size
@@ -297,79 +297,79 @@ def _read_envelope(tables: BatchColumns, row: np.ndarray, at: int) -> int:
 
 
 @kernel
-def _read_outbox(tables: BatchColumns, step_record: np.ndarray, at: int) -> int:
-    step_record[SENT] = tables.sizes[ALL_SENT]
+def _read_outbox(columns: BatchColumns, step_record: np.ndarray, at: int) -> int:
+    step_record[SENT] = columns.sizes[ALL_SENT]
     step_record[BODY_BYTES] = 0
     step_record[SENT_COUNT], at = _array(
-        tables.payload, at, tables.sent.shape[0] - step_record[SENT]
+        columns.payload, at, columns.sent.shape[0] - step_record[SENT]
     )
     for row in range(step_record[SENT], step_record[SENT] + step_record[SENT_COUNT]):
-        at = _read_envelope(tables, tables.sent[row], at)
-        step_record[BODY_BYTES] += tables.sent[row, BODY_END] - tables.sent[row, BODY]
-    tables.sizes[ALL_SENT] += step_record[SENT_COUNT]
+        at = _read_envelope(columns, columns.sent[row], at)
+        step_record[BODY_BYTES] += columns.sent[row, BODY_END] - columns.sent[row, BODY]
+    columns.sizes[ALL_SENT] += step_record[SENT_COUNT]
     return at
 
 
 @kernel
-def _read_goal(tables: BatchColumns, step_record: np.ndarray, row: int, at: int) -> int:
-    kind, numbers, after = head_of(tables.payload, at)
+def _read_goal(columns: BatchColumns, step_record: np.ndarray, row: int, at: int) -> int:
+    kind, numbers, after = head_of(columns.payload, at)
     step_record[HEADS] = kind == ARRAY
     if kind != ARRAY:
         return after
     if numbers != 2:
         return _MALFORMED
-    at = _read_metres(tables, row, 2, after)
-    return _read_metres(tables, row, 3, at)
+    at = _read_metres(columns, row, 2, after)
+    return _read_metres(columns, row, 3, at)
 
 
 @kernel
 def _read_outputs(
-    tables: BatchColumns, step_record: np.ndarray, row: int, at: int, samples: int
+    columns: BatchColumns, step_record: np.ndarray, row: int, at: int, samples: int
 ) -> int:
-    kind, fields, at = head_of(tables.payload, at)
+    kind, fields, at = head_of(columns.payload, at)
     step_record[PRESENT] = kind == ARRAY
     step_record[SENT_COUNT] = 0
     if kind != ARRAY:
         return at
-    step_record[STEP], at = _number(tables.payload, at)
-    at = skip(tables.payload, at, 1)  # pose
-    at = _read_goal(tables, step_record, row, at)
-    step_record[SPENT] = tables.sizes[PAIRS]
-    step_record[SPENT_COUNT], at = _read_pairs(tables, at, samples)
-    step_record[LOWERED] = tables.sizes[PAIRS]
-    step_record[LOWERED_COUNT], at = _read_pairs(tables, at, samples)
-    _, step_record[WEIGHTS_BYTES], step_record[WEIGHTS] = head_of(tables.payload, at)
-    at = _read_outbox(tables, step_record, step_record[WEIGHTS] + step_record[WEIGHTS_BYTES])
-    step_record[ENERGY], at = _number(tables.payload, at)
-    step_record[STATE], at = _number(tables.payload, at)
-    step_record[REFUSED], at = _number(tables.payload, at)
-    return skip(tables.payload, at, fields - 10)
+    step_record[STEP], at = _number(columns.payload, at)
+    at = skip(columns.payload, at, 1)  # pose
+    at = _read_goal(columns, step_record, row, at)
+    step_record[SPENT] = columns.sizes[PAIRS]
+    step_record[SPENT_COUNT], at = _read_pairs(columns, at, samples)
+    step_record[LOWERED] = columns.sizes[PAIRS]
+    step_record[LOWERED_COUNT], at = _read_pairs(columns, at, samples)
+    _, step_record[WEIGHTS_BYTES], step_record[WEIGHTS] = head_of(columns.payload, at)
+    at = _read_outbox(columns, step_record, step_record[WEIGHTS] + step_record[WEIGHTS_BYTES])
+    step_record[ENERGY], at = _number(columns.payload, at)
+    step_record[STATE], at = _number(columns.payload, at)
+    step_record[REFUSED], at = _number(columns.payload, at)
+    return skip(columns.payload, at, fields - 10)
 
 
 @kernel
-def _read_ruling(tables: BatchColumns, step_record: np.ndarray, row: int, at: int) -> int:
-    kind, fields, at = head_of(tables.payload, at)
+def _read_verdict(columns: BatchColumns, step_record: np.ndarray, row: int, at: int) -> int:
+    kind, fields, at = head_of(columns.payload, at)
     step_record[PRESENT] &= kind == ARRAY
     if kind != ARRAY:
         return at
-    numbers, at = _array(tables.payload, at, _ANY)
-    at = _read_metres(tables, row, 0, at)
-    at = _read_metres(tables, row, 1, at)
-    at = skip(tables.payload, at, numbers - 2)
-    step_record[FINDS], at = _array(tables.payload, at, _ANY)
-    at = skip(tables.payload, at, step_record[FINDS])
-    step_record[VIOLATIONS], at = _array(tables.payload, at, _ANY)
+    numbers, at = _array(columns.payload, at, _ANY)
+    at = _read_metres(columns, row, 0, at)
+    at = _read_metres(columns, row, 1, at)
+    at = skip(columns.payload, at, numbers - 2)
+    step_record[FINDS], at = _array(columns.payload, at, _ANY)
+    at = skip(columns.payload, at, step_record[FINDS])
+    step_record[VIOLATIONS], at = _array(columns.payload, at, _ANY)
     step_record[VOID] = step_record[TOO_FAST] = 0
     for item in range(step_record[VIOLATIONS]):
-        kind, size, at = head_of(tables.payload, at)
+        kind, size, at = head_of(columns.payload, at)
         if kind != TEXT:
             return _MALFORMED
         for text in _REFUSALS:
-            step_record[VOID] |= _reads(tables.payload, at, size, text)
-        if _reads(tables.payload, at, size, _SPEED):
+            step_record[VOID] |= _equals(columns.payload, at, size, text)
+        if _equals(columns.payload, at, size, _SPEED):
             step_record[TOO_FAST] = item + 1
         at += size
-    return skip(tables.payload, at, fields - 3)
+    return skip(columns.payload, at, fields - 3)
 
 
 @kernel
@@ -388,11 +388,11 @@ def _read_batch(
     supervisor: int,
     samples: int,
 ) -> int:
-    """Fill the tables; the position after what is read.
+    """Fill the arrays; returns the position after the fields that were decoded.
 
-    Negative if this is no batch, or if a table has too few rows for it.
+    Negative if the payload is no batch, or if an array has too few rows for it.
     """
-    tables = BatchColumns(
+    columns = BatchColumns(
         payload,
         sizes,
         step_records,
@@ -413,14 +413,14 @@ def _read_batch(
     for i in range(sizes[ACTS]):
         step_record = step_records[i]
         fields, at = _array(payload, at, _ANY)
-        step_record[PLACE], at = _place(tables, at)
+        step_record[PLACE], at = _place(columns, at)
         step_record[NOW_NS], at = _number(payload, at)
         items, at = _array(payload, at, _ANY)  # the observation
         step_record[OBSERVED], at = _number(payload, at)
         at = skip(payload, at, items - 1)
-        at = _read_heard(tables, step_record, at)
-        at = _read_outputs(tables, step_record, i, at, samples)
-        at = _read_ruling(tables, step_record, i, at)
+        at = _read_heard(columns, step_record, at)
+        at = _read_outputs(columns, step_record, i, at, samples)
+        at = _read_verdict(columns, step_record, i, at)
         step_record[SKEW_NS] = 0
         if fields > 6:
             step_record[SKEW_NS], at = _number(payload, at)
@@ -430,17 +430,17 @@ def _read_batch(
     sizes[VERDICTS], at = _array(payload, at, decisions.shape[0])
     for i in range(sizes[VERDICTS]):
         fields, at = _array(payload, at, _ANY)
-        decisions[i, SOURCE], at = _place(tables, at)
+        decisions[i, SOURCE], at = _place(columns, at)
         decisions[i, SEQUENCE], at = _number(payload, at)
-        decisions[i, TARGET], at = _place(tables, at)
+        decisions[i, TARGET], at = _place(columns, at)
         decisions[i, DUE_NS], at = _number(payload, at)
         at = skip(payload, at, fields - 4)
     if parts < 8:
         return at
-    at = skip(payload, at, 3)  # out_of_range, absent, tolls
+    at = skip(payload, at, 3)  # out_of_range, absent, fault_stats
     sizes[INJECTED], at = _array(payload, at, injected.shape[0])
     for i in range(sizes[INJECTED]):
-        at = _read_envelope(tables, injected[i], at)
+        at = _read_envelope(columns, injected[i], at)
     return at
 
 
@@ -453,9 +453,9 @@ def _is_finite(kind: int, value: int) -> bool:
 
 @kernel
 def parts_of_gossip(payload: bytes, at: int, end: int) -> tuple[int, int, int, int, int]:
-    """Epoch of the News in payload[at:end], and where its `version_vector` and `logs` begin and end.
+    """Incarnation of the GossipMessage in payload[at:end]; where its `version_vector` and `logs` begin and end.
 
-    The last is negative for what `decode_news` would refuse.
+    The last is negative for a body that `decode_gossip` refuses.
     """
     refused = (0, 0, 0, 0, _MALFORMED)
     if end - at > BODY_BYTES_MAX:
@@ -466,16 +466,16 @@ def parts_of_gossip(payload: bytes, at: int, end: int) -> tuple[int, int, int, i
     step, at = _number(payload, at)
     kind_x, x, at = head_of(payload, at)
     kind_y, y, at = head_of(payload, at)
-    if at < 0 or fields < 8 or tag != _NEWS_TAG or version != VERSION or step < 0:
+    if at < 0 or fields < 8 or tag != _GOSSIP_TAG or version != VERSION or step < 0:
         return refused
     if not (_is_finite(kind_x, x) and _is_finite(kind_y, y)):
         return refused
-    have_kind, size, version_vector = head_of(payload, at)
-    have_end = version_vector + size
-    logs_kind, size, logs = head_of(payload, have_end if version_vector > 0 else version_vector)
+    vector_kind, size, version_vector = head_of(payload, at)
+    vector_end = version_vector + size
+    logs_kind, size, logs = head_of(payload, vector_end if version_vector > 0 else version_vector)
     logs_end = logs + size
     claims_kind, size, claims = head_of(payload, logs_end if logs > 0 else logs)
-    if claims < 0 or not have_kind == logs_kind == claims_kind == BYTES:
+    if claims < 0 or not vector_kind == logs_kind == claims_kind == BYTES:
         return refused
     at = claims + size
     if fields > 8:
@@ -488,14 +488,14 @@ def parts_of_gossip(payload: bytes, at: int, end: int) -> tuple[int, int, int, i
         incarnation, at = _number(payload, at)
     if not 0 <= incarnation <= INCARNATIONS_MAX or skip(payload, at, fields - 10) != end:
         return refused
-    return incarnation, version_vector, have_end, logs, logs_end
+    return incarnation, version_vector, vector_end, logs, logs_end
 
 
 @kernel
 def parts_of_weights(payload: bytes, at: int, end: int) -> tuple[int, int, int, int, int]:
     """Sequence, base, size of the WeightsMessage in payload[at:end]; where its content begins and ends.
 
-    The last is negative for what `WeightsSubscriber` would not decode.
+    The last is negative for a message that `WeightsSubscriber` does not decode.
     """
     fields, at = _array(payload, at, _ANY)
     tag, at = _number(payload, at)
@@ -531,7 +531,7 @@ class ColumnarDecoder:
     def decode(self, record: Record, payload: bytes = b"") -> DecodedRecord:
         """The record's bytes and, for a batch, its columns.
 
-        The first record must be an opening. payload: the record encoded, if it came so.
+        The first record must be an opening. payload: the record encoded, if the caller has it.
         """
         payload = payload or encode_record(record)
         if isinstance(record, Batch):
@@ -545,13 +545,13 @@ class ColumnarDecoder:
         return DecodedRecord(record, payload, (payload, *self._tables))
 
     def _make_room(self, rows: int) -> None:
-        """Tables of so many rows each; none needs more than its payload has bytes."""
+        """Allocate arrays of this number of rows; none needs more than its payload has bytes."""
         self._rows = rows
         poses_m = np.zeros((rows, 4))
         self._pose_bits = poses_m.view(np.int64)
         self._tables = (
             np.zeros(6, dtype=np.int64),
-            np.zeros((rows, _ACT_COLUMNS), dtype=np.int64),
+            np.zeros((rows, _STEP_RECORD_COLUMNS), dtype=np.int64),
             poses_m,
             *(np.zeros((rows, columns), dtype=np.int64) for columns in (2, 5, 4, 2, 5)),
         )

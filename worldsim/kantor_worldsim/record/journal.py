@@ -1,7 +1,7 @@
 """The journal: the records of a run on disk (MCAP, msgpack) and their digest.
 
-Every message goes to the operating system at once, so a killed recorder loses nothing that it took;
-MCAP's own chunks would hold seconds back. A file cut anywhere reads up to the cut.
+Every message goes to the operating system at once, so a killed recorder loses no record that it accepted;
+MCAP's own chunks would hold seconds back. A file cut anywhere can be read up to the cut.
 """
 
 import contextlib
@@ -40,19 +40,19 @@ class Digest:
 
     @property
     def hex(self) -> str:
-        """So far."""
+        """Digest of the records that were added so far, hexadecimal."""
         return self._hash.hexdigest()
 
 
 class Journal:
-    """Digests every record and, given a file, writes it down.
+    """Digests every record and, given a file, writes it.
 
     A disk that fills up does not stop the mission: the journal notes where it was cut and writes no
     more. Room for the ending was set aside at the start.
     """
 
     def __init__(self, path: Path | None = None, *, anew: bool = False) -> None:
-        """path: the file to create; None digests only. anew: beside the one that is there, see `replace`."""
+        """path: the file to create; None digests only. anew: write next to the existing file, see `replace`."""
         self.digest = Digest()
         self.cut: str | None = None
         """Why the file ends early, if it does."""
@@ -91,7 +91,7 @@ class Journal:
         self.append(decoded.record, decoded.payload)
 
     def append(self, record: Record, payload: bytes = b"") -> None:
-        """Write one record. payload: the record encoded, if it came so."""
+        """Write one record. payload: the record encoded, if the caller has it."""
         payload = payload or encode_record(record)
         self.digest.add(payload)
         if isinstance(record, (Batch, Ending)):
@@ -105,13 +105,13 @@ class Journal:
             self._write(METRICS_TOPIC, json.dumps(row._asdict()).encode())
 
     def replace(self) -> None:
-        """Take the old file's place, once all that is in it has been written anew."""
+        """Replace the old file, once all its records have been written again."""
         draft, self._draft = self._draft, None
         if draft is not None and self._path is not None and self.cut is None:
             draft.replace(self._path)
 
     def close(self) -> None:
-        """Finish the file, and give the reserve back, so that the result finds room."""
+        """Finish the file, and delete the reserve, so that the result has room on the disk."""
         if self._file is not None:
             try:
                 self._writer.finish()  # type: ignore[no-untyped-call]
@@ -142,7 +142,9 @@ class Journal:
     def _drop_file(self) -> None:
         file, self._file = self._file, None
         if file is not None:
-            with contextlib.suppress(OSError):  # what was buffered did not fit: it ends before
+            with contextlib.suppress(
+                OSError
+            ):  # the buffered bytes did not fit: the file ends before them
                 file.close()
 
 

@@ -1,4 +1,4 @@
-"""Process events: what can happen to a process in a mission, and what follows from it.
+"""Process events: their kinds in a mission, and the consequences of each kind.
 
 The values of the enum stand in records and are a contract.
 """
@@ -31,26 +31,26 @@ class ProcessEventKind(StrEnum):
     RIGHT = "right"
     """Its clock jumps back to the right time."""
     IMPOSTOR_REFUSED = "pretend"
-    """A second process asked to join under its id, and was refused. Also the order to start one."""
+    """A second process asked to join under its id, and was refused. Also the command to start one."""
     IMPOSTOR_ADMITTED = "let in"
     """A second process asked to join under its id, and was admitted, which must not happen."""
     LEAVE = "leave"
-    """It left the bus although no fault is the cause."""
+    """The process left the bus although no fault is the cause."""
     JOIN = "join"
-    """It is back on the bus after it left, or joined late, although no fault is the cause."""
+    """The process is back on the bus after it left, or joined late, although no fault is the cause."""
 
 
 class EventRules(NamedTuple):
-    """What follows from a kind of process event."""
+    """Consequences of a kind of process event."""
 
     counter: str = ""
-    """Counter of `result.json` for the fault that is the cause (`FaultCounts`); empty: none is."""
+    """Counter of `result.json` for the fault that is the cause (`FaultCounts`); empty: none."""
     signal: str = ""
-    """How the event is carried out on a real process; empty: nothing is done to it."""
+    """Signal or action that carries out the event on a real process; empty: none."""
     ended_by: ProcessEventKind | None = None
     """The process makes no step from this event until that one; None: it goes on."""
     takes_over: bool = False
-    """A process takes over the participant's body; the event tells from which step and incarnation."""
+    """A process takes over the participant's body; the event has the step and the incarnation from which it goes on."""
 
 
 EVENTS = {

@@ -35,7 +35,7 @@ class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
     ground: Array | None = None
     """(rows, columns) uint8: the true map, if the robots explore one; see `grid.py`."""
     frame: Frame | None = None
-    """Where the cells of the map lie in the world."""
+    """Frame of the map: position of its cells in the world."""
 
     @property
     def site(self) -> WorldSetup:
@@ -71,8 +71,8 @@ class StepRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):
     heard: tuple[tuple[ParticipantId, int], ...]
     """The inbox by reference: source and sequence of each envelope, in order; empty without outputs."""
     outputs: Outputs | None
-    """None: late, crashed or disconnected. In virtual time the participant is asked again, with the same inputs, until
-    it answers; now_ns stays the time of the first request."""
+    """None: late, crashed or disconnected. In virtual time the participant is requested again, with the same inputs,
+    until it answers; now_ns stays the time of the first request."""
     verdict: StepVerdict | None
     skew_ns: int = 0
     """Skew of the clock that it read, positive if it was ahead of now_ns."""
@@ -87,7 +87,7 @@ class Batch(msgspec.Struct, frozen=True, array_like=True, tag="batch"):
     out_of_range: int
     """Number of receivers that envelopes did not reach because of range."""
     absent: tuple[ParticipantId, ...] = ()
-    """Participants that were asked and returned no outputs."""
+    """Participants that were requested to step and returned no outputs."""
     fault_stats: tuple[FaultStats, ...] = ()
     """Effects of the scenario's link faults on the decisions."""
     injected: tuple[Envelope, ...] = ()
@@ -95,7 +95,7 @@ class Batch(msgspec.Struct, frozen=True, array_like=True, tag="batch"):
 
 
 class ProcessEvent(msgspec.Struct, frozen=True, array_like=True, tag="incident", gc=False):
-    """Something that happened to a process."""
+    """An event of a process; see `ProcessEventKind`."""
 
     now_ns: int
     who: ParticipantId

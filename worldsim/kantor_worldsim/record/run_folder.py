@@ -1,4 +1,4 @@
-"""The folder of a run (design, part 7): its files, and what a run that was cut short has left in it."""
+"""The folder of a run: its files, and the contents of one whose run was cut short."""
 
 import contextlib
 import csv
@@ -16,20 +16,10 @@ from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.records import Ending, Opening, Record
 
 JOURNAL = "run.mcap"
-
-
 MANIFEST = "manifest.json"
-
-
 RESULT = "result.json"
-
-
 SCENARIO = "scenario.toml"
-
-
 METRICS = "metrics.csv"
-
-
 REPORT = "report.png"
 
 
@@ -55,17 +45,17 @@ class OverError(ResumeError):
 
 
 class Terms(msgspec.Struct, frozen=True):
-    """How a run is run, in its manifest."""
+    """Settings of a run, as in its manifest."""
 
     run: str
-    """Names it."""
+    """Name of the run."""
     exchange: str
     speed: float
     exact_every: int | None = None
 
 
 class Past(NamedTuple):
-    """What a run folder holds of a mission that was cut short."""
+    """Contents of the folder of a run that was cut short."""
 
     terms: Terms
     opening: Opening
@@ -75,14 +65,16 @@ class Past(NamedTuple):
 
     @classmethod
     def of(cls, folder: Path) -> "Past":
-        """Raises ResumeError; OverError if nothing is left to be done."""
+        """Read a run folder. Raises ResumeError; OverError if the mission has come to its end."""
         try:
             manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
             records = [record for _, record in read(folder / JOURNAL)]
             terms = msgspec.convert(manifest, Terms)
         except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-            what = error.strerror if isinstance(error, OSError) else str(error)
-            raise ResumeError(f"{folder}: no run to go on with ({what}); give its folder") from None
+            reason = error.strerror if isinstance(error, OSError) else str(error)
+            raise ResumeError(
+                f"{folder}: no run to go on with ({reason}); give its folder"
+            ) from None
         except msgspec.ValidationError as error:
             raise ResumeError(f"{folder / MANIFEST}: of another version: {error}") from None
         if not records or not isinstance(records[0], Opening):
@@ -96,7 +88,7 @@ class Past(NamedTuple):
 
 
 class MetricsFile:
-    """metrics.csv, written as the run goes; a full disk ends it quietly, the journal says so."""
+    """metrics.csv, written as the run goes; a full disk ends it without an error, which the journal reports."""
 
     def __init__(self, path: Path, columns: tuple[str, ...]) -> None:
         self._file: IO[str] | None = None
@@ -147,7 +139,7 @@ def write_json(path: Path, tree: dict[str, Any]) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace a file whole, so that nobody ever reads half of it; a full disk leaves the old one."""
+    """Replace a file atomically, so that no reader gets half of it; a full disk leaves the old one."""
     draft = path.with_name(f".{path.name}.draft")
     try:
         draft.write_text(text, encoding="utf-8")

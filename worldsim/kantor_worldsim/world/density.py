@@ -20,7 +20,7 @@ Points = npt.NDArray[np.float64]
 
 
 def samples_of(scenario: Scenario, seed: int) -> Points:
-    """(N, 2) samples, world frame, metres. Raises ScenarioError for a file that is no use."""
+    """(N, 2) samples, world frame, metres. Raises ScenarioError for an unusable file."""
     points = _drawn(
         "samples", scenario, scenario.samples.file, scenario.samples.count, seed, stratified=True
     )
@@ -44,7 +44,7 @@ def targets_of(scenario: Scenario, seed: int) -> Points:
 
 
 def starts_of(scenario: Scenario, seed: int) -> Points:
-    """(n, 2) where the robots stand at time 0."""
+    """(n, 2) positions of the robots at time 0, world frame, metres."""
     if not scenario.starts.random:
         return np.array(scenario.starts.poses_m, dtype=np.float64)
     low, high = np.array(scenario.domain.min_m), np.array(scenario.domain.max_m)
@@ -86,18 +86,18 @@ def _from_mixture(
         sizes = np.floor(shares * count + 1e-9).astype(int)
         rest = np.argsort(sizes - shares * count, kind="stable")[: count - sizes.sum()]
         sizes[rest] += 1
-        which = np.repeat(np.arange(len(components)), sizes)
+        chosen = np.repeat(np.arange(len(components)), sizes)
     else:
-        which = random.choice(len(components), count, p=shares)
+        chosen = random.choice(len(components), count, p=shares)
     mean = np.array([component.mean_m for component in components])
     deviation = np.sqrt([component.variance_m2 for component in components])
-    return np.asarray(mean[which] + deviation[which] * random.standard_normal((count, 2)))
+    return np.asarray(mean[chosen] + deviation[chosen] * random.standard_normal((count, 2)))
 
 
 def _from_image(
     key: str, file: str, domain: Domain, count: int, random: np.random.Generator
 ) -> Points:
-    """Pixels by their brightness, uniform within a pixel; the image spans the domain, top row up."""
+    """Draws by the brightness of pixels, uniform within a pixel; the image spans the domain, top row up."""
     from PIL import Image  # noqa: PLC0415  only where an image is used
 
     try:

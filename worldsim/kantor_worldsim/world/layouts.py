@@ -1,6 +1,6 @@
 """Generated true maps: the kinds of workspace of KME's figure 4, and an office as in Burgard's figure 8.
 
-The papers print pictures, not maps, so these are our own of the same kind. A layout is a function
+The papers print pictures, not maps, so these maps are only of the same kind. A layout is a function
 of its name, size, resolution and seed; all free space is one part, without cutting corners, and a
 closed wall of one cell surrounds it.
 """
@@ -24,7 +24,7 @@ def layout(
 ) -> Ground:
     """A map by its name, with its lower left corner at (0, 0).
 
-    - blank: nothing but the wall.
+    - blank: only the surrounding wall.
     - unstructured: random obstacles of 2 to 12 m cover a fifth.
     - cityblock: streets of about 5 m round solid blocks of about 12 m, some of them merged.
     - office: rooms along corridors, with doors of 0.8 to 1 m, some with furniture.
@@ -61,7 +61,7 @@ def _frame(size_m: Point, resolution_m: float) -> Frame:
     return Frame(resolution_m, (0.0, 0.0), max(1, rows), max(1, columns))
 
 
-class _Kind(NamedTuple):
+class _Layout(NamedTuple):
     draw: Callable[[Cells, Frame, np.random.Generator], None]
     """Opens free space in cells that are all occupied."""
     complaints: Callable[[Frame], list[str]]
@@ -100,7 +100,7 @@ def _blank(cells: Cells, _frame: Frame, _random: np.random.Generator) -> None:
 
 
 def _unstructured(cells: Cells, frame: Frame, random: np.random.Generator) -> None:
-    """Rectangles and ellipses, turned and overlapping; what they enclose is filled."""
+    """Rotated and overlapping rectangles and ellipses; the space that they enclose is filled."""
     inner = cells[1:-1, 1:-1]
     inner[:] = FREE
     unit, left = _unit_cells(frame), int(inner.size * 0.2)
@@ -111,7 +111,7 @@ def _unstructured(cells: Cells, frame: Frame, random: np.random.Generator) -> No
 
 
 def _obstacle(cells: Cells, unit: float, random: np.random.Generator) -> int:
-    """Stamps one and returns how many cells it took."""
+    """Stamp one obstacle; returns the number of free cells that it occupies."""
     draw = random.random(7)
     long = (1.0 + 5.0 * draw[0] ** 2) * unit  # half axes; small ones are common
     short = max(long * (0.25 + 0.75 * draw[1]), 0.71)
@@ -149,7 +149,7 @@ def _cityblock(cells: Cells, frame: Frame, random: np.random.Generator) -> None:
 
 
 def _blocks(length: int, unit: float, random: np.random.Generator) -> list[tuple[int, int]]:
-    """Where blocks begin and end between streets, along one side of the map; two at least."""
+    """Ranges (begin, end) of blocks between streets, along one side of the map; at least two."""
     count = max(2, round((length / unit - 5.0) / 17.0))
     widths = np.empty(2 * count + 1)
     widths[0::2] = 5.0 + random.random(count + 1) * 1.5
@@ -170,9 +170,9 @@ _CORRIDOR_M, _ROOM_DEPTH_M, _ROOM_WIDTH_M = 1.8, 5.5, 5.8
 _DOOR_M = (0.8, 1.0)
 _CROSSING_EACH_M = 30.0
 _PASSAGE_M = 0.6
-"""Beside furniture."""
+"""Free width around furniture."""
 _FURNITURE_M = ((1.6, 0.8), (1.2, 0.4), (2.0, 1.0))
-"""Along the wall, and off it."""
+"""Sizes of pieces: along the wall, and away from it."""
 
 
 class _Room(NamedTuple):
@@ -227,7 +227,7 @@ def _office(cells: Cells, frame: Frame, random: np.random.Generator) -> None:
 def _cross(
     cells: Cells, bottom: int, top: int, corridor: int, per_m: float, random: np.random.Generator
 ) -> list[tuple[int, int]]:
-    """Opens crossings through a band of rooms and returns what they leave for rooms."""
+    """Open crossings through a band of rooms; returns the column ranges that are left for rooms."""
     columns = cells.shape[1]
     count = max(1, round(columns / per_m / _CROSSING_EACH_M))
     spans, begin = [], 1
@@ -243,7 +243,7 @@ def _cross(
 def _rooms(
     left: int, right: int, per_m: float, random: np.random.Generator
 ) -> list[tuple[int, int]]:
-    """Where rooms begin and end between two walls, with a wall between any two."""
+    """Ranges (begin, end) of rooms between two walls, with a wall between any two."""
     count = max(1, round((right - left) / per_m / _ROOM_WIDTH_M))
     edges = _edges(right - left + 1, 0.6 + 0.8 * random.random(count))
     return [(left + begin, left + end - 1) for begin, end in pairwise(edges)]
@@ -252,7 +252,7 @@ def _rooms(
 def _open(
     cells: Cells, room: _Room, per_m: float, random: np.random.Generator, *, wide: bool
 ) -> None:
-    """Doors to the corridors, to one at least; a lounge is open all along."""
+    """Open doors to the corridors, to at least one; a lounge is open along its whole side."""
     walls = [room.bottom - 1] * room.below + [room.top] * room.above
     if len(walls) == 2 and random.random() < 0.7:
         del walls[random.integers(2)]
@@ -267,7 +267,7 @@ def _open(
 
 
 def _furnish(cells: Cells, room: _Room, per_m: float, random: np.random.Generator) -> None:
-    """Up to four pieces along the walls, where a way round each is left and no door is blocked."""
+    """Place up to four pieces along the walls, where a way round each is left and no door is blocked."""
     gap = max(1, round(_PASSAGE_M * per_m))
     for _ in range(4):
         along_m, off_m = _FURNITURE_M[random.integers(len(_FURNITURE_M))]
@@ -284,9 +284,9 @@ def _furnish(cells: Cells, room: _Room, per_m: float, random: np.random.Generato
             plan[1 : 1 + off, start : start + along] = OCCUPIED
 
 
-LAYOUTS: dict[str, _Kind] = {
-    "blank": _Kind(_blank, _large_enough(3, 0.0)),
-    "unstructured": _Kind(_unstructured, _large_enough(24, 0.25)),
-    "cityblock": _Kind(_cityblock, _large_enough(36, 0.4)),
-    "office": _Kind(_office, _office_complaints, (27.0, 20.0), 0.2),
+LAYOUTS: dict[str, _Layout] = {
+    "blank": _Layout(_blank, _large_enough(3, 0.0)),
+    "unstructured": _Layout(_unstructured, _large_enough(24, 0.25)),
+    "cityblock": _Layout(_cityblock, _large_enough(36, 0.4)),
+    "office": _Layout(_office, _office_complaints, (27.0, 20.0), 0.2),
 }

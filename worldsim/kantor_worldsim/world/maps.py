@@ -1,7 +1,7 @@
 """True maps from files: Nav2 map_server's YAML, MovingAI's `.map`, and plain images.
 
-What a file says becomes UNKNOWN, FREE or OCCUPIED, row 0 lowest. A `Ground` is what robots can
-stand on, hit and see; nobody but world-sim knows it.
+Each pixel or character of a file becomes an UNKNOWN, FREE or OCCUPIED cell, row 0 lowest. A `Ground` is
+the map on which robots stand, that they hit and that they sense; only world-sim knows it.
 """
 
 import struct
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 Cells = npt.NDArray[np.uint8]
 
 IMAGE_RESOLUTION_M = 0.05
-"""Of an image without a YAML file: what Nav2's map_saver and SLAM Toolbox write by default."""
+"""Resolution of an image without a YAML file: the default of Nav2's map_saver and SLAM Toolbox."""
 
 MOVING_AI_RESOLUTION_M = 1.0
 
 RESOLUTION_MIN_M, RESOLUTION_MAX_M = 1e-3, 1e4
 ORIGIN_MAX_M = 1e7
-"""So that float64 places cells exactly enough, also in UTM coordinates."""
+"""Largest coordinate of an origin: float64 places cells exactly enough up to it, also in UTM coordinates."""
 
 _GREY_UNKNOWN = 205
-"""What map_saver writes for unknown cells: (255 - 205) / 255 = 0.196 occupied."""
+"""Grey that map_saver writes for unknown cells: (255 - 205) / 255 = 0.196 occupied."""
 
 _FORMATS = ("BMP", "JPEG", "PNG", "PPM", "TIFF")
 UNREADABLE = (
@@ -56,12 +56,12 @@ def read(path: str | Path, resolution_m: float | None = None) -> tuple[Ground, l
     - `.yaml`, `.yml`: as Nav2's map_server reads it (`_classes`). The file has the resolution.
     - `.map`: MovingAI. `.`, `G` and `S` are free, `@`, `O`, `T` and `W` occupied; 1 m a cell.
     - `.png`, `.pgm`, `.jpg`, `.jpeg`, `.bmp`, `.tif`, `.tiff`: less bright than 0.35 is occupied,
-      brighter than 0.804 is free, as by the thresholds 0.65 and 0.196 that Nav2 writes. What lies
-      between is unknown, such as its grey 205, and what is not opaque. 0.05 m a cell.
+      brighter than 0.804 is free, as by the thresholds 0.65 and 0.196 that Nav2 writes. Brightness
+      in between is unknown, such as Nav2's grey 205, and so are pixels that are not opaque. 0.05 m a cell.
 
     resolution_m: the side of a cell, instead of the format's. The lower left corner is at (0, 0)
-    unless a YAML file says otherwise. Raises ScenarioError for what cannot be read, has no free
-    cell, or has more than CELLS_MAX.
+    unless a YAML file says otherwise. Raises ScenarioError for a map that cannot be read,
+    has no free cell, or has more than CELLS_MAX.
     """
     path = Path(path)
     reader = _READERS.get(path.suffix.lower())
@@ -86,8 +86,8 @@ def read(path: str | Path, resolution_m: float | None = None) -> tuple[Ground, l
 # Images, as Nav2's map_server reads them.
 
 
-class _Nav2(msgspec.Struct, frozen=True):
-    """What a YAML file of Nav2's map_server says. Other keys are ignored, as there."""
+class _Nav2Config(msgspec.Struct, frozen=True):
+    """Contents of a YAML file of Nav2's map_server. Other keys are ignored, as by map_server."""
 
     image: str
     resolution: Annotated[float, Meta(ge=RESOLUTION_MIN_M, le=RESOLUTION_MAX_M)]
@@ -113,18 +113,18 @@ class _Picture(NamedTuple):
 
 
 def _from_yaml(path: Path, resolution_m: float | None) -> tuple[Ground, list[str]]:
-    said = _said(path)
-    if resolution_m not in (None, said.resolution):
+    config = _read_config(path)
+    if resolution_m not in (None, config.resolution):
         raise ScenarioError(
-            f"map.resolution_m: {resolution_m:g}, but {path} says {said.resolution:g}; leave it out"
+            f"map.resolution_m: {resolution_m:g}, but {path} says {config.resolution:g}; leave it out"
         )
-    picture = _picture(path.parent / said.image, f"map.file: {path}: image")
-    x_m, y_m, _ = said.origin
-    return _ground(f"map.file: {path}", picture, said, (x_m, y_m))
+    picture = _picture(path.parent / config.image, f"map.file: {path}: image")
+    x_m, y_m, _ = config.origin
+    return _ground(f"map.file: {path}", picture, config, (x_m, y_m))
 
 
 def _from_image(path: Path, resolution_m: float | None) -> tuple[Ground, list[str]]:
-    said = _Nav2(
+    config = _Nav2Config(
         image=path.name,
         resolution=resolution_m or IMAGE_RESOLUTION_M,
         origin=(0.0, 0.0, 0.0),
@@ -133,28 +133,30 @@ def _from_image(path: Path, resolution_m: float | None) -> tuple[Ground, list[st
         negate=False,
     )
     picture = _picture(path, "map.file:")
-    ground, traps = _ground(f"map.file: {path}", picture._replace(alpha=None), said, (0.0, 0.0))
+    ground, found = _ground(f"map.file: {path}", picture._replace(alpha=None), config, (0.0, 0.0))
     if picture.alpha is not None:
         ground.cells[picture.alpha[::-1] < 255] = UNKNOWN
-    return ground, traps
+    return ground, found
 
 
 def _ground(
-    place: str, picture: _Picture, said: _Nav2, origin_m: tuple[float, float]
+    place: str, picture: _Picture, config: _Nav2Config, origin_m: tuple[float, float]
 ) -> tuple[Ground, list[str]]:
-    classes = _classes(picture, said)
+    classes = _classes(picture, config)
     rows, columns = classes.shape
-    frame = Frame(said.resolution, origin_m, rows, columns)
-    return Ground(frame, np.ascontiguousarray(classes[::-1])), _traps(place, picture, said, classes)
+    frame = Frame(config.resolution, origin_m, rows, columns)
+    return Ground(frame, np.ascontiguousarray(classes[::-1])), _likely_mistakes(
+        place, picture, config, classes
+    )
 
 
-def _said(path: Path) -> _Nav2:
-    """The YAML file, checked."""
+def _read_config(path: Path) -> _Nav2Config:
+    """Read and check the YAML file."""
     import yaml  # noqa: PLC0415  only where such a map is used
 
     place = f"map.file: {path}"
     try:
-        said = msgspec.convert(yaml.safe_load(path.read_bytes()), _Nav2, strict=False)
+        config = msgspec.convert(yaml.safe_load(path.read_bytes()), _Nav2Config, strict=False)
     except FileNotFoundError:
         raise ScenarioError(f"{place}: no such file") from None
     except msgspec.ValidationError as error:
@@ -165,32 +167,32 @@ def _said(path: Path) -> _Nav2:
         ) from None
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         raise ScenarioError(f"{place}: not a readable YAML file: {error}") from None
-    for complaint in _complaints(said):
+    for complaint in _complaints(config):
         raise ScenarioError(f"{place}: {complaint}")
-    return msgspec.structs.replace(said, mode=said.mode.lower())
+    return msgspec.structs.replace(config, mode=config.mode.lower())
 
 
-def _complaints(said: _Nav2) -> list[str]:
-    x_m, y_m, yaw_rad = said.origin
+def _complaints(config: _Nav2Config) -> list[str]:
+    x_m, y_m, yaw_rad = config.origin
     found = []
-    if said.mode.lower() not in ("trinary", "scale", "raw"):
-        found.append(f"mode: '{said.mode}' is unknown; give trinary, scale or raw")
-    if said.free_thresh > said.occupied_thresh:
+    if config.mode.lower() not in ("trinary", "scale", "raw"):
+        found.append(f"mode: '{config.mode}' is unknown; give trinary, scale or raw")
+    if config.free_thresh > config.occupied_thresh:
         found.append(
-            f"free_thresh: {said.free_thresh:g} is above occupied_thresh, {said.occupied_thresh:g}; "
+            f"free_thresh: {config.free_thresh:g} is above occupied_thresh, {config.occupied_thresh:g}; "
             "Nav2 writes 0.196 and 0.65"
         )
     if not (abs(x_m) <= ORIGIN_MAX_M and abs(y_m) <= ORIGIN_MAX_M):
         found.append(f"origin: ({x_m:g}, {y_m:g}) is too far away; stay within {ORIGIN_MAX_M:g} m")
     if yaw_rad != 0.0:
         found.append(f"origin: a yaw of {yaw_rad:g} is not supported; rotate the image and give 0")
-    if not said.image:
+    if not config.image:
         found.append("image: empty; give the file's name")
     return found
 
 
 def _picture(path: Path, place: str) -> _Picture:
-    """Decoded only if it is small enough."""
+    """Decode an image, unless it has more than CELLS_MAX pixels."""
     from PIL import Image  # noqa: PLC0415  only where an image is used
 
     too_large = ScenarioError(
@@ -230,42 +232,42 @@ def _pixels(image: "Image") -> _Picture:
     return _Picture(np.asarray(image.convert("RGB")).sum(axis=2, dtype=np.uint16), 3, 255, None)
 
 
-def _classes(picture: _Picture, said: _Nav2) -> Cells:
-    """(rows, columns), top row first: what each pixel says, by `loadMapFromFile` of nav2_map_server.
+def _classes(picture: _Picture, config: _Nav2Config) -> Cells:
+    """(rows, columns), top row first: the class of each pixel, by `loadMapFromFile` of nav2_map_server.
 
-    There brightness is the mean of the channels, in trinary mode with alpha as one of them, and
+    In Nav2 brightness is the mean of the channels, in trinary mode with alpha as one of them, and
     occupancy is 1 - brightness, or brightness if negated. trinary: occupied above occupied_thresh,
-    free below free_thresh, else unknown. scale: the same, with what is not opaque unknown; the
+    free below free_thresh, else unknown. scale: the same, with pixels that are not opaque unknown; the
     percentages that Nav2 spreads between the thresholds are free at 0, occupied at 100, else
     unknown. raw: the value in 0 to 100 is a percentage, which is free or occupied by the thresholds
     as for map_saver; a value above is unknown.
     """
     levels, channels = picture.colour, picture.channels
-    if said.mode == "trinary" and picture.alpha is not None:
+    if config.mode == "trinary" and picture.alpha is not None:
         levels, channels = levels + picture.alpha, channels + 1
     every = np.arange(channels * picture.white + 1)
     shade = every * (65535 // picture.white) / channels / 65535.0  # in that order, as Nav2 rounds
-    rule = _by_percent if said.mode == "raw" else _by_occupancy
-    classes: Cells = rule(shade, said)[levels]
-    if said.mode == "scale" and picture.alpha is not None:
+    rule = _by_percent if config.mode == "raw" else _by_occupancy
+    classes: Cells = rule(shade, config)[levels]
+    if config.mode == "scale" and picture.alpha is not None:
         classes[picture.alpha < 255] = UNKNOWN
     return classes
 
 
-def _by_occupancy(shade: npt.NDArray[np.float64], said: _Nav2) -> Cells:
-    occupancy = shade if said.negate else 1.0 - shade
-    free, occupied = occupancy < said.free_thresh, occupancy > said.occupied_thresh
-    span = said.occupied_thresh - said.free_thresh
-    if said.mode == "scale" and span > 0.0:
-        percent = np.rint((occupancy - said.free_thresh) / span * 100.0)
+def _by_occupancy(shade: npt.NDArray[np.float64], config: _Nav2Config) -> Cells:
+    occupancy = shade if config.negate else 1.0 - shade
+    free, occupied = occupancy < config.free_thresh, occupancy > config.occupied_thresh
+    span = config.occupied_thresh - config.free_thresh
+    if config.mode == "scale" and span > 0.0:
+        percent = np.rint((occupancy - config.free_thresh) / span * 100.0)
         free, occupied = free | (percent == 0.0), occupied | (percent == 100.0)
     return _as_cells(free, occupied)
 
 
-def _by_percent(shade: npt.NDArray[np.float64], said: _Nav2) -> Cells:
+def _by_percent(shade: npt.NDArray[np.float64], config: _Nav2Config) -> Cells:
     percent = np.floor(shade * 255.0 + 0.5)
-    free = percent <= np.rint(said.free_thresh * 100.0)
-    occupied = (percent >= np.rint(said.occupied_thresh * 100.0)) & (percent <= 100.0)
+    free = percent <= np.rint(config.free_thresh * 100.0)
+    occupied = (percent >= np.rint(config.occupied_thresh * 100.0)) & (percent <= 100.0)
     return _as_cells(free, occupied & ~free)
 
 
@@ -273,9 +275,11 @@ def _as_cells(free: npt.NDArray[np.bool_], occupied: npt.NDArray[np.bool_]) -> C
     return np.where(occupied, OCCUPIED, np.where(free, FREE, UNKNOWN)).astype(np.uint8)
 
 
-def _traps(place: str, picture: _Picture, said: _Nav2, classes: Cells) -> list[str]:
-    """What Nav2 reads so as well, but hardly anybody means."""
-    if said.mode != "trinary":
+def _likely_mistakes(
+    place: str, picture: _Picture, config: _Nav2Config, classes: Cells
+) -> list[str]:
+    """Warnings of contents that Nav2 reads in the same way, but that are rarely intended."""
+    if config.mode != "trinary":
         return []
     found = []
     grey = picture.colour == _GREY_UNKNOWN * picture.channels * (picture.white // 255)
@@ -334,20 +338,20 @@ def _from_moving_ai(path: Path, resolution_m: float | None) -> tuple[Ground, lis
 
 
 def _header(place: str, lines: list[bytes]) -> tuple[int, int, int]:
-    """How many lines it has, the height and the width."""
-    said: dict[bytes, bytes] = {}
+    """Number of header lines, height and width."""
+    fields: dict[bytes, bytes] = {}
     for number, line in enumerate(lines[:10], 1):
         key, _, value = line.strip().partition(b" ")
-        if key == b"map" and {b"height", b"width"} <= said.keys():
-            return number, *_size(place, said[b"height"].strip(), said[b"width"].strip())
-        said[key] = value
+        if key == b"map" and {b"height", b"width"} <= fields.keys():
+            return number, *_size(place, fields[b"height"].strip(), fields[b"width"].strip())
+        fields[key] = value
     raise ScenarioError(
         f"{place}: not a MovingAI map; it begins with type octile, height, width and map, a line each"
     )
 
 
 def _size(place: str, height: bytes, width: bytes) -> tuple[int, int]:
-    """Rows and columns."""
+    """Parse and check the numbers of rows and columns."""
     if not all(text.isdigit() and len(text) <= 8 and int(text) for text in (height, width)):
         raise ScenarioError(f"{place}: height and width must be whole numbers above 0; mend them")
     rows, columns = int(height), int(width)
@@ -371,9 +375,9 @@ _READERS: dict[str, _Reader] = {
 
 
 def parts(cells: Cells) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
-    """The connected parts of the free cells: where a robot gets without cutting corners.
+    """The connected parts of the free cells: regions that a robot crosses without cutting corners.
 
-    cells: (rows, columns). Returns (rows, columns) labels from 1, with 0 for what is not free, and
+    cells: (rows, columns). Returns (rows, columns) labels from 1, with 0 for cells that are not free, and
     (labels + 1) sizes in cells, 0 for label 0.
     """
     from scipy.ndimage import label  # noqa: PLC0415  slow to import, not needed without a map

@@ -1,4 +1,4 @@
-"""What a pose senses: targets, ranges, and whether a wall stands in between."""
+"""Sensing from a pose: targets, ranges, and the walls between two places."""
 
 import math
 
@@ -17,7 +17,7 @@ from kantor_worldsim.world.maps import Ground
 def sense_targets(
     targets_m: np.ndarray, found: np.ndarray, x: float, y: float, range_m: float, out: np.ndarray
 ) -> int:
-    """Mark the targets within range that were not found yet; their number, indices in `out`.
+    """Mark the targets within range that were not found yet; returns their number, with their indices in `out`.
 
     targets_m: (T, 2) world frame; found: (T,) bool; out: (T,) int64 room.
     """
@@ -69,7 +69,7 @@ def sense_targets_in_sight(
 
 @kernel
 def walls_between(cells: np.ndarray, u: float, v: float, to_u: float, to_v: float) -> int:
-    """How many walls a straight line crosses: runs of cells that are not free; all outside is one.
+    """Number of walls that a straight line crosses: runs of cells that are not free; all outside is one.
 
     cells: (rows, columns). Coordinates in cells, column axis first. The same from either end: the line
     is followed from the left, or from the end that is on the map. A line to nowhere (nan) crosses nothing.
@@ -96,9 +96,9 @@ def walls_between(cells: np.ndarray, u: float, v: float, to_u: float, to_v: floa
 def way_to_wall(
     cells: np.ndarray, u: float, v: float, angle_rad: float, range_cells: float
 ) -> float:
-    """How far from (u, v), in cells, a beam enters a cell that is not free; inf beyond the range.
+    """Distance from (u, v), in cells, at which a beam enters a cell that is not free; inf beyond the range.
 
-    cells: (rows, columns); what lies outside is not free. 0 for a beam that begins there.
+    cells: (rows, columns); cells outside are not free. 0 for a beam that begins there.
     """
     rows, columns = cells.shape
     if not (0.0 <= u < columns and 0.0 <= v < rows):
@@ -149,7 +149,7 @@ def _scan(
 
 
 class RangeFinder:
-    """Scans the true map; how robots read a scan is in `evidence.py`."""
+    """Scans the true map; the rules by which robots read a scan are in `occupancy_log.py`."""
 
     def __init__(self, sensor: SensorOptions, ground: Ground, seed: int) -> None:
         self._ground = ground

@@ -1,7 +1,7 @@
-"""Where robots begin on a map: at given places, anywhere, or on spots as in KME's figure 5.
+"""Starts of robots on a map: given, drawn from all free cells, or on spots as in KME's figure 5.
 
-Free means connected by steps to one of four neighbours, so that nobody cuts a corner. Everybody
-starts in one such part, else no team could finish; drawn starts lie in the largest.
+Free cells are connected by steps to one of four neighbours, so that no robot cuts a corner. All robots
+start in one connected part, else no team could finish; drawn starts lie in the largest.
 """
 
 from collections.abc import Sequence
@@ -30,11 +30,11 @@ def starts_on(
     count: int,
     seed: int,
 ) -> npt.NDArray[np.float64]:
-    """(n, 2) world frame, metres: where r1 … rn stand at time 0.
+    """(n, 2) positions of r1 … rn at time 0, world frame, metres.
 
     poses_m: used as they are, unless `random`. Drawn starts are centres of cells of their own in
     the largest free part. separate: any cells; together: one, and the nearest around it on foot.
-    spots: how many spots the map has, 0 for none (`spots`). separate: each robot draws a spot of
+    spots: number of spots of the map, 0 for none (`spots`). separate: each robot draws a spot of
     its own; together: around spot number seed mod `spots`, so that as many seeds in a row try each
     once (KME, V-A). Raises ScenarioError if the map has no such starts.
     """
@@ -69,7 +69,7 @@ def spots(ground: Ground, count: int) -> Numbers:
 def observable(ground: Ground, starts_m: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     """(rows, columns): the cells that robots from these starts can ever see.
 
-    Free cells that are connected with a start, and what is not free next to them (4 neighbours). Starts that are
+    Free cells that are connected with a start, and the cells next to them (4 neighbours) that are not free. Starts that are
     outside the map or not free reach nothing.
     """
     labels, sizes = parts(ground.cells)
@@ -78,11 +78,11 @@ def observable(ground: Ground, starts_m: npt.NDArray[np.float64]) -> npt.NDArray
         cell = ground.frame.cell_of(x_m, y_m)
         if cell != NOWHERE:
             reached[labels.flat[cell]] = True
-    reached[0] = False  # what is not free
+    reached[0] = False  # cells that are not free
     seen = reached[labels]
     wide = np.pad(seen, 1)
-    beside = wide[:-2, 1:-1] | wide[2:, 1:-1] | wide[1:-1, :-2] | wide[1:-1, 2:]
-    return np.asarray(seen | (beside & (ground.cells != FREE)))
+    neighbours = wide[:-2, 1:-1] | wide[2:, 1:-1] | wide[1:-1, :-2] | wide[1:-1, 2:]
+    return np.asarray(seen | (neighbours & (ground.cells != FREE)))
 
 
 def _given(ground: Ground, poses_m: Sequence[Point]) -> npt.NDArray[np.float64]:
@@ -156,18 +156,18 @@ def _around(ground: Ground, first: int, count: int) -> list[int]:
     """A free cell and those nearest to it on foot; of equally near ones the lowest first."""
     found, ring, seen = [first], [first], {first}
     while len(found) < count:
-        ring = sorted({cell for near in ring for cell in _free_beside(ground, near)} - seen)
+        ring = sorted({cell for near in ring for cell in _free_neighbours(ground, near)} - seen)
         seen.update(ring)
         found += ring
     return found[:count]
 
 
-def _free_beside(ground: Ground, cell: int) -> list[int]:
+def _free_neighbours(ground: Ground, cell: int) -> list[int]:
     rows, columns = ground.cells.shape
     row, column = divmod(cell, columns)
-    beside = ((row - 1, column), (row, column - 1), (row, column + 1), (row + 1, column))
+    neighbours = ((row - 1, column), (row, column - 1), (row, column + 1), (row + 1, column))
     return [
         r * columns + c
-        for r, c in beside
+        for r, c in neighbours
         if 0 <= r < rows and 0 <= c < columns and ground.cells[r, c] == FREE
     ]

@@ -1,4 +1,4 @@
-"""The truth: poses of robots and targets, energy that is left, what was consumed and found."""
+"""The truth: poses of robots and targets, energy that was spent, and targets that were found."""
 
 import math
 from typing import NamedTuple
@@ -87,12 +87,12 @@ def ground_of(scenario: Scenario) -> tuple[Ground, list[str]]:
     from kantor_worldsim.world.layouts import layout  # noqa: PLC0415  only where there is a map
     from kantor_worldsim.world.maps import read  # noqa: PLC0415
 
-    wanted = scenario.map
-    assert wanted is not None
-    if wanted.file is not None:
-        return read(wanted.file, wanted.resolution_m)
-    assert wanted.layout is not None
-    return layout(wanted.layout, wanted.size_m, wanted.resolution_m, wanted.seed), []
+    options = scenario.map
+    assert options is not None
+    if options.file is not None:
+        return read(options.file, options.resolution_m)
+    assert options.layout is not None
+    return layout(options.layout, options.size_m, options.resolution_m, options.seed), []
 
 
 def units_of(scenario: Scenario, samples: int) -> Units:
@@ -166,18 +166,18 @@ class World:
         return Observation(body.step, body.pose, body.found, body.scan, body.bumped)
 
     def body(self, name: ParticipantId) -> Body:
-        """State of a participant as a process that takes it over must know it."""
+        """State of a participant that a process needs to take it over."""
         body = self._bodies[name]
         return Body(body.pose, body.step, body.energy_spent, body.incarnation)
 
     def begin(self, name: ParticipantId, incarnation: int) -> bool:
-        """Set the incarnation that acts from now on; whether it is a new one."""
+        """Set the incarnation that acts from now on; returns whether it is a new one."""
         body = self._bodies[name]
-        other, body.incarnation = incarnation != body.incarnation, incarnation
-        return other
+        is_new, body.incarnation = incarnation != body.incarnation, incarnation
+        return is_new
 
     def accept(self, name: ParticipantId, now_ns: int, outputs: Outputs) -> StepVerdict:
-        """Judge a step that was made at `now_ns`, and apply the parts that break no rule."""
+        """Check a step that was made at `now_ns`, and apply the parts that break no rule."""
         body = self._bodies[name]
         if outputs.step <= body.step or now_ns < body.moved_ns:
             return StepVerdict(pose=body.pose, violations=("step",))
@@ -233,12 +233,12 @@ class World:
 
     def _sense(self, name: ParticipantId) -> tuple[Found, ...]:
         body, ground, targets_m = self._bodies[name], self._ground, self._targets.xy_m
-        seen = (targets_m, self.found, body.pose.x_m, body.pose.y_m, self._range_m, self._room)
+        arguments = (targets_m, self.found, body.pose.x_m, body.pose.y_m, self._range_m, self._room)
         if ground is None:
-            count = sense_targets(*seen)
+            count = sense_targets(*arguments)
         else:
             frame, cells = ground
-            count = sense_targets_in_sight(cells, *frame.origin_m, frame.resolution_m, *seen)
+            count = sense_targets_in_sight(cells, *frame.origin_m, frame.resolution_m, *arguments)
         if not count:
             return ()
         indices = self._room[:count].tolist()
