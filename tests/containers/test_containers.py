@@ -131,7 +131,7 @@ def test_a_killed_world_sim_is_started_again_and_goes_on(fleet_of: MakeFleet) ->
     fleet.await_log("worldsim", r"explored [2-9]\d %")
     call("docker", "kill", fleet.id("r1"))
     call("docker", "start", fleet.id("r1"))
-    fleet.await_log("r1", "goes on, epoch 0")
+    fleet.await_log("r1", "goes on as incarnation 0")
     assert fleet.readiness_s("r1") > 0.0  # it is on the bus since it was started again
     if os.getuid() == 0:
         os.kill(fleet.inspect("worldsim")["State"]["Pid"], signal.SIGKILL)
