@@ -25,9 +25,9 @@ class CausedEvent(NamedTuple):
     who: ParticipantId
     what: str
     at_ns: int
-    """It does not come before."""
+    """The earliest time at which it comes."""
     mid_step: bool
-    """It waits for a step of the process, which may never come."""
+    """Whether it waits for a step of the process, which may never come."""
 
 
 def caused_events(scenario: Scenario) -> Iterable[CausedEvent]:
@@ -41,7 +41,7 @@ def caused_events(scenario: Scenario) -> Iterable[CausedEvent]:
 
 
 def _moments(fault: OnProcesses) -> Iterable[tuple[str, int | None]]:
-    """What a fault does to a process, and when; a fault without an end has no second moment."""
+    """The events of a fault, with their times; a fault without an end has no second one."""
     begins_ns, ends_ns = fault.from_ns, fault.until_ns
     match fault:
         case Kill():
@@ -63,7 +63,7 @@ def _moments(fault: OnProcesses) -> Iterable[tuple[str, int | None]]:
 
 
 class WrongClocks:
-    """How far the clocks of participants may be ahead of simulated time, by the clock faults."""
+    """Bounds on how far clocks of participants are ahead of simulated time, by the clock faults."""
 
     def __init__(self, scenario: Scenario, *, virtual: bool) -> None:
         """virtual: a clock is wrong exactly within the window of its fault; otherwise it learns of it later."""
@@ -97,6 +97,6 @@ class WrongClocks:
 
 
 def _skew_ns(fault: ClockFault, now_ns: int) -> int:
-    """What a fault has added to a clock: its offset, and so many millionths of the time since it began."""
+    """The error that a fault has added to a clock: its offset, and so many millionths of the time since it began."""
     elapsed_ns = now_ns - fault.from_ns
     return round(fault.offset_s * 1e9) + elapsed_ns * round(fault.rate_ppm) // 10**6

@@ -42,7 +42,7 @@ from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent,
 
 
 class Snapshot(NamedTuple):
-    """How the run stands, cheap to get at any time."""
+    """The state of a run in a few numbers, cheap to get at any time."""
 
     now_ns: int
     energy_spent: int
@@ -54,22 +54,22 @@ class Snapshot(NamedTuple):
     """Deliveries a simulated second over the last ten rows."""
     robots_done: int
     mass_left: float
-    """On a map the share of cells that nobody has seen."""
+    """On a map the share of cells that no robot has seen."""
     distance_m: float | None = None
     """On a map: what all robots have driven."""
 
 
 class RunMetrics:
-    """Follows the records of one run: what is the same whatever is explored.
+    """Follows the records of one run and measures what every kind of mission has.
 
-    A kind of mission adds what it measures: `_begin`, `_attend`, `_row`, `_snapshot_of` and `_measured`.
+    A kind of mission adds its own measures: `_begin`, `_attend`, `_row`, `_snapshot_of` and `_measured`.
     """
 
     columns: ClassVar[tuple[str, ...]]
     """The names in a row."""
 
     def __init__(self, decoder: ColumnarDecoder | None = None) -> None:
-        """reader: the one that another referee of the same run reads by."""
+        """decoder: that of another observer of the same run, to share its work."""
         self.rows: list[Any] = []
         self.finds: list[tuple[float, ParticipantId, int, float, float]] = []
         """(time, robot, target, x, y), world frame."""
@@ -85,7 +85,7 @@ class RunMetrics:
         elif isinstance(record, Batch):
             self._follow(record)
         elif isinstance(record, ProcessEvent):
-            self._befall(record)
+            self._follow_event(record)
         else:
             self._ending = record
             self._row(last=True)
@@ -119,12 +119,12 @@ class RunMetrics:
         self._tally.standing[:, 2] = NEVER
         self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
         self._out_of_range = self._absences = 0
-        self._tolls = Counter[tuple[int, str]]()
+        self._fault_counts = Counter[tuple[int, str]]()
         self._restarts = 0
-        self._epochs = dict.fromkeys(names, 0)
+        self._incarnations = dict.fromkeys(names, 0)
         self._gone: set[ParticipantId] = set()
         self._started_ns: dict[ParticipantId, int] = {}
-        """Who has started again and not stepped yet, and when that was."""
+        """Participants that have started again and not stepped yet, and when that was."""
         self._rejoined_ns: list[int] = []
         self._ending = Ending(0, "cut")
         self._tick = 0
@@ -143,8 +143,8 @@ class RunMetrics:
         self._out_of_range += batch.out_of_range
         self._absences += len(batch.absent)
         for stats in batch.fault_stats:
-            for deed in LINK_COUNTERS:
-                self._tolls[stats.fault, deed] += getattr(stats, deed)
+            for counter in LINK_COUNTERS:
+                self._fault_counts[stats.fault, counter] += getattr(stats, counter)
         if self._started_ns:
             self._note_rejoining(batch)
         columns = self._decoder.read(batch)
@@ -152,27 +152,27 @@ class RunMetrics:
             self._note_finds(batch)
         self._attend(batch, columns)
 
-    def _befall(self, incident: ProcessEvent) -> None:
-        """Follow what befell a process."""
+    def _follow_event(self, incident: ProcessEvent) -> None:
+        """Follow an event of a process."""
         name, what = incident.who, incident.what
         if incident.fault >= 0 and what in PROCESS_COUNTERS:
-            self._tolls[incident.fault, PROCESS_COUNTERS[what]] += 1
+            self._fault_counts[incident.fault, PROCESS_COUNTERS[what]] += 1
         if what in {"kill", "leave"}:
             self._gone.add(name)
             self._started_ns.pop(name, None)
         elif what in {"start", "join"}:
             self._restarts += name in self._gone
-            if name in self._epochs:
-                self._take_over(incident)
+            if name in self._incarnations:
+                self._begin_incarnation(incident)
             self._gone.discard(name)
 
-    def _take_over(self, incident: ProcessEvent) -> None:
+    def _begin_incarnation(self, incident: ProcessEvent) -> None:
         name = incident.who
         if name in self._gone:
             self._started_ns[name] = incident.now_ns
-        if incident.incarnation <= self._epochs[name]:
+        if incident.incarnation <= self._incarnations[name]:
             return
-        self._epochs[name] = incident.incarnation
+        self._incarnations[name] = incident.incarnation
         place = self._scenario.roster.index(name)
         begin_anew(*self._tally, place, self._units.sample)
 
@@ -184,17 +184,17 @@ class RunMetrics:
 
     @property
     def steps(self) -> int:
-        """Of all robots so far."""
+        """Steps of all robots so far."""
         return self._tally.counts.item(STEPS)
 
     @property
     def deliveries(self) -> int:
-        """So far."""
+        """Copies that have arrived or will, so far."""
         return self._tally.counts.item(DELIVERIES)
 
     @property
     def drops(self) -> int:
-        """So far."""
+        """Copies that were lost, so far."""
         return self._tally.counts.item(DROPS)
 
     def _note_finds(self, batch: Batch) -> None:
@@ -211,22 +211,22 @@ class RunMetrics:
         raise NotImplementedError
 
     def _attend(self, batch: Batch, columns: tuple[Any, ...]) -> None:
-        """Follow a batch that has been counted. reading: a Reading as arguments of a kernel."""
+        """Follow a batch that has been counted. columns: a ColumnarBatch as arguments of a kernel."""
 
     def _row(self, *, last: bool = False) -> None:
-        """Measure."""
+        """Measure, and add a row."""
         raise NotImplementedError
 
     def _snapshot_of(self) -> dict[str, Any]:
-        """By the last row: `w_ub`, `mass_left` and what else there is in a Glance."""
+        """The fields `w_ub` and `mass_left` of a Snapshot, and others that it may have, by the last row."""
         raise NotImplementedError
 
     def _measured(self) -> dict[str, Any]:
-        """What a Result has beside the counts."""
+        """The fields of a Result beside the counts."""
         raise NotImplementedError
 
     def snapshot(self) -> Snapshot:
-        """How the run stands, by the last row."""
+        """The state of the run, by the last row."""
         if not self.rows:
             return Snapshot(0, 0, 0, 0, 0.0, 0, 0.0, 0, 1.0)
         last = self.rows[-1]
@@ -255,7 +255,7 @@ class RunMetrics:
         record: str,
         complaints: tuple[str, ...],
     ) -> Result:
-        """The summary; call it after the last record. complaints: the checker's."""
+        """The summary; call it after the last record. complaints: the violations that checkers found."""
         scenario, counts = self._scenario, self._tally.counts.tolist()
         robots = scenario.robots.count
         finished = self._tally.standing[:robots, 2].tolist()
@@ -295,12 +295,12 @@ class RunMetrics:
             wall_s=wall_s,
             faults={
                 f"{i} {kind_of(fault)}": FaultCounts(
-                    **{deed: self._tolls[i, deed] for deed in FaultCounts.__struct_fields__}
+                    **{name: self._fault_counts[i, name] for name in FaultCounts.__struct_fields__}
                 )
                 for i, fault in enumerate(scenario.faults)
             },
             restarts=self._restarts,
-            incarnations=sum(self._epochs.values()),
+            incarnations=sum(self._incarnations.values()),
             rejoin_s=Rejoining.of(self._rejoined_ns),
             excess=dict(excess),
             **self._measured(),

@@ -130,7 +130,7 @@ def _sum_up(
     """The pending terms, mass times the distance to a robot, over all samples.
 
     For each robot in paper: by the common weights or its own view; in local: eq. 12, what the robots in
-    its range have shipped and their terms by its own view. near: (m, m) room for who is in whose range.
+    its range have shipped and their terms by its own view. near: (m, m) room for the robots in range of each.
     xyu (3, B), way_m (B,): room for one block of samples, which stays in the cache while all robots and
     views meet in it.
     """
@@ -165,7 +165,7 @@ class DensityMetrics(RunMetrics):
     ) -> None:
         """exact_every: periods from one exact distance to the next; 0: at the end only; None: never.
 
-        decoder: the one that another referee of the same run reads by.
+        decoder: that of another observer of the same run, to share its work.
         """
         super().__init__(decoder)
         self._exact_every = exact_every
@@ -214,7 +214,7 @@ class DensityMetrics(RunMetrics):
         tally, scenario, whole = self._tally, self._scenario, self._units.whole
         counts = tally.counts.tolist()
         true_rest = _rest(tally.true_left)
-        # The common view: everybody's minimum, or with a ledger the truth.
+        # The common view: the minimum of all views, or with a ledger the truth.
         left = true_rest if scenario.merge == "ledger" else counts[LEAST]
         shipped, shipped_now = tally.shipped.tolist()
         tight = None

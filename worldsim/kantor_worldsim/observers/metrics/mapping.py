@@ -1,7 +1,7 @@
-"""What a mapping run is measured by, from its records alone (Puig, Garcia, Wu, section 4).
+"""Metrics of a mission on a map, from its records alone (Puig, Garcia, Wu, section 4).
 
 The map is cut into 2, 4 … 64 blocks of equal size; of each only the cells that can ever be seen count,
-and a block without any is left out. With w the tick at which a cell was first seen by anybody, and
+and a block without any is left out. With w the tick at which a cell was first seen, and
 w' = t + e for a cell not yet seen, e the distance in cells from its middle to the closest robot:
 
 WTV
@@ -95,13 +95,13 @@ def _merged(finest: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDAr
 
 
 def _variance(sums: npt.NDArray[np.float64], counts: npt.NDArray[np.float64]) -> float:
-    """Of the means of those that have any."""
+    """The variance of the means of regions that have any cells."""
     there = counts > 0.0
     return float(np.var(sums[there] / counts[there])) if there.any() else 0.0
 
 
 class _Pace:
-    """How one robot gets on: what it heads for, and since when it stands still."""
+    """The progress of one robot: its goal, and since when it stands still."""
 
     def __init__(self, xy_m: tuple[float, float]) -> None:
         self.xy_m = xy_m
@@ -119,7 +119,7 @@ class MapMetrics(RunMetrics):
     def __init__(
         self, decoder: ColumnarDecoder | None = None, map_tracker: MapTracker | None = None
     ) -> None:
-        """reader, survey: those that other referees of the same run follow it by, after this one."""
+        """decoder, map_tracker: those of other observers of the same run, which follow it after this one."""
         super().__init__(decoder)
         self.map_tracker = map_tracker or MapTracker(self._decoder)
         self.shares: list[list[float]] = []
@@ -152,7 +152,7 @@ class MapMetrics(RunMetrics):
         self._walls = Walls.of(scenario.radio, self.map_tracker.ground)
         self._resolution_m = frame.resolution_m
 
-    def _attend(self, batch: Batch, _reading: tuple[Any, ...]) -> None:
+    def _attend(self, batch: Batch, _columns: tuple[Any, ...]) -> None:
         self.map_tracker.observe(
             batch
         )  # not before: a row tells how things stood at the end of its tick
