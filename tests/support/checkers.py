@@ -9,7 +9,7 @@ from kantor_worldsim.record.records import Record
 
 def rules(records: Iterable[Record]) -> set[str]:
     """The rules that a record breaks."""
-    return {violation.partition(":")[0] for violation in check(records).complaints}
+    return {violation.partition(":")[0] for violation in check(records).violations}
 
 
 def listed(checker: type) -> set[str]:

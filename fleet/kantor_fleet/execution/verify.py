@@ -104,7 +104,7 @@ def _verdict_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Rec
     checker = check((record for _, record in records), virtual=virtual)
     if not checker.count:
         return True, "checker: all rules held"
-    return False, f"checker: {checker.count} complaints, first: {checker.complaints[0]}"
+    return False, f"checker: {checker.count} complaints, first: {checker.violations[0]}"
 
 
 def _verdict_of_execution(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Verdict:

@@ -193,7 +193,7 @@ def test_no_complaint_about_a_sound_run(
     overrides = (f"coordination={coordination}", f"clock.order={order}")
     records = played(*MERGES[merge], *RADIOS[radio], *overrides)
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
     assert isinstance(records[-1], Ending)
     assert records[-1].reason == "done"
 
@@ -206,7 +206,7 @@ def test_no_complaint_about_a_sound_run_by_registers(
     """Sums over places, whatever becomes of the messages that carry them."""
     records = played(*SPECTRAL, *RADIOS[radio], f"coordination={coordination}")
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
     origins = len(opening(records).scenario.roster)
     told = [own_register(step_record, origins) for step_record in step_records(records, "r1")]
     assert max(told) > 5
@@ -258,7 +258,7 @@ def test_no_complaint_whatever_the_radio_and_the_clocks(
         seed=seed,
     )
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
 
 
 # Broken records: the overrides of the run, what is done to it, and the rules that must be named.
@@ -785,7 +785,7 @@ def test_no_complaint_whatever_befalls_processes(
     """Sound robots break no rule when their processes are struck."""
     records = played(*faults, *MERGES[merge], *planner)
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
     assert befell(records)
 
 
@@ -1146,7 +1146,7 @@ def test_complaint_says_when_who_and_what(played: Play) -> None:
     """A complaint is one line: rule, time, who, what."""
     records = _jumps(played(*DEAF))
 
-    assert check(records).complaints[0].startswith("speed: t=0.400 s: r1: moved ")
+    assert check(records).violations[0].startswith("speed: t=0.400 s: r1: moved ")
 
 
 def test_broken_record_is_counted_to_its_end(played: Play) -> None:
@@ -1154,7 +1154,7 @@ def test_broken_record_is_counted_to_its_end(played: Play) -> None:
     records = played()
     checker = check([*records, *(records[-1] for _ in range(150))])
 
-    assert (len(checker.complaints), checker.count) == (100, 150)
+    assert (len(checker.violations), checker.count) == (100, 150)
 
 
 def test_subscriber_sees_what_the_checker_follows(played: Play) -> None:

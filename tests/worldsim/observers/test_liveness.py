@@ -59,7 +59,7 @@ def judged(records: Sequence[Record]) -> LivenessChecker:
 
 
 def rules(records: Sequence[Record]) -> set[str]:
-    return {complaint.partition(":")[0] for complaint in judged(records).complaints}
+    return {complaint.partition(":")[0] for complaint in judged(records).violations}
 
 
 @pytest.mark.parametrize("merge", [("merge=ledger",), ("merge=min", "claims=false")])
@@ -72,7 +72,7 @@ def test_all_is_known_to_all_in_the_end(
     """Whatever happened before: who can hear one another hold the same when all is quiet."""
     checker = judged(rested(*merge, fault, *guided, *radio))
 
-    assert checker.complaints == []
+    assert checker.violations == []
     assert {"L1", "L2"} <= checker.judged
     assert ("I8" in checker.judged) == ("merge=ledger" in merge)
 
@@ -88,7 +88,7 @@ def test_supervisor_that_dies_is_given_up_and_taken_back() -> None:
         for e in step_record.outputs.outbox
     ]
 
-    assert checker.complaints == []
+    assert checker.violations == []
     assert "L3" in checker.judged
     assert {SUPERVISOR, EVERYBODY} == set(targets)
     assert targets[-1] == SUPERVISOR
@@ -98,7 +98,7 @@ def test_nothing_is_judged_before_it_can_be_known() -> None:
     """A run that ends while robots move, or under a fault, says nothing of what would have been."""
     lasting = judged(rested("faults=[{kind='partition', shape='halves'}]"))
 
-    assert lasting.complaints == []
+    assert lasting.violations == []
     assert lasting.judged == {"L2"}
 
 

@@ -256,7 +256,7 @@ def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
     reason = simulate(simulation, lossy, 1, lambda: False)
 
     assert reason == "done"
-    assert check(records).complaints == []
+    assert check(records).violations == []
 
 
 @given(grounds(), st.data())
@@ -280,7 +280,7 @@ def test_any_small_map_is_explored_and_judged(ground: Ground, data: st.DataObjec
     map_tracker, witness = surveyed(records), Witness(records)
 
     assert reason == "done"
-    assert check(records).complaints == []
+    assert check(records).violations == []
     assert in_survey(map_tracker) == witness.first
     assert map_tracker.seen == map_tracker.total
     assert map_tracker.completed_tick is not None

@@ -343,7 +343,7 @@ def test_good_record_brings_no_complaint(planner: str, radio: str) -> None:
     """Robots that keep the rules are not accused."""
     checker = check(explored(f"planner={planner}", *RADIOS[radio]))
 
-    assert checker.complaints == []
+    assert checker.violations == []
     assert checker.count == 0
 
 
@@ -392,7 +392,7 @@ def test_frontier_may_be_declared_dead_after_heading_for_it_in_vain() -> None:
     given_up = put(records, step_record, says(lambda news: having(tells(news), r1=1)))
 
     def accused(records: Records) -> bool:
-        return any("declares a frontier dead" in line for line in check(records).complaints)
+        return any("declares a frontier dead" in line for line in check(records).violations)
 
     assert accused(given_up)
     assert not accused(opened(given_up, scenario=on_map(*slow, "planner.patience=1")))
@@ -408,7 +408,7 @@ def test_rules_of_every_run_hold_on_maps() -> None:
 
 def test_complaint_says_when_who_and_what() -> None:
     """A complaint is one line: rule, time, who, what."""
-    complaints = check(_forwards_something_else(explored())).complaints
+    complaints = check(_forwards_something_else(explored())).violations
 
     assert complaints[0].startswith("union: t=")
     assert complaints[0].endswith("r1: forwards an entry at 0 of r2's log that r2 never sent")
@@ -420,7 +420,7 @@ def test_broken_record_is_counted_to_its_end() -> None:
     cells = np.where(ROOMS.cells == FREE, OCCUPIED, FREE).astype(np.uint8)
     checker = check(opened(records, ground=Array.of(cells)))
 
-    assert len(checker.complaints) == 100
+    assert len(checker.violations) == 100
     assert checker.count > 120
 
 
@@ -483,7 +483,7 @@ def test_no_complaint_about_maps_whatever_befalls_processes(struck: str, planner
     """A new incarnation begins with an empty chart and a log of its own."""
     records = explored(f"faults=[{STRUCK[struck]}]", f"planner.name={planner}")
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
 
 
 def test_supervisor_that_forgets_is_not_accused() -> None:
@@ -491,7 +491,7 @@ def test_supervisor_that_forgets_is_not_accused() -> None:
     fault = "{kind='kill', who=['supervisor'], from_s=0.75, until_s=1.5, disk='torn'}"
     records = explored(f"faults=[{fault}]", "coordination=centralized")
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
 
 
 def test_robot_that_goes_on_with_its_old_log_is_named() -> None:
@@ -502,4 +502,4 @@ def test_robot_that_goes_on_with_its_old_log_is_named() -> None:
     reborn = msgspec.structs.replace(start, incarnation=1)
     told = [reborn if record is start else record for record in records]
 
-    assert {"map", "epoch"} <= {each.partition(":")[0] for each in check(told).complaints}
+    assert {"map", "epoch"} <= {each.partition(":")[0] for each in check(told).violations}

@@ -82,7 +82,7 @@ class LivenessChecker:
     """Follows the records of one run; most violations come with the ending."""
 
     def __init__(self) -> None:
-        self.complaints: list[str] = []
+        self.violations: list[str] = []
         self.judged: set[str] = set()
         """The rules that this record could have broken."""
         self._opening: Opening | None = None
@@ -125,7 +125,7 @@ class LivenessChecker:
         """Rules and participants of violations that last from step to step."""
 
     def _report(self, rule: str, now_ns: int, who: str, what: str) -> None:
-        self.complaints.append(f"{rule}: t={now_ns * 1e-9:.3f} s: {who}: {what}")
+        self.violations.append(f"{rule}: t={now_ns * 1e-9:.3f} s: {who}: {what}")
 
     def _follow(self, step_record: StepRecord, now_ns: int) -> None:
         state = self._states.get(step_record.name)
