@@ -1,4 +1,4 @@
-"""The referees: silent on a good record, and each rule noticed when it alone is broken."""
+"""The checker is silent on a sound record, and finds each rule that is broken alone."""
 
 import zlib
 from collections.abc import Callable, Sequence
@@ -47,7 +47,7 @@ RADIOS = {
     ),
 }
 DEAF = ("radio.range_m=0", "supervisor.range_m=0")
-"""Nobody hears anybody, so that nothing but the broken rule is touched."""
+"""No robot hears another, so that nothing but the broken rule is touched."""
 
 
 # Ways to change a record.
@@ -430,7 +430,7 @@ def _delivered_to_a_stranger(records: Records) -> list[Record]:
 
 
 @breaks("delivery", run=("coordination=centralized",))
-def _delivered_to_somebody_else(records: Records) -> list[Record]:
+def _delivered_to_another_target(records: Records) -> list[Record]:
     first = batches(records)[0]
     return add_verdict(records, first, DeliveryDecision("r1", 1, "r2", first.now_ns))
 
@@ -912,7 +912,7 @@ def _forgets_its_predecessors_log(records: Records) -> list[Record]:
 
 
 @breaks("ledger")
-def _holds_entries_of_nobody(records: Records) -> list[Record]:
+def _holds_entries_of_no_incarnation(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[-1]
 
     def invent(said: GossipMessage) -> GossipMessage:
@@ -958,7 +958,7 @@ def _strikes_a_stranger(records: Records) -> list[Record]:
 
 
 @breaks("incident", run=COPIED)
-def _strikes_somebody_else(records: Records) -> list[Record]:
+def _strikes_another_process(records: Records) -> list[Record]:
     return changed(records, "pretend", who="r1")
 
 
@@ -1102,7 +1102,7 @@ def _too_fast_by_a_clock_that_did_not_gain(records: Records) -> list[Record]:
 
 
 def test_too_fast_by_a_clock_that_gains_is_excused(played: Play) -> None:
-    """It cannot know that its clock has jumped; the world refuses the move, and nobody is to blame."""
+    """A robot cannot know that its clock has jumped: world-sim refuses the move, and no rule is broken."""
     records = played(*SKEWED)
     step_record = next(
         step_record for step_record in step_records(records, "r2") if step_record.skew_ns

@@ -28,7 +28,7 @@ GUIDED = "coordination=centralized"
 
 
 class _Patient(Simulation):
-    """A stage on which the mission goes on for a while when everybody rests."""
+    """A simulation in which the mission goes on for a while when all robots rest."""
 
     rested_ns = -1
 
@@ -78,7 +78,7 @@ def test_all_is_known_to_all_in_the_end(
 
 
 def test_supervisor_that_dies_is_given_up_and_taken_back() -> None:
-    """Robots talk to everybody meanwhile, and nobody complains."""
+    """Robots talk to all robots meanwhile, and no rule is broken."""
     records = rested(AWAY, GUIDED)
     checker = judged(records)
     targets = [
@@ -197,7 +197,7 @@ def test_who_does_not_turn_to_others_is_named(target: str) -> None:
 
 
 def test_lost_entries_are_named() -> None:
-    """I8: what a robot has consumed and nobody knows of, not even itself."""
+    """I8: entries that a robot has consumed and that no participant holds, not even itself."""
     records = rested()
     told = [*records]
     for name in ("r1", "r2", "r3"):
@@ -213,7 +213,7 @@ def test_lost_entries_are_named() -> None:
 
 
 def test_what_a_fault_has_held_up_is_news_when_it_arrives() -> None:
-    """Nobody is judged by what was still under way; once it has arrived long ago, everybody is."""
+    """Messages under way put off the judgement until they have arrived and had time to spread."""
     records = rested(CUT)
     sent = next(i for i, r in enumerate(records) if isinstance(r, Batch) and r.decisions)
     batch = records[sent]

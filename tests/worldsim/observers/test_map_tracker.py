@@ -178,8 +178,8 @@ def test_moments_are_those_of_the_stamps(run: str) -> None:
     )
 
 
-def test_all_know_later_than_somebody() -> None:
-    """What one has seen takes a while to reach all; who hears nobody must see it all itself."""
+def test_every_robot_knows_later_than_the_first() -> None:
+    """Cells that one robot has seen take a while to reach all; a robot that hears no other must see them itself."""
     together, alone = surveyed(explored()), surveyed(explored(*RUNS["alone"]))
 
     for map_tracker in (together, alone):
@@ -219,7 +219,7 @@ def test_bumps_are_counted_where_they_happen() -> None:
     assert surveyed(records).bumps == [(bumped.pose.x_m, bumped.pose.y_m)]
 
 
-def test_referees_may_share_a_survey() -> None:
+def test_observers_may_share_a_map_tracker() -> None:
     """A record that is handed on twice counts once."""
     decoder = ColumnarDecoder()
     map_tracker = MapTracker(decoder)
@@ -235,7 +235,7 @@ def test_referees_may_share_a_survey() -> None:
 
 
 @pytest.mark.parametrize("radio", [(), ("radio.range_m=0.01", "radio.beacon=state")])
-def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
+def test_lost_steps_are_no_violations(radio: tuple[str, ...]) -> None:
     """A robot whose output was lost is asked again; it is not accused of that."""
     scenario = on_map(*radio)
     site = site_of(scenario)

@@ -1,4 +1,4 @@
-"""The referees of mapping runs: silent on a good record, and each rule noticed when it alone is broken."""
+"""The checker of mapping runs is silent on a sound record, and finds each rule that is broken alone."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ Records = Sequence[Record]
 Change = Callable[[StepRecord], StepRecord]
 
 ALONE = ("radio.range_m=0.01", "radio.beacon=state")
-"""Nobody hears anybody, and everybody tells all that it knows all the time."""
+"""No robot hears another, and each sends all that it knows all the time."""
 RADIOS = {
     "near": (),
     "everywhere": ("radio.range_m=100",),
@@ -359,7 +359,7 @@ def test_broken_rule_is_named(name: str) -> None:
     records = explored(*run)
 
     assert rules(records) == set()
-    also = {"speed"} if name == "wall-nowhere" else set()  # as far as nobody can go
+    also = {"speed"} if name == "wall-nowhere" else set()  # farther than a robot can go
     assert rules(broken(records)) == {name.partition("-")[0]} | also
 
 
@@ -406,16 +406,16 @@ def test_rules_of_every_run_hold_on_maps() -> None:
     assert "speed" in rules(jumps)
 
 
-def test_complaint_says_when_who_and_what() -> None:
-    """A complaint is one line: rule, time, who, what."""
-    complaints = check(_forwards_something_else(explored())).violations
+def test_violation_has_rule_time_participant_and_text() -> None:
+    """A violation is one line."""
+    violations = check(_forwards_something_else(explored())).violations
 
-    assert complaints[0].startswith("union: t=")
-    assert complaints[0].endswith("r1: forwards an entry at 0 of r2's log that r2 never sent")
+    assert violations[0].startswith("union: t=")
+    assert violations[0].endswith("r1: forwards an entry at 0 of r2's log that r2 never sent")
 
 
 def test_broken_record_is_counted_to_its_end() -> None:
-    """A hundred complaints are kept, all are counted."""
+    """A hundred violations are kept, all are counted."""
     records = explored()
     cells = np.where(ROOMS.cells == FREE, OCCUPIED, FREE).astype(np.uint8)
     checker = check(opened(records, ground=Array.of(cells)))
@@ -440,7 +440,7 @@ def test_opening_without_a_map_is_refused() -> None:
         check(opened(explored(), ground=None))
 
 
-def test_checker_stands_what_nobody_can_read() -> None:
+def test_checker_survives_messages_that_do_not_decode() -> None:
     """Whatever is in the logs, kernels stay inside their arrays."""
     records = explored()
     rng = np.random.default_rng(3)
