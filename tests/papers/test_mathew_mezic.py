@@ -58,7 +58,7 @@ def flown(overrides: tuple[str, ...], seed: int) -> Flight:
             )
 
     play(scenario, seed, site, [Pipeline(metrics, checker).observe, keep])
-    assert checker.complaints == []
+    assert checker.violations == []
     return Flight(scenario, 100.0 * len(metrics.finds) / len(site.targets_m), step_records)
 
 

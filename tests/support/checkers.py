@@ -1,4 +1,4 @@
-"""What referees say of a record, and which rules they know."""
+"""The rules that a record breaks, and the rules that a checker has."""
 
 import inspect
 from collections.abc import Iterable
@@ -9,11 +9,11 @@ from kantor_worldsim.record.records import Record
 
 def rules(records: Iterable[Record]) -> set[str]:
     """The rules that a record breaks."""
-    return {complaint.partition(":")[0] for complaint in check(records).complaints}
+    return {violation.partition(":")[0] for violation in check(records).violations}
 
 
 def listed(checker: type) -> set[str]:
-    """The rules that a referee's docstring lists. Python 3.13 takes its indentation off, earlier ones do not."""
+    """The rules that a checker's docstring lists. Python 3.13 takes its indentation off, earlier ones do not."""
     text = inspect.getdoc(checker)
     assert text is not None
     lines = text.partition("-----\n")[2].splitlines()

@@ -1,6 +1,6 @@
-"""The rules of link faults in plain Python: what the compiled ones are compared with.
+"""The rules of link faults in plain Python, with which the compiled ones are compared.
 
-Slow, and close to the words of the faults themselves. What a forger makes is no business of this.
+Slow, and close to the descriptions of the faults themselves. Forgeries are left out.
 """
 
 from collections import Counter, deque
@@ -33,12 +33,12 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.radio.channel import DROPPED, LINK_WIDTH, Decisions, LinkGeometry, Sent, hears
 
 Row = tuple[int, int, int]
-"""Receiver, row on the air, due_ns: a verdict."""
+"""Receiver, row on the air, due_ns: a delivery decision."""
 Reaches = Callable[[int, int, float], bool]
 """Whether one participant hears another if their range were so many metres."""
 
 _NEVER_NS = 2**62
-"""Later than any mission; whatever is due then does not arrive."""
+"""Later than any mission; a copy that is due then does not arrive."""
 _SLOTS_IN_A_STATE = 10
 """Of a burst: slots in the shorter of its mean times."""
 _FLAP_SHARE = 0.5
@@ -52,7 +52,7 @@ _RECEIVER = itemgetter(0, 1)
 
 
 class Fate(NamedTuple):
-    """What a rule says of a copy."""
+    """The effect of a rule on a copy."""
 
     dropped: bool = False
     delay_ns: int = 0
@@ -60,7 +60,7 @@ class Fate(NamedTuple):
     """It does not arrive before."""
 
     def joined(self, other: "Fate") -> "Fate":
-        """What two rules say together."""
+        """The effect of two rules together."""
         return Fate(
             self.dropped or other.dropped,
             self.delay_ns + other.delay_ns,
@@ -107,7 +107,7 @@ _F = TypeVar("_F", bound=Fault)
 
 
 class Rule(Generic[_F]):
-    """One fault of a scenario, ready to rule."""
+    """One fault of a scenario, ready to apply."""
 
     def __init__(self, fault: _F, index: int, scenario: Scenario, seed: int) -> None:
         """index: its place in the scenario's list."""
@@ -132,7 +132,7 @@ class Rule(Generic[_F]):
         return not self._names or source in self._names or target in self._names
 
     def fate(self, _hop: Hop) -> Fate:
-        """What it says of a copy on a link that it is about."""
+        """Its effect on a copy on a link that it is about."""
         return PASS
 
     def _draw(self, purpose: Purpose, hop: Hop) -> float:
@@ -225,11 +225,11 @@ class _Partition(Cut[Partition]):
 
 
 class _Range(Rule[Range]):
-    """It says nothing of copies: whoever is beyond is out of range."""
+    """It has no effect on copies: a receiver beyond the range gets none."""
 
 
 class _Duplicate(Rule[Duplicate]):
-    """It says nothing of copies: it makes more."""
+    """It has no effect on copies: it makes more of them."""
 
     def copies(self, hop: Hop) -> list[tuple[int, int]]:
         """Number and delay of each copy more."""
@@ -246,21 +246,21 @@ class _Duplicate(Rule[Duplicate]):
 
 
 class _Replay(Rule[Replay]):
-    """It says nothing of copies: it sends what was sent before."""
+    """It has no effect on copies: it sends an older message again."""
 
     def _prepare(self, _scenario: Scenario) -> None:
         self._age_ns = round(self.fault.age_s * 1e9)
         self._sent: dict[tuple[ParticipantId, ParticipantId], deque[Sent]] = {}
 
     def remember(self, sent: Sent) -> None:
-        """Note what is sent, and forget what is too old to be drawn."""
+        """Note an envelope, and drop those that are too old to be drawn."""
         past = self._sent.setdefault((sent.envelope.source, sent.envelope.target), deque())
         past.append(sent)
         while len(past) > 1 and past[1].now_ns <= sent.now_ns - self._age_ns:
             past.popleft()
 
     def older(self, hop: Hop, envelope: Envelope) -> Envelope | None:
-        """What comes once more beside an envelope, if anything."""
+        """The envelope that comes once more beside this one, if any."""
         if self._draw(Purpose.FAULT_REPLAY, hop) >= self.fault.probability:
             return None
         share = 1.0 - self._draw(Purpose.FAULT_DELAY, hop)
@@ -270,7 +270,7 @@ class _Replay(Rule[Replay]):
 
 
 class _Bandwidth(Rule[Bandwidth]):
-    """It says the same of every copy of an envelope, when that is sent."""
+    """It has the same effect on every copy of an envelope, when that is sent."""
 
     def _prepare(self, _scenario: Scenario) -> None:
         self._free_ns: dict[ParticipantId, int] = {}
@@ -305,8 +305,8 @@ _RULES: dict[type[Fault], type[Rule[Any]]] = {
 
 _R = TypeVar("_R", bound=Rule[Any])
 
-_Said = list[tuple[int, Fate]]
-"""Which fault says what."""
+_Effects = list[tuple[int, Fate]]
+"""Faults by their places in the list, and their effects on a copy."""
 
 
 class PlainFaults:
@@ -321,18 +321,18 @@ class PlainFaults:
         self._rules = rules
         self._cuts = [rule for rule in rules if isinstance(rule, Cut)]
         self._ranges = [rule for rule in rules if isinstance(rule, _Range)]
-        self._doublers = [rule for rule in rules if isinstance(rule, _Duplicate)]
-        self._replayers = [rule for rule in rules if isinstance(rule, _Replay)]
+        self._duplicates = [rule for rule in rules if isinstance(rule, _Duplicate)]
+        self._replays = [rule for rule in rules if isinstance(rule, _Replay)]
         self._queues = [rule for rule in rules if isinstance(rule, _Bandwidth)]
         self._roster = scenario.roster
         self._places = {name: i for i, name in enumerate(scenario.roster)}
         self._numbers = self._places | {SUPERVISOR: LINK_WIDTH - 1}
         self._range_m = scenario.radio.range_m
         self._supervisor_range_m = scenario.supervisor.range_m
-        self._tolls: dict[int, Counter[str]] = {}
+        self._counts: dict[int, Counter[str]] = {}
 
     def cuts(self, now_ns: int, source: ParticipantId, target: ParticipantId) -> bool:
-        """Whether nothing that is sent now gets from one to the other, however near they are."""
+        """Whether a message sent now cannot get from one to the other, however near they are."""
         return any(rule.active(now_ns) and rule.cuts(now_ns, source, target) for rule in self._cuts)
 
     def reach_m(self, now_ns: int, source: ParticipantId, target: ParticipantId) -> float:
@@ -345,18 +345,22 @@ class PlainFaults:
     ) -> tuple[Sequence[Sent], Decisions, int]:
         """As `Interference` has it."""
         rows = [(to, row, due_ns) for to, row, due_ns in ruled.rows[: ruled.size].tolist()]
-        on_air, told, lost = self.rule(
+        on_air, decided, lost = self.rule(
             sent, rows, lambda one, other, range_m: bool(hears(field, one, other, range_m))
         )
-        return on_air, Decisions(np.array([*told, (0, 0, 0)], dtype=np.int64), len(told)), lost
+        return (
+            on_air,
+            Decisions(np.array([*decided, (0, 0, 0)], dtype=np.int64), len(decided)),
+            lost,
+        )
 
     def rule(
         self, sent: Sequence[Sent], ruled: Iterable[Row], reaches: Reaches
     ) -> tuple[Sequence[Sent], list[Row], int]:
-        """Rule on what the radio has ruled."""
+        """Apply the faults to the decisions of the radio."""
         on_air = list(sent)
         queued = [self._send(each) for each in sent]
-        told: list[Row] = []
+        decided: list[Row] = []
         lost = 0
         for (to, row), ruled_copies in groupby(ruled, key=_RECEIVER):
             hop = self._hop(sent[row], to)
@@ -365,18 +369,20 @@ class PlainFaults:
                 continue
             dues_ns = [due_ns for _, _, due_ns in ruled_copies]
             for copy, which, due_ns in self._copies(hop, row, dues_ns, on_air):
-                told.append((to, which, self._judge(hop._replace(copy=copy), due_ns, queued[row])))
-        return on_air, told, lost
+                decided.append(
+                    (to, which, self._judge(hop._replace(copy=copy), due_ns, queued[row]))
+                )
+        return on_air, decided, lost
 
     def pop_stats(self) -> dict[int, dict[str, int]]:
-        """What each fault has done since the last call; those that did nothing are left out."""
-        taken, self._tolls = self._tolls, {}
-        return {fault: dict(taken[fault]) for fault in sorted(taken)}
+        """Counters of each fault since the last call; faults without effect are left out."""
+        counted, self._counts = self._counts, {}
+        return {fault: dict(counted[fault]) for fault in sorted(counted)}
 
-    def _send(self, sent: Sent) -> _Said:
-        """What is said of an envelope whoever hears it."""
-        for replayer in self._replayers:
-            replayer.remember(sent)
+    def _send(self, sent: Sent) -> _Effects:
+        """The effects on an envelope for all its receivers."""
+        for replay in self._replays:
+            replay.remember(sent)
         now_ns, envelope = sent
         active = [queue for queue in self._queues if queue.active(now_ns)]
         return [(queue.index, queue.send(now_ns, envelope)) for queue in active]
@@ -417,29 +423,29 @@ class PlainFaults:
         arriving_ns = next((due_ns for due_ns in dues_ns if due_ns != DROPPED), DROPPED)
         if arriving_ns == DROPPED:
             return
-        for doubler in self._about(hop, self._doublers):
-            for copy, delay_ns in doubler.copies(hop):
-                self._count(doubler.index, "doubled")
+        for duplicate in self._about(hop, self._duplicates):
+            for copy, delay_ns in duplicate.copies(hop):
+                self._count(duplicate.index, "doubled")
                 yield copy, row, arriving_ns + delay_ns
-        for replayer in self._about(hop, self._replayers):
-            older = replayer.older(hop, on_air[row].envelope)
+        for replay in self._about(hop, self._replays):
+            older = replay.older(hop, on_air[row].envelope)
             if older is not None:
-                self._count(replayer.index, "replayed")
+                self._count(replay.index, "replayed")
                 on_air.append(Sent(hop.now_ns, older))
-                yield _REPLAYED + replayer.index, len(on_air) - 1, arriving_ns
+                yield _REPLAYED + replay.index, len(on_air) - 1, arriving_ns
 
     def _about(self, hop: Hop, rules: list[_R]) -> list[_R]:
         """Those of the rules that are about this link now."""
         now_ns, source, target = hop[:3]
         return [rule for rule in rules if rule.active(now_ns) and rule.concerns(source, target)]
 
-    def _judge(self, hop: Hop, due_ns: int, queued: _Said) -> int:
+    def _judge(self, hop: Hop, due_ns: int, queued: _Effects) -> int:
         """When a copy arrives that the radio has due then, or DROPPED."""
         if due_ns == DROPPED:
             return DROPPED
-        said = queued + [(rule.index, rule.fate(hop)) for rule in self._about(hop, self._rules)]
-        joined = reduce(Fate.joined, (fate for _, fate in said), PASS)
-        for index, fate in said:
+        effects = queued + [(rule.index, rule.fate(hop)) for rule in self._about(hop, self._rules)]
+        joined = reduce(Fate.joined, (fate for _, fate in effects), PASS)
+        for index, fate in effects:
             if fate.dropped:
                 self._count(index, "dropped")
             elif not joined.dropped and fate.due_ns(due_ns) > due_ns:
@@ -447,4 +453,4 @@ class PlainFaults:
         return min(joined.due_ns(due_ns), _NEVER_NS)
 
     def _count(self, index: int, what: str) -> None:
-        self._tolls.setdefault(index, Counter())[what] += 1
+        self._counts.setdefault(index, Counter())[what] += 1

@@ -1,4 +1,4 @@
-"""What tests of the world share: missions that were played in process, as records."""
+"""Records of missions that were played in process, shared by the tests of world-sim."""
 
 import functools
 from collections.abc import Callable

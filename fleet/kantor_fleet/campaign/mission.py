@@ -164,7 +164,7 @@ class Follower:
 
     def violations(self) -> tuple[str, ...]:
         """The first violations of a mission that is over: as it ran, or by its record alone."""
-        seen = (*self.recording.checker.complaints[:10], *self._broken_invariants)
+        seen = (*self.recording.checker.violations[:10], *self._broken_invariants)
         return seen[:10] or tuple(self._check_again()[:10])
 
     def _check_again(self) -> list[str]:
@@ -174,7 +174,7 @@ class Follower:
         for payload in self.payloads:
             pipeline.observe(decode_record(payload), payload)
         self.judged = frozenset(liveness.judged)
-        return checker.complaints or liveness.complaints
+        return checker.violations or liveness.violations
 
 
 def _attempt(case: Case, *, validate: bool) -> dict[str, Any]:
@@ -233,4 +233,4 @@ def _cut_journal(seed: int, payloads: list[bytes]) -> Iterable[str]:
             pipeline = Pipeline(checker)
             for payload, record in found:
                 pipeline.observe(record, payload)
-            yield from checker.complaints
+            yield from checker.violations

@@ -230,7 +230,7 @@ def _check(config: FleetConfig, failures: list[str]) -> ProcessMission:
     if result.ended != "done" or result.record != "whole":
         violations.append(f"end: {result.ended}; record {result.record}")
     violations += [f"verify: {line}" for held, line in findings(folder, journal) if not held]
-    violations += liveness.complaints
+    violations += liveness.violations
     violations += [f"{i.who}: let in" for i in _process_events(records) if i.kind == "let in"]
     rejoined_s: tuple[float, ...] = ()
     resumed_s: tuple[float, ...] = ()

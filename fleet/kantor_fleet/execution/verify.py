@@ -109,7 +109,7 @@ def _finding_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Rec
     checker = check((record for _, record in records), virtual=virtual)
     if not checker.count:
         return True, "checker: all rules held"
-    return False, f"checker: {checker.count} violations, first: {checker.complaints[0]}"
+    return False, f"checker: {checker.count} violations, first: {checker.violations[0]}"
 
 
 def _finding_of_execution(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Finding:

@@ -308,7 +308,7 @@ def test_other_robots_go_on_without_a_missing_one(merge: tuple[str, ...]) -> Non
     assert all(batch.absent in {(), ("r2",)} for batch in batches(records))
     assert finished == {"r1", "r3"}
     assert records[-1] == Ending(scenario.limit_ns, "limit")
-    assert check(records).complaints == []
+    assert check(records).violations == []
 
 
 def test_a_robot_that_has_left_is_not_waited_for() -> None:
@@ -348,7 +348,7 @@ def test_a_robot_that_was_late_goes_on() -> None:
     ]
 
     assert steps[:4] == [(1, 1), (2, 2), (3, 3), (7, 4)]
-    assert check(records).complaints == []
+    assert check(records).violations == []
     assert records[-1] != Ending(scenario.limit_ns, "limit")
 
 
@@ -381,7 +381,7 @@ def test_an_interruption_ends_the_record() -> None:
     assert isinstance(records[-1], Ending)
     assert records[-1].reason == "interrupted"
     assert 1 < len(records) < 7
-    assert check(records).complaints == []
+    assert check(records).violations == []
 
 
 def test_an_interruption_before_the_first_step_leaves_a_closed_record() -> None:

@@ -1,4 +1,4 @@
-"""The referees: silent on a good record, and each rule noticed when it alone is broken."""
+"""The checker is silent on a sound record, and finds each rule that is broken alone."""
 
 import zlib
 from collections.abc import Callable, Sequence
@@ -47,7 +47,7 @@ RADIOS = {
     ),
 }
 DEAF = ("radio.range_m=0", "supervisor.range_m=0")
-"""Nobody hears anybody, so that nothing but the broken rule is touched."""
+"""No robot hears another, so that nothing but the broken rule is touched."""
 
 
 # Ways to change a record.
@@ -193,7 +193,7 @@ def test_no_complaint_about_a_sound_run(
     overrides = (f"coordination={coordination}", f"clock.order={order}")
     records = played(*MERGES[merge], *RADIOS[radio], *overrides)
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
     assert isinstance(records[-1], Ending)
     assert records[-1].reason == "done"
 
@@ -206,7 +206,7 @@ def test_no_complaint_about_a_sound_run_by_registers(
     """Sums over places, whatever becomes of the messages that carry them."""
     records = played(*SPECTRAL, *RADIOS[radio], f"coordination={coordination}")
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
     origins = len(opening(records).scenario.roster)
     told = [own_register(step_record, origins) for step_record in step_records(records, "r1")]
     assert max(told) > 5
@@ -258,7 +258,7 @@ def test_no_complaint_whatever_the_radio_and_the_clocks(
         seed=seed,
     )
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
 
 
 # Broken records: the overrides of the run, what is done to it, and the rules that must be named.
@@ -430,7 +430,7 @@ def _delivered_to_a_stranger(records: Records) -> list[Record]:
 
 
 @breaks("delivery", run=("coordination=centralized",))
-def _delivered_to_somebody_else(records: Records) -> list[Record]:
+def _delivered_to_another_target(records: Records) -> list[Record]:
     first = batches(records)[0]
     return add_verdict(records, first, DeliveryDecision("r1", 1, "r2", first.now_ns))
 
@@ -785,7 +785,7 @@ def test_no_complaint_whatever_befalls_processes(
     """Sound robots break no rule when their processes are struck."""
     records = played(*faults, *MERGES[merge], *planner)
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
     assert befell(records)
 
 
@@ -912,7 +912,7 @@ def _forgets_its_predecessors_log(records: Records) -> list[Record]:
 
 
 @breaks("ledger")
-def _holds_entries_of_nobody(records: Records) -> list[Record]:
+def _holds_entries_of_no_incarnation(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[-1]
 
     def invent(said: GossipMessage) -> GossipMessage:
@@ -958,7 +958,7 @@ def _strikes_a_stranger(records: Records) -> list[Record]:
 
 
 @breaks("incident", run=COPIED)
-def _strikes_somebody_else(records: Records) -> list[Record]:
+def _strikes_another_process(records: Records) -> list[Record]:
     return changed(records, "pretend", who="r1")
 
 
@@ -1102,7 +1102,7 @@ def _too_fast_by_a_clock_that_did_not_gain(records: Records) -> list[Record]:
 
 
 def test_too_fast_by_a_clock_that_gains_is_excused(played: Play) -> None:
-    """It cannot know that its clock has jumped; the world refuses the move, and nobody is to blame."""
+    """A robot cannot know that its clock has jumped: world-sim refuses the move, and no rule is broken."""
     records = played(*SKEWED)
     step_record = next(
         step_record for step_record in step_records(records, "r2") if step_record.skew_ns
@@ -1146,7 +1146,7 @@ def test_complaint_says_when_who_and_what(played: Play) -> None:
     """A complaint is one line: rule, time, who, what."""
     records = _jumps(played(*DEAF))
 
-    assert check(records).complaints[0].startswith("speed: t=0.400 s: r1: moved ")
+    assert check(records).violations[0].startswith("speed: t=0.400 s: r1: moved ")
 
 
 def test_broken_record_is_counted_to_its_end(played: Play) -> None:
@@ -1154,7 +1154,7 @@ def test_broken_record_is_counted_to_its_end(played: Play) -> None:
     records = played()
     checker = check([*records, *(records[-1] for _ in range(150))])
 
-    assert (len(checker.complaints), checker.count) == (100, 150)
+    assert (len(checker.violations), checker.count) == (100, 150)
 
 
 def test_subscriber_sees_what_the_checker_follows(played: Play) -> None:

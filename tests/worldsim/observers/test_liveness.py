@@ -29,7 +29,7 @@ GUIDED = "coordination=centralized"
 
 
 class _Patient(Simulation):
-    """A stage on which the mission goes on for a while when everybody rests."""
+    """A simulation in which the mission goes on for a while when all robots rest."""
 
     rested_ns = -1
 
@@ -61,7 +61,7 @@ def judged(records: Sequence[Record]) -> LivenessChecker:
 
 
 def rules(records: Sequence[Record]) -> set[str]:
-    return {complaint.partition(":")[0] for complaint in judged(records).complaints}
+    return {complaint.partition(":")[0] for complaint in judged(records).violations}
 
 
 @pytest.mark.parametrize("merge", [("merge=ledger",), ("merge=min", "claims=false")])
@@ -74,13 +74,13 @@ def test_all_is_known_to_all_in_the_end(
     """Whatever happened before: who can hear one another hold the same when all is quiet."""
     checker = judged(rested(*merge, fault, *guided, *radio))
 
-    assert checker.complaints == []
+    assert checker.violations == []
     assert {"L1", "L2"} <= checker.judged
     assert ("I8" in checker.judged) == ("merge=ledger" in merge)
 
 
 def test_supervisor_that_dies_is_given_up_and_taken_back() -> None:
-    """Robots talk to everybody meanwhile, and nobody complains."""
+    """Robots talk to all robots meanwhile, and no rule is broken."""
     records = rested(AWAY, GUIDED)
     checker = judged(records)
     targets = [
@@ -90,7 +90,7 @@ def test_supervisor_that_dies_is_given_up_and_taken_back() -> None:
         for e in step_record.outputs.outbox
     ]
 
-    assert checker.complaints == []
+    assert checker.violations == []
     assert "L3" in checker.judged
     assert {SUPERVISOR, EVERYBODY} == set(targets)
     assert targets[-1] == SUPERVISOR
@@ -100,7 +100,7 @@ def test_nothing_is_judged_before_it_can_be_known() -> None:
     """A run that ends while robots move, or under a fault, says nothing of what would have been."""
     lasting = judged(rested("faults=[{kind='partition', shape='halves'}]"))
 
-    assert lasting.complaints == []
+    assert lasting.violations == []
     assert lasting.judged == {"L2"}
 
 
@@ -199,7 +199,7 @@ def test_who_does_not_turn_to_others_is_named(target: str) -> None:
 
 
 def test_lost_entries_are_named() -> None:
-    """I8: what a robot has consumed and nobody knows of, not even itself."""
+    """I8: entries that a robot has consumed and that no participant holds, not even itself."""
     records = rested()
     told = [*records]
     for name in ("r1", "r2", "r3"):
@@ -215,7 +215,7 @@ def test_lost_entries_are_named() -> None:
 
 
 def test_what_a_fault_has_held_up_is_news_when_it_arrives() -> None:
-    """Nobody is judged by what was still under way; once it has arrived long ago, everybody is."""
+    """Messages under way put off the judgement until they have arrived and had time to spread."""
     records = rested(CUT)
     sent = next(i for i, r in enumerate(records) if isinstance(r, Batch) and r.decisions)
     batch = records[sent]

@@ -181,8 +181,8 @@ def test_moments_are_those_of_the_stamps(run: str) -> None:
     )
 
 
-def test_all_know_later_than_somebody() -> None:
-    """What one has seen takes a while to reach all; who hears nobody must see it all itself."""
+def test_every_robot_knows_later_than_the_first() -> None:
+    """Cells that one robot has seen take a while to reach all; a robot that hears no other must see them itself."""
     together, alone = surveyed(explored()), surveyed(explored(*RUNS["alone"]))
 
     for map_tracker in (together, alone):
@@ -236,7 +236,7 @@ def test_metrics_keep_the_tracker_up_to_date() -> None:
 
 
 @pytest.mark.parametrize("radio", [(), ("radio.range_m=0.01", "radio.beacon=state")])
-def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
+def test_lost_steps_are_no_violations(radio: tuple[str, ...]) -> None:
     """A robot whose output was lost is asked again; it is not accused of that."""
     scenario = on_map(*radio)
     site = site_of(scenario)
@@ -257,7 +257,7 @@ def test_lost_steps_are_no_faults(radio: tuple[str, ...]) -> None:
     reason = simulate(simulation, lossy, 1, lambda: False)
 
     assert reason == "done"
-    assert check(records).complaints == []
+    assert check(records).violations == []
 
 
 @given(grounds(), st.data())
@@ -281,7 +281,7 @@ def test_any_small_map_is_explored_and_judged(ground: Ground, data: st.DataObjec
     map_tracker, witness = surveyed(records), Witness(records)
 
     assert reason == "done"
-    assert check(records).complaints == []
+    assert check(records).violations == []
     assert in_survey(map_tracker) == witness.first
     assert map_tracker.seen == map_tracker.total
     assert map_tracker.completed_tick is not None

@@ -1,4 +1,4 @@
-"""The referees of mapping runs: silent on a good record, and each rule noticed when it alone is broken."""
+"""The checker of mapping runs is silent on a sound record, and finds each rule that is broken alone."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -34,7 +34,7 @@ Records = Sequence[Record]
 Change = Callable[[StepRecord], StepRecord]
 
 ALONE = ("radio.range_m=0.01", "radio.beacon=state")
-"""Nobody hears anybody, and everybody tells all that it knows all the time."""
+"""No robot hears another, and each sends all that it knows all the time."""
 RADIOS = {
     "near": (),
     "everywhere": ("radio.range_m=100",),
@@ -344,7 +344,7 @@ def test_good_record_brings_no_complaint(planner: str, radio: str) -> None:
     """Robots that keep the rules are not accused."""
     checker = check(explored(f"planner={planner}", *RADIOS[radio]))
 
-    assert checker.complaints == []
+    assert checker.violations == []
     assert checker.count == 0
 
 
@@ -360,7 +360,7 @@ def test_broken_rule_is_named(name: str) -> None:
     records = explored(*run)
 
     assert rules(records) == set()
-    also = {"speed"} if name == "wall-nowhere" else set()  # as far as nobody can go
+    also = {"speed"} if name == "wall-nowhere" else set()  # farther than a robot can go
     assert rules(broken(records)) == {name.partition("-")[0]} | also
 
 
@@ -393,7 +393,7 @@ def test_frontier_may_be_declared_dead_after_heading_for_it_in_vain() -> None:
     given_up = put(records, step_record, says(lambda news: having(tells(news), r1=1)))
 
     def accused(records: Records) -> bool:
-        return any("declares a frontier dead" in line for line in check(records).complaints)
+        return any("declares a frontier dead" in line for line in check(records).violations)
 
     assert accused(given_up)
     assert not accused(opened(given_up, scenario=on_map(*slow, "planner.patience=1")))
@@ -407,21 +407,21 @@ def test_rules_of_every_run_hold_on_maps() -> None:
     assert "speed" in rules(jumps)
 
 
-def test_complaint_says_when_who_and_what() -> None:
-    """A complaint is one line: rule, time, who, what."""
-    complaints = check(_forwards_something_else(explored())).complaints
+def test_violation_has_rule_time_participant_and_text() -> None:
+    """A violation is one line."""
+    violations = check(_forwards_something_else(explored())).violations
 
-    assert complaints[0].startswith("union: t=")
-    assert complaints[0].endswith("r1: forwards an entry at 0 of r2's log that r2 never sent")
+    assert violations[0].startswith("union: t=")
+    assert violations[0].endswith("r1: forwards an entry at 0 of r2's log that r2 never sent")
 
 
 def test_broken_record_is_counted_to_its_end() -> None:
-    """A hundred complaints are kept, all are counted."""
+    """A hundred violations are kept, all are counted."""
     records = explored()
     cells = np.where(ROOMS.cells == FREE, OCCUPIED, FREE).astype(np.uint8)
     checker = check(opened(records, ground=Array.of(cells)))
 
-    assert len(checker.complaints) == 100
+    assert len(checker.violations) == 100
     assert checker.count > 120
 
 
@@ -441,7 +441,7 @@ def test_opening_without_a_map_is_refused() -> None:
         check(opened(explored(), ground=None))
 
 
-def test_checker_stands_what_nobody_can_read() -> None:
+def test_checker_survives_messages_that_do_not_decode() -> None:
     """Whatever is in the logs, kernels stay inside their arrays."""
     records = explored()
     rng = np.random.default_rng(3)
@@ -485,7 +485,7 @@ def test_no_complaint_about_maps_whatever_befalls_processes(struck: str, planner
     """A new incarnation begins with an empty chart and a log of its own."""
     records = explored(f"faults=[{STRUCK[struck]}]", f"planner.name={planner}")
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
 
 
 def test_supervisor_that_forgets_is_not_accused() -> None:
@@ -493,7 +493,7 @@ def test_supervisor_that_forgets_is_not_accused() -> None:
     fault = "{kind='kill', who=['supervisor'], from_s=0.75, until_s=1.5, disk='torn'}"
     records = explored(f"faults=[{fault}]", "coordination=centralized")
 
-    assert check(records).complaints == []
+    assert check(records).violations == []
 
 
 def test_robot_that_goes_on_with_its_old_log_is_named() -> None:
@@ -504,4 +504,4 @@ def test_robot_that_goes_on_with_its_old_log_is_named() -> None:
     reborn = msgspec.structs.replace(start, incarnation=1)
     told = [reborn if record is start else record for record in records]
 
-    assert {"map", "epoch"} <= {each.partition(":")[0] for each in check(told).complaints}
+    assert {"map", "epoch"} <= {each.partition(":")[0] for each in check(told).violations}

@@ -235,7 +235,7 @@ def test_own_bytes_of_maps_are_counted() -> None:
 
 
 def test_overlap_is_what_was_seen_twice() -> None:
-    """The sum of what robots saw themselves over what somebody saw; a robot alone has none."""
+    """The sum of the cells that each robot saw itself over the cells that any saw; a robot alone has none."""
     metrics = measured(explored("radio.range_m=0.01"))
     own = metrics.map_tracker.own_cells.sum()
     alone = measured(explored("robots.count=1", "starts.poses_m=[[1.5, 1.5]]"))
@@ -360,7 +360,7 @@ def test_glance_has_distance_and_share() -> None:
 
 
 def test_run_folder_has_rows_and_result(tmp_path: Path) -> None:
-    """metrics.csv has a map's columns, result.json its part, and both referees share one survey."""
+    """metrics.csv has a map's columns, result.json its part, and metrics and checker share one map tracker."""
     scenario = on_map()
     recording = Recording(scenario, 1, "in-process", tmp_path)
     play(scenario, 1, site_of(scenario), [recording.observe])
@@ -387,7 +387,7 @@ def test_checker_that_reads_the_tracker_of_metrics_finds_what_one_with_its_own_f
         measured_alone.observe(record)
 
     assert metrics.rows == alone.rows
-    assert reading.complaints == own.complaints == []
+    assert reading.violations == own.violations == []
     assert reading.count == own.count
 
 

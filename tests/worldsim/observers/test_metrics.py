@@ -470,7 +470,7 @@ def test_what_befell_processes_is_counted(played: Play) -> None:
 
 
 def _unheard(records: Sequence[Record]) -> int:
-    """What was forged and reached somebody who was dead, or at rest for ever."""
+    """Forged messages that reached a process that was dead, or at rest for good."""
     batches = [record for record in records if isinstance(record, Batch)]
     heard = sum(
         n >= FORGED_FIRST
@@ -569,7 +569,7 @@ def test_rows_may_be_fewer(played: Play, every: int) -> None:
 
 
 def test_bound_and_mass_never_rise_in_turn(played: Play) -> None:
-    """In turn, with everybody in range, nothing is filled twice: the tight bound stays to the end."""
+    """In turn, with all robots in range, nothing is filled twice: the tight bound stays to the end."""
     rows = measured(played("metrics.every=1", "clock.order=turn")).rows
     masses = [row.mass_left for row in rows]
 

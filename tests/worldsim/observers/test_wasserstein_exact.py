@@ -87,7 +87,7 @@ def test_no_bound_lies_below_it(
         rows, checker = judged(played(*MERGES[merge], *overrides, seed=seed), every=5)
         claimed += sum(row.w1_exact is not None and row.w_ub_tight is not None for row in rows)
 
-        assert checker.complaints == []
+        assert checker.violations == []
     assert claimed >= 6  # at the start at least it claims to hold
 
 
@@ -132,6 +132,6 @@ def test_checker_tells_of_a_bound_below_it(played: Play, form: str) -> None:
 
     checker.observe_row(row._replace(**{form: 0.999}))
 
-    assert [line.partition(":")[0] for line in checker.complaints] == ["bound"]
+    assert [line.partition(":")[0] for line in checker.violations] == ["bound"]
     checker.observe_row(row._replace(w_ub_tight=None, w_ub_paper=0.1))  # it does not claim to hold
     assert checker.count == 1

@@ -757,7 +757,7 @@ def result_of(records: Sequence[Record]) -> Result:
         digest=journal.digest.hex,
         wall_s=0.0,
         record="whole",
-        complaints=tuple(check(records).complaints),
+        complaints=tuple(check(records).violations),
     )
 
 

@@ -136,7 +136,7 @@ class Recording:
             refused_at_door=self.refused_at_door,
             excess=self.excess,
             record=self.journal.cut or "whole",
-            complaints=tuple(self.checker.complaints),
+            complaints=tuple(self.checker.violations),
         )
         if self._folder is not None:
             self._manifest |= {

@@ -112,7 +112,7 @@ class Checker:
 
         virtual: virtual time, in which a participant hears all that has arrived; not the realtime exchange.
         """
-        self.complaints: list[str] = []
+        self.violations: list[str] = []
         """The first violations, as texts."""
         self.count = 0
         """All violations, also those beyond the ones that are kept."""
@@ -156,8 +156,8 @@ class Checker:
 
     def _report(self, rule: str, who: str, what: str) -> None:
         self.count += 1
-        if len(self.complaints) < VIOLATIONS_MAX:
-            self.complaints.append(f"{rule}: t={self._now_ns * 1e-9:.3f} s: {who}: {what}")
+        if len(self.violations) < VIOLATIONS_MAX:
+            self.violations.append(f"{rule}: t={self._now_ns * 1e-9:.3f} s: {who}: {what}")
 
     def _open(self, opening: Opening) -> None:
         scenario = opening.scenario

@@ -37,7 +37,8 @@ def check_energy(state: CheckerState, limits: Limits, columns: ColumnarBatch, ro
     """A step spends units that are left, one point at a time, within the budget."""
     step_record = columns.step_records[row]
     who = step_record[of.PLACE]
-    participant, slot = state.participants[who], state.participants[who, INCARNATION_ID]
+    participant = state.participants[who]
+    incarnation_id = participant[INCARNATION_ID]
     if step_record[of.SPENT_COUNT] == of.NOT_DECODED:
         note_violation(state, GARBLED_SPENT, row, 0, 0, 0, 0.0, 0.0)
         return
@@ -47,10 +48,10 @@ def check_energy(state: CheckerState, limits: Limits, columns: ColumnarBatch, ro
         shipped += units
         state.consumed[sample] += units
         if limits.ledger:
-            entry = state.logs[slot, state.shipped[slot, ENTRIES]]
+            entry = state.logs[incarnation_id, state.shipped[incarnation_id, ENTRIES]]
             entry[0], entry[1] = sample, units
-            state.shipped[slot, ENTRIES] += 1
-    state.shipped[slot, WRITES] += step_record[of.SPENT_COUNT] > 0
+            state.shipped[incarnation_id, ENTRIES] += 1
+    state.shipped[incarnation_id, WRITES] += step_record[of.SPENT_COUNT] > 0
     participant[POINTS] += step_record[of.SPENT_COUNT] > 0
     points = participant[POINTS]
     if shipped > limits.point_units:
@@ -86,7 +87,7 @@ def check_weights(state: CheckerState, limits: Limits, columns: ColumnarBatch, r
 
 @kernel
 def check_published(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
-    """What has changed since the message before; a keyframe is left to `Checker`, to inflate it."""
+    """A published difference rebuilds the vector; a keyframe is left to `Checker`, which inflates it."""
     step_record = columns.step_records[row]
     payload, at = columns.payload, step_record[of.WEIGHTS]
     participant, view = (
@@ -149,7 +150,7 @@ def check_goal(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
 
 @kernel
 def ships_to(state: CheckerState, columns: ColumnarBatch, row: int, x_m: float, y_m: float) -> bool:
-    """Whether something of what was spent went to this place."""
+    """Whether units of this step were shipped to a place."""
     step_record = columns.step_records[row]
     for i in range(
         step_record[of.SPENT], step_record[of.SPENT] + max(0, step_record[of.SPENT_COUNT])

@@ -44,7 +44,7 @@ def remove_delivery(state: CheckerState, who: int, row: int) -> None:
 def check_inbox(
     state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int, now_ns: int
 ) -> None:
-    """What was heard had arrived; in virtual time also: all that had arrived, in order of arrival."""
+    """An inbox holds what had arrived; in virtual time all of it, in order of arrival."""
     step_record = columns.step_records[row]
     who = step_record[of.PLACE]
     deliveries = state.deliveries[who]

@@ -43,15 +43,15 @@ class _Cut(NamedTuple):
     severed: npt.NDArray[np.bool_]
     """(n, n): the links that it cuts while it is there."""
     flap_ns: int
-    """Length of the slots in which it is there or not; 0: it is always there."""
+    """Length of the intervals in which it is there or not; 0: it is always there."""
 
     def is_there(self, now_ns: int, seed: int) -> bool:
         """Whether it cuts its links within its window."""
         if not self.flap_ns:
             return True
         assert isinstance(self.fault, Partition)
-        purpose, slot = Purpose.FAULT_FLAP.value, now_ns // self.flap_ns
-        draw = uniform(seed, purpose, 0, slot, self.place << _COPY_BITS)
+        purpose, interval = Purpose.FAULT_FLAP.value, now_ns // self.flap_ns
+        draw = uniform(seed, purpose, 0, interval, self.place << _COPY_BITS)
         return bool(draw < (self.fault.flap_share or _FLAP_SHARE))
 
 
@@ -108,9 +108,9 @@ class Links:
             yield _ALWAYS_NS if fault.until_ns is None else fault.until_ns
         for each in self._cuts:
             if each.flap_ns and each.fault.holds(now_ns):
-                slot = now_ns // each.flap_ns
-                yield slot * each.flap_ns
-                yield (slot + 1) * each.flap_ns
+                interval = now_ns // each.flap_ns
+                yield interval * each.flap_ns
+                yield (interval + 1) * each.flap_ns
 
 
 def _ranges_m(scenario: Scenario) -> npt.NDArray[np.float64]:

@@ -41,7 +41,7 @@ _WITHIN_STEPS = CONTACT_PERIODS + 1
 
 
 def settling_ns(scenario: Scenario, hops: int) -> int:
-    """How long entries may take over so many links, when nothing else changes."""
+    """The time that entries may take over so many links, when nothing else changes."""
     radio = scenario.radio
     tries = (
         1 if radio.drop <= 0.0 else math.ceil(math.log(_UNLUCKY) / math.log(min(radio.drop, 0.99)))
@@ -54,13 +54,13 @@ def settling_ns(scenario: Scenario, hops: int) -> int:
 
 
 def _way_ns(scenario: Scenario) -> int:
-    """How long a message is under way at most, without faults."""
+    """The longest time that a message is under way, without faults."""
     radio = scenario.radio
     return round((radio.delay_s + radio.jitter_s + radio.reorder_s) * 1e9)
 
 
 class _Holding(NamedTuple):
-    """What a participant holds by its own messages."""
+    """The entries and the view of a participant, by its own messages."""
 
     version_vector: list[int]
     """The log lengths by incarnation id."""
@@ -84,7 +84,7 @@ class LivenessChecker:
     """Follows the records of one run; most violations come with the ending."""
 
     def __init__(self) -> None:
-        self.complaints: list[str] = []
+        self.violations: list[str] = []
         self.judged: set[str] = set()
         """The rules that this record could have broken."""
         self._opening: Opening | None = None
@@ -128,7 +128,7 @@ class LivenessChecker:
         """Rules and participants of violations that last from step to step."""
 
     def _report(self, rule: str, now_ns: int, who: str, what: str) -> None:
-        self.complaints.append(f"{rule}: t={now_ns * 1e-9:.3f} s: {who}: {what}")
+        self.violations.append(f"{rule}: t={now_ns * 1e-9:.3f} s: {who}: {what}")
 
     def _follow(self, step_record: StepRecord, now_ns: int) -> None:
         state = self._states.get(step_record.name)
@@ -227,7 +227,7 @@ class LivenessChecker:
         return now_ns - max(self._changed_ns, self._quiet_ns()) >= settling_ns(self._scenario, 1)
 
     def _holding(self, name: ParticipantId) -> _Holding | None:
-        """What a participant holds by its last message, and its view; None if it has sent none."""
+        """The entries that a participant holds by its last message, and its view; None if it has sent none."""
         assert self._opening is not None
         state, samples = self._states[name], self._opening.samples_m.shape[0]
         version_vector = _version_vector_of(

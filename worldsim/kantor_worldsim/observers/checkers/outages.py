@@ -26,9 +26,9 @@ class CausedEvent(NamedTuple):
     who: ParticipantId
     kind: ProcessEventKind
     at_ns: int
-    """It does not come before."""
+    """The earliest time at which it comes."""
     mid_step: bool
-    """It waits for a step of the process, which may never come."""
+    """Whether it waits for a step of the process, which may never come."""
 
 
 def caused_events(scenario: Scenario) -> Iterable[CausedEvent]:
@@ -64,7 +64,7 @@ def _moments(fault: OnProcesses) -> Iterable[tuple[ProcessEventKind, int | None]
 
 
 class WrongClocks:
-    """How far the clocks of participants may be ahead of simulated time, by the clock faults."""
+    """Bounds on how far clocks of participants are ahead of simulated time, by the clock faults."""
 
     def __init__(self, scenario: Scenario, *, virtual: bool) -> None:
         """virtual: a clock is wrong exactly within the window of its fault; otherwise it learns of it later."""
@@ -98,6 +98,6 @@ class WrongClocks:
 
 
 def _skew_ns(fault: ClockFault, now_ns: int) -> int:
-    """What a fault has added to a clock: its offset, and so many millionths of the time since it began."""
+    """The error that a fault has added to a clock: its offset, and so many millionths of the time since it began."""
     elapsed_ns = now_ns - fault.from_ns
     return round(fault.offset_s * 1e9) + elapsed_ns * round(fault.rate_ppm) // 10**6

@@ -17,7 +17,7 @@ Place = tuple[float, float]
 
 @kernel
 def count_walls(cells: np.ndarray, u: float, v: float, to_u: float, to_v: float) -> int:
-    """How many walls a straight line crosses: runs of cells that are not free.
+    """Count the walls that a straight line crosses: runs of cells that are not free.
 
     cells: (rows, columns). Coordinates in cells, column axis first. Everything outside the map is one wall.
     The line is followed from its left end, or from its lower one if it is upright, or from the end that is
@@ -68,7 +68,7 @@ class Sight:
         """Whether walls matter at all."""
 
     def walls(self, here_m: Place, there_m: Place) -> int:
-        """How many stand between two places; 0 where they do not matter."""
+        """Count the walls between two places; 0 where they do not matter."""
         if not self.counts or self._frame is None or self._cells is None:
             return 0
         ends = (*self._frame.uv(*here_m), *self._frame.uv(*there_m))

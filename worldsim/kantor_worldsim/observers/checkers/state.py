@@ -131,7 +131,7 @@ class CheckerState(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What the scenario allows, for the kernels."""
+    """Limits of the scenario, for the kernels."""
 
     sample_units: int
     point_units: int
@@ -177,7 +177,7 @@ def has_ledger(scenario: Scenario) -> bool:
 
 
 def arguments(state: CheckerState, limits: Limits, links: LinkTable) -> tuple[Any, ...]:
-    """What the compiled pass takes behind a batch: a NamedTuple of arrays is dear at the border to Python."""
+    """The arguments of the compiled pass behind a batch: a NamedTuple of arrays costs much at the border to Python."""
     return (*state, *limits, *links)
 
 

@@ -42,7 +42,7 @@ from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent
 
 
 class Snapshot(NamedTuple):
-    """How the run stands, cheap to get at any time."""
+    """The state of a run in a few numbers, cheap to get at any time."""
 
     now_ns: int
     energy_spent: int
@@ -54,15 +54,15 @@ class Snapshot(NamedTuple):
     """Deliveries a simulated second over the last ten rows."""
     robots_done: int
     mass_left: float
-    """On a map the share of cells that nobody has seen."""
+    """On a map the share of cells that no robot has seen."""
     distance_m: float | None = None
     """On a map: what all robots have driven."""
 
 
 class RunMetrics:
-    """Follows the records of one run: what is the same whatever is explored.
+    """Follows the records of one run and measures what every kind of mission has.
 
-    A kind of mission adds what it measures: `_begin`, `_attend`, `_row`, `_snapshot_of` and `_measured`.
+    A kind of mission adds its own measures: `_begin`, `_attend`, `_row`, `_snapshot_of` and `_measured`.
     """
 
     columns: ClassVar[tuple[str, ...]]
@@ -86,7 +86,7 @@ class RunMetrics:
         elif isinstance(record, Batch):
             self._follow(record, decoded)
         elif isinstance(record, ProcessEvent):
-            self._befall(record)
+            self._follow_event(record)
         else:
             self._ending = record
             self._row(last=True)
@@ -119,12 +119,12 @@ class RunMetrics:
         self._tally.standing[:, 2] = NEVER
         self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
         self._out_of_range = self._absences = 0
-        self._tolls = Counter[tuple[int, str]]()
+        self._fault_counts = Counter[tuple[int, str]]()
         self._restarts = 0
-        self._epochs = dict.fromkeys(names, 0)
+        self._incarnations = dict.fromkeys(names, 0)
         self._gone: set[ParticipantId] = set()
         self._started_ns: dict[ParticipantId, int] = {}
-        """Who has started again and not stepped yet, and when that was."""
+        """Participants that have started again and not stepped yet, and when that was."""
         self._rejoined_ns: list[int] = []
         self._ending = Ending(0, "cut")
         self._tick = 0
@@ -143,35 +143,35 @@ class RunMetrics:
         self._out_of_range += batch.out_of_range
         self._absences += len(batch.absent)
         for stats in batch.fault_stats:
-            for deed in LINK_COUNTERS:
-                self._tolls[stats.fault, deed] += getattr(stats, deed)
+            for counter in LINK_COUNTERS:
+                self._fault_counts[stats.fault, counter] += getattr(stats, counter)
         if self._started_ns:
             self._note_rejoining(batch)
         if follow(*decoded.columns, *self._arguments):
             self._note_finds(batch)
         self._attend(batch, decoded)
 
-    def _befall(self, incident: ProcessEvent) -> None:
-        """Follow what befell a process."""
-        name, what = incident.who, incident.kind
-        if incident.fault >= 0 and (counter := EVENTS[what].counter):
-            self._tolls[incident.fault, counter] += 1
-        if what in {ProcessEventKind.KILL, ProcessEventKind.LEAVE}:
+    def _follow_event(self, event: ProcessEvent) -> None:
+        """Follow an event of a process."""
+        name, kind = event.who, event.kind
+        if event.fault >= 0 and (counter := EVENTS[kind].counter):
+            self._fault_counts[event.fault, counter] += 1
+        if kind in {ProcessEventKind.KILL, ProcessEventKind.LEAVE}:
             self._gone.add(name)
             self._started_ns.pop(name, None)
-        elif what in TAKE_OVER:
+        elif kind in TAKE_OVER:
             self._restarts += name in self._gone
-            if name in self._epochs:
-                self._take_over(incident)
+            if name in self._incarnations:
+                self._begin_incarnation(event)
             self._gone.discard(name)
 
-    def _take_over(self, incident: ProcessEvent) -> None:
+    def _begin_incarnation(self, incident: ProcessEvent) -> None:
         name = incident.who
         if name in self._gone:
             self._started_ns[name] = incident.now_ns
-        if incident.incarnation <= self._epochs[name]:
+        if incident.incarnation <= self._incarnations[name]:
             return
-        self._epochs[name] = incident.incarnation
+        self._incarnations[name] = incident.incarnation
         place = self._scenario.roster.index(name)
         begin_anew(*self._tally, place, self._units.sample)
 
@@ -183,17 +183,17 @@ class RunMetrics:
 
     @property
     def steps(self) -> int:
-        """Of all robots so far."""
+        """Steps of all robots so far."""
         return self._tally.counts.item(STEPS)
 
     @property
     def deliveries(self) -> int:
-        """So far."""
+        """Copies that have arrived or will, so far."""
         return self._tally.counts.item(DELIVERIES)
 
     @property
     def drops(self) -> int:
-        """So far."""
+        """Copies that were lost, so far."""
         return self._tally.counts.item(DROPS)
 
     def _note_finds(self, batch: Batch) -> None:
@@ -217,19 +217,19 @@ class RunMetrics:
         self._on_row(row)
 
     def _row(self, *, last: bool = False) -> None:
-        """Measure."""
+        """Measure, and add a row."""
         raise NotImplementedError
 
     def _snapshot_of(self) -> dict[str, Any]:
-        """By the last row: `w_ub`, `mass_left` and what else there is in a Glance."""
+        """The fields `w_ub` and `mass_left` of a Snapshot, and others that it may have, by the last row."""
         raise NotImplementedError
 
     def _measured(self) -> dict[str, Any]:
-        """What a Result has beside the counts."""
+        """The fields of a Result beside the counts."""
         raise NotImplementedError
 
     def snapshot(self) -> Snapshot:
-        """How the run stands, by the last row."""
+        """The state of the run, by the last row."""
         if not self.rows:
             return Snapshot(0, 0, 0, 0, 0.0, 0, 0.0, 0, 1.0)
         last = self.rows[-1]
@@ -258,7 +258,7 @@ class RunMetrics:
         record: str,
         complaints: tuple[str, ...],
     ) -> Result:
-        """The summary; call it after the last record. complaints: the checker's."""
+        """The summary; call it after the last record. complaints: the violations that checkers found."""
         scenario, counts = self._scenario, self._tally.counts.tolist()
         robots = scenario.robots.count
         finished = self._tally.standing[:robots, 2].tolist()
@@ -298,12 +298,12 @@ class RunMetrics:
             wall_s=wall_s,
             faults={
                 f"{i} {kind_of(fault)}": FaultCounts(
-                    **{deed: self._tolls[i, deed] for deed in FaultCounts.__struct_fields__}
+                    **{name: self._fault_counts[i, name] for name in FaultCounts.__struct_fields__}
                 )
                 for i, fault in enumerate(scenario.faults)
             },
             restarts=self._restarts,
-            incarnations=sum(self._epochs.values()),
+            incarnations=sum(self._incarnations.values()),
             rejoin_s=Rejoining.of(self._rejoined_ns),
             excess=dict(excess),
             **self._measured(),

@@ -131,7 +131,7 @@ def _sum_up(
     """The pending terms, mass times the distance to a robot, over all samples.
 
     For each robot in paper: by the common weights or its own view; in local: eq. 12, what the robots in
-    its range have shipped and their terms by its own view. near: (m, m) room for who is in whose range.
+    its range have shipped and their terms by its own view. near: (m, m) room for the robots in range of each.
     xyu (3, B), way_m (B,): room for one block of samples, which stays in the cache while all robots and
     views meet in it.
     """
@@ -217,7 +217,7 @@ class DensityMetrics(RunMetrics):
         tally, scenario, whole = self._tally, self._scenario, self._units.whole
         counts = tally.counts.tolist()
         true_rest = _rest(tally.true_left)
-        # The common view: everybody's minimum, or with a ledger the truth.
+        # The common view: the minimum of all views, or with a ledger the truth.
         left = true_rest if scenario.merge == "ledger" else counts[LEAST]
         shipped, shipped_now = tally.shipped.tolist()
         tight = None

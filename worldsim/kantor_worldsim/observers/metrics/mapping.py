@@ -1,7 +1,7 @@
-"""What a mapping run is measured by, from its records alone (Puig, Garcia, Wu, section 4).
+"""Metrics of a mission on a map, from its records alone (Puig, Garcia, Wu, section 4).
 
 The map is cut into 2, 4 … 64 blocks of equal size; of each only the cells that can ever be seen count,
-and a block without any is left out. With w the tick at which a cell was first seen by anybody, and
+and a block without any is left out. With w the tick at which a cell was first seen, and
 w' = t + e for a cell not yet seen, e the distance in cells from its middle to the closest robot:
 
 WTV
@@ -96,13 +96,13 @@ def _merged(finest: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDAr
 
 
 def _variance(sums: npt.NDArray[np.float64], counts: npt.NDArray[np.float64]) -> float:
-    """Of the means of those that have any."""
+    """The variance of the means of regions that have any cells."""
     there = counts > 0.0
     return float(np.var(sums[there] / counts[there])) if there.any() else 0.0
 
 
 class _Pace:
-    """How one robot gets on: what it heads for, and since when it stands still."""
+    """The progress of one robot: its goal, and since when it stands still."""
 
     def __init__(self, xy_m: tuple[float, float]) -> None:
         self.xy_m = xy_m
@@ -163,9 +163,9 @@ class MapMetrics(RunMetrics):
             if pace is not None:
                 self._keep_pace(pace, step_record)
 
-    def _befall(self, incident: ProcessEvent) -> None:
-        super()._befall(incident)
-        self.map_tracker.follow_event(incident)
+    def _follow_event(self, event: ProcessEvent) -> None:
+        super()._follow_event(event)
+        self.map_tracker.follow_event(event)
 
     def _keep_pace(self, pace: _Pace, step_record: StepRecord) -> None:
         """Whether a robot has changed its mind before the move, and whether it moves."""

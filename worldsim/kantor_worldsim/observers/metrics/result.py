@@ -9,7 +9,7 @@ from kantor_protocol.transport.rate_limit import Excess
 
 
 class Bounds(msgspec.Struct, frozen=True):
-    """The three readings of W_UB, see the module."""
+    """W_UB as printed, as a tight bound, and its part of the last tick."""
 
     paper: float
     tight: float | None
@@ -17,7 +17,7 @@ class Bounds(msgspec.Struct, frozen=True):
 
 
 class BytesPerRobotTick(msgspec.Struct, frozen=True):
-    """What a robot puts on the bus in one step, payload only."""
+    """Bytes that a robot puts on the bus in one step, payload only."""
 
     weights: float
     """On its weights key."""
@@ -37,14 +37,14 @@ class ByRegions(msgspec.Struct, frozen=True):
 
 
 class MapResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What came of exploring a map. Only cells that can ever be seen count; ticks are periods."""
+    """The result of exploring a map. Only cells that can ever be seen count; ticks are periods."""
 
     explored: float
-    """Share of them that somebody has seen."""
+    """Share of them that a robot has seen."""
     completed_tick: int | None
-    """When no reachable free cell that somebody had seen had an unknown neighbour any more, or null."""
+    """When no reachable free cell that a robot had seen had an unknown neighbour any more, or null."""
     t95_tick: int | None
-    """When that share was seen by somebody."""
+    """When that share was seen by a robot."""
     t99_tick: int | None
     all_t99_tick: int | None
     """When every robot knew of that share, by itself or from others."""
@@ -53,7 +53,7 @@ class MapResult(msgspec.Struct, frozen=True, kw_only=True):
     longest_m: float
     """By one of them, at most."""
     overlap: float
-    """What robots have seen themselves, summed, over what somebody has seen; minus 1."""
+    """Cells that each robot has seen itself, summed, over cells that any robot has seen; minus 1."""
     bumps: int
     """Moves that ended at a wall."""
     switches: int
@@ -72,9 +72,9 @@ class MapResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FaultCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """What one fault of the scenario did; all 0 says that it never struck.
+    """The effects of one fault of the scenario; all 0 says that it never struck.
 
-    A fault of links counts copies of messages, one of processes how often it did what.
+    A fault of links counts copies of messages, one of processes its events.
     """
 
     dropped: int = 0
@@ -83,7 +83,7 @@ class FaultCounts(msgspec.Struct, frozen=True, kw_only=True):
     doubled: int = 0
     replayed: int = 0
     forged: int = 0
-    """Nobody sent them."""
+    """No participant sent them."""
     killed: int = 0
     started: int = 0
     """Late joiners too."""
@@ -106,7 +106,7 @@ LINK_COUNTERS = ("dropped", "delayed", "doubled", "replayed", "forged")
 
 
 class Rejoining(msgspec.Struct, frozen=True, kw_only=True):
-    """How long participants that had started again took to their first step, in simulated seconds."""
+    """Times from a restart of a participant to its first step, in simulated seconds."""
 
     count: int
     median_s: float
@@ -115,7 +115,7 @@ class Rejoining(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, times_ns: Sequence[int]) -> "Rejoining | None":
-        """Of so many times, if there are any. A quantile is one of them."""
+        """The quantiles of some times, each of which is one of them; None if there are none."""
         if not times_ns:
             return None
         times_s = [time_ns * 1e-9 for time_ns in sorted(times_ns)]
@@ -165,20 +165,20 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     """`whole`, or why it was cut."""
     violations: int
     complaints: tuple[str, ...]
-    """What the checker found, at most the first ten."""
+    """Violations that checkers found, at most the first ten."""
     digest: str
     wall_s: float
     faults: dict[str, FaultCounts] = {}
     """By place in the scenario's list and kind, such as `0 partition`."""
     restarts: int = 0
-    """How often a participant, or world-sim, that had been killed or had left was there again."""
+    """How often a participant, or world-sim, started again after it was killed or had left."""
     incarnations: int = 0
-    """New ones: robots, or the supervisor, that came back and had forgotten what others had of them."""
+    """New ones, of robots or the supervisor that came back without their logs."""
     rejoin_s: Rejoining | None = None
-    """In real seconds on the wall at speed 1; turn by turn to the next step that is due."""
+    """Real seconds in the realtime exchange at speed 1; in virtual time to the next step that is due."""
     map: MapResult | None = None
-    """Of a mission that explores a map; bounds, energy and mass then say nothing but mass_left, the share
-    of cells that nobody has seen."""
+    """Of a mission that explores a map; bounds, energy and mass then mean nothing but mass_left, the share
+    of cells that no robot has seen."""
     excess: dict[ParticipantId, Excess] = {}
-    """Who flooded the bus, and how much of it was not taken in since it was beyond its quota. It counts for no
-    other figure."""
+    """Participants that flooded the bus, and how much was refused beyond their quota. It counts in no other
+    figure."""

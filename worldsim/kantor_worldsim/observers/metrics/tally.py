@@ -11,7 +11,7 @@ from kantor_protocol.base.machine import State
 from kantor_worldsim.radio.channel import DROPPED
 from kantor_worldsim.record import columnar as of
 
-# Slots of Tally.counts and Tally.shipped.
+# Slots of RunTally.counts and RunTally.shipped.
 VIOLATIONS, STEPS, BYTES_WEIGHTS, BYTES_TOTAL, ENERGY, UNITS = 0, 1, 2, 3, 4, 5
 
 
@@ -25,16 +25,16 @@ NEVER = -1
 
 
 class RunTally(NamedTuple):
-    """What is counted batch by batch. n participants, of them m robots; N samples."""
+    """Counters over batches. n participants, of them m robots; N samples."""
 
     counts: npt.NDArray[np.int64]
     """(11,): violations, robot-steps, bytes on weights keys and in all, points and units shipped,
-    deliveries, drops, step of the first contact or _NEVER, units in `least`, messages that
-    incarnations refused that are no more."""
+    deliveries, drops, step of the first contact or NEVER, units in `least`, messages that
+    former incarnations refused."""
     shipped: npt.NDArray[np.float64]
     """(2,) mass times metres: since the start, in this tick."""
     standing: npt.NDArray[np.int64]
-    """(n, 4): refused messages; whether it rests; step in which it saw no weight left, or _NEVER; how far
+    """(n, 4): refused messages; whether it rests; step in which it saw no weight left, or NEVER; how far
     its clock was ahead in its last step."""
     shipped_by: npt.NDArray[np.float64]
     """(m,) since the start."""
@@ -45,7 +45,7 @@ class RunTally(NamedTuple):
     least: npt.NDArray[np.int64]
     """(N,) the least of all views."""
     true_left: npt.NDArray[np.int64]
-    """(N,) first weight minus everybody's spending; negative where a sample was filled twice."""
+    """(N,) first weight minus all spending; negative where a sample was filled twice."""
 
 
 @kernel
@@ -75,7 +75,7 @@ def begin_anew(
     place: int,
     units: int,
 ) -> None:
-    """Who drives a body has forgotten all: its view is full, it rests no more, it has refused nothing."""
+    """A new incarnation drives a body: its view is full, it does not rest, it has refused nothing."""
     tally = RunTally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left)
     counts[REFUSED_BEFORE] += standing[place, 0]
     standing[place, 0], standing[place, 1], standing[place, 2] = 0, 0, NEVER
@@ -119,7 +119,7 @@ def follow(
     samples_m: np.ndarray,
     whole: int,
 ) -> int:
-    """Count one batch, see Reading and Tally; how many targets were found in it.
+    """Count one batch, see ColumnarBatch and RunTally; the number of targets found in it.
 
     samples_m: (N, 2) as they are now.
     """
@@ -135,7 +135,7 @@ def follow(
         counts[VIOLATIONS] += step_record[of.VIOLATIONS]
         if (
             step_record[of.TOO_FAST] > 0 and step_record[of.SKEW_NS] > standing[place, 3]
-        ):  # see the checker's rule
+        ):  # as in the rule `ruling` of the checker
             counts[VIOLATIONS] -= 1
         standing[place, 3] = step_record[of.SKEW_NS]
         standing[place, 0] = step_record[of.REFUSED]

@@ -1,4 +1,4 @@
-"""What it takes at most to ship the mass that is left: a feasible plan, found in one pass.
+"""An upper bound on the cost of shipping the mass that is left: a feasible plan, found in one pass.
 
 Theorem 2 (Kabir & Lee, eq. 11) ships the whole rest once for every robot. When no sample was filled
 twice, every robot has the same share of it to ship, and any plan in which each ships its share gives a
@@ -15,7 +15,7 @@ import numpy.typing as npt
 from kantor_protocol.base.kernels import kernel
 
 _RATE = 0.05
-"""How far a price moves, as a share of the mean distance, for an excess of one share."""
+"""The step of a price, as a share of the mean distance, for an excess of one share."""
 _BLOCK = 512
 """Samples whose distances to all robots are taken at a time."""
 _ROUNDS_FIRST = 50

@@ -1,4 +1,4 @@
-"""The exact Wasserstein distance that the bounds of Theorems 1-3 are held against.
+"""The exact Wasserstein distance with which the bounds of Theorems 1-3 are compared.
 
 Solved as a linear program by POT's network simplex. Seconds for thousands of points, so it is asked
 for at a few moments only; POT is an extra (`pip install kantor[exact]`).
