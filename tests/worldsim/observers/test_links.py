@@ -16,7 +16,7 @@ from kantor_protocol.base.varint import put_uint
 from kantor_protocol.scenario.faults.base import Fault
 from kantor_protocol.scenario.faults.links import OneWay, Partition, Range
 from kantor_protocol.scenario.schema import RadioOptions, Scenario
-from kantor_protocol.wire.version_vector import slots_told
+from kantor_protocol.wire.version_vector import covered_ids
 from kantor_worldsim.engine.process_faults import ProcessFaults, schedule_of
 from kantor_worldsim.observers.checkers.links import Links
 from kantor_worldsim.observers.checkers.outages import WrongClocks, caused_events
@@ -143,11 +143,11 @@ def test_walls_do_not_matter_without_a_map_or_an_option() -> None:
 def test_events_of_drawn_missions_are_those_of_the_schedule(first: int) -> None:
     for seed in range(first, first + 50):
         scenario = draw(seed)
-        caused = {(e.at_ns, e.fault, e.who, e.what, e.mid_step) for e in caused_events(scenario)}
+        caused = {(e.at_ns, e.fault, e.who, e.kind, e.mid_step) for e in caused_events(scenario)}
         scheduled = schedule_of(scenario)
 
         assert len(caused) == len(scheduled)
-        assert caused == {(s.at_ns, s.fault, s.who, s.what, s.mid_step) for s in scheduled}
+        assert caused == {(s.at_ns, s.fault, s.who, s.kind, s.mid_step) for s in scheduled}
 
 
 @pytest.mark.parametrize("first", range(0, 200, 50))
@@ -182,7 +182,7 @@ def packed(numbers: list[int]) -> bytes:
 def test_version_vectors_are_read_as_participants_read_them(
     content: bytes, participants: int, *, claims: bool
 ) -> None:
-    count = slots_told(content, participants, claims=claims)
+    count = covered_ids(content, participants, claims=claims)
 
     assert (incarnations_of(content, participants, claims=claims) or None) == count
     lengths = read_lengths(content, participants, claims=claims)
