@@ -183,7 +183,7 @@ def world_sim_forgets_what_was_under_way(patch: Patch) -> None:
 def link_fault_ends_early(patch: Patch) -> None:
     def changed(table: FaultTable) -> None:
         window = table.rules[:, [rules._FROM_NS, rules._UNTIL_NS]]
-        lasting = window[:, 1] < rules.NEVER_NS
+        lasting = window[:, 1] < rules.DUE_MAX_NS
         table.rules[lasting, rules._UNTIL_NS] -= (window[lasting, 1] - window[lasting, 0]) // 10
 
     _with_table(patch, changed)

@@ -95,7 +95,8 @@ def a_new_incarnation_leaps(patch: Patch) -> None:
         def made(self: DensityRobot, *arguments: Any) -> None:
             init(self, *arguments)
             if self._step:
-                self._now_ns, self._period_ns = 0, 10 * self._period_ns
+                timer = self._timer
+                timer._last_ns, timer._period_ns = 0, 10 * timer._period_ns
 
         return made
 
