@@ -15,9 +15,11 @@ from kantor_fleet.campaign.process_scenarios import (
 )
 from kantor_fleet.campaign.processes import ProcessMission, Soak, Terms, Totals
 from kantor_fleet.campaign.rss_monitor import Grown
+from kantor_fleet.execution.in_process_team import play
 from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM
 from kantor_protocol.scenario.faults.base import Fault
 from kantor_protocol.scenario.faults.processes import Impostor, Kill, OnProcesses, Pause
+from kantor_worldsim.world.world import WorldSetup
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
@@ -70,6 +72,8 @@ def test_a_storm_over_real_processes_breaks_no_rule(kantor: "Kantor") -> None:
 
     How soon they rejoin is a bound of soaks.
     """
+    scenario = process_scenario(EVERYTHING, 8.0, SHORT_S)
+    play(scenario, 0, WorldSetup.of(scenario, 0), [])  # a process that compiles kernels grows
     finished = kantor(
         "campaign", "--processes", "--seeds", f"{EVERYTHING}:{EVERYTHING + 1}", "--storm", SHORT_S,
         "--rejoin", EVENT_LIMIT_S,
@@ -97,12 +101,12 @@ def test_the_first_violation_ends_a_soak_with_all_that_repeats_it(
 ) -> None:
     """Seed, commit, command, and the folder that is kept."""
 
-    def fly(seed: int, _terms: Terms, folder: Path, *_: object) -> ProcessMission:
+    def run_mission(seed: int, _terms: Terms, folder: Path, *_: object) -> ProcessMission:
         folder.mkdir(parents=True)
         wrong = ("energy: t=1.000 s: r1: spends what it has not",) if seed == 2 else ()
         return ProcessMission(seed, "wall", "done", 1.0, wrong, Counter(kill=3), (0.5,), (1.0,))
 
-    monkeypatch.setattr(processes, "fly", fly)
+    monkeypatch.setattr(processes, "run_mission", run_mission)
     monkeypatch.setattr(processes, "warm_up", lambda: None)
     code = processes.soak(Soak(range(5), tmp_path, Terms(8.0, 40.0)))
 
