@@ -254,7 +254,7 @@ def _count_first_incarnations(version_vector: bytes, roster: int, parts: int) ->
 
 @mutant("a version vector with a second incarnation is malformed", has(Kill, disk=("torn", "lost")))
 def second_incarnation_refused(patch: Patch) -> None:
-    replace_kernel(patch, reader, "count_slots", _count_first_incarnations)
+    replace_kernel(patch, reader, "count_ids", _count_first_incarnations)
 
 
 def _count_any(version_vector: bytes, roster: int, parts: int) -> int:
@@ -267,4 +267,4 @@ def _count_any(version_vector: bytes, roster: int, parts: int) -> int:
 
 @mutant("a version vector may have any number of numbers", has(Hostile))
 def version_vector_of_any_length(patch: Patch) -> None:
-    replace_kernel(patch, reader, "count_slots", _count_any)
+    replace_kernel(patch, reader, "count_ids", _count_any)
