@@ -12,49 +12,16 @@ import pytest
 from hypothesis import settings
 
 from support.limits import EVENT_LIMIT_S
+from support.tiers import LONGEST_FIRST, tier_of
 
 settings.register_profile("kantor", deadline=None, print_blob=True)
-settings.register_profile("fast", settings.get_profile("kantor"), max_examples=25)
+settings.register_profile("fast", settings.get_profile("kantor"), max_examples=10)
 settings.load_profile("kantor")
-
-TESTS = Path(__file__).parent
-TIERS = ("unit", "processes", "papers", "campaign", "containers", "fuzz")
-TIER_OF_PLACE = {
-    **dict.fromkeys(("agent", "fleet", "protocol", "supervisor", "worldsim"), "unit"),
-    **{tier: tier for tier in TIERS[1:]},
-    "fleet/test_report.py": "processes",
-    "fleet/test_report_of_maps.py": "processes",
-    "fleet/test_reproduce.py": "papers",
-    "fleet/test_reproduce_maps.py": "papers",
-    "fleet/test_reproduce_resilience.py": "papers",
-    "test_architecture.py": "unit",
-    "test_digests.py": "processes",
-    "test_readme.py": "processes",
-    "test_tiers.py": "unit",
-}
-"""The tier of a folder or file of this folder; the longest path counts, and a mark of the test above all."""
-LONGEST_FIRST = ("containers", "papers", "processes", "campaign", "fuzz", "unit")
-"""Tiers in the order in which they start: a long test that starts last leaves the other worker idle."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """`--rewrite` brings the transcripts up to date."""
     parser.addoption("--rewrite", action="store_true", help="rewrite transcripts of robots")
-
-
-def tier_of(item: pytest.Item) -> str:
-    """The tier of a test: its own mark, `processes` if it runs the command, or that of its place."""
-    own = [mark.name for mark in item.iter_markers() if mark.name in TIERS]
-    if len(own) > 1:
-        raise pytest.UsageError(f"{item.nodeid}: several tiers: {', '.join(own)}; keep one")
-    if own:
-        return own[0]
-    path = item.path.relative_to(TESTS)
-    places = [place.as_posix() for place in (path, *path.parents)]
-    tier = next((TIER_OF_PLACE[place] for place in places if place in TIER_OF_PLACE), None)
-    if tier is None:
-        raise pytest.UsageError(f"{item.nodeid}: no tier; add {path} to tests/conftest.py")
-    return "processes" if tier == "unit" and "kantor" in item.fixturenames else tier
 
 
 @pytest.hookimpl(tryfirst=True)

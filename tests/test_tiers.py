@@ -2,7 +2,7 @@
 
 import pytest
 
-from conftest import TIERS, tier_of
+from support.tiers import TIER_OF_PLACE, TIERS, tier_of
 
 
 def test_every_test_has_exactly_one_tier(request: pytest.FixtureRequest) -> None:
@@ -21,10 +21,12 @@ def test_two_tiers_are_refused(request: pytest.FixtureRequest) -> None:
 def test_a_folder_without_a_tier_is_refused(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("conftest.TIER_OF_PLACE", {})
+    monkeypatch.delitem(TIER_OF_PLACE, "test_tiers.py")
     monkeypatch.setattr(request.node, "own_markers", [])
 
-    with pytest.raises(pytest.UsageError, match=r"no tier; add test_tiers.py to tests/conftest.py"):
+    with pytest.raises(
+        pytest.UsageError, match=r"no tier; add test_tiers.py to tests/support/tiers.py"
+    ):
         tier_of(request.node)
 
 

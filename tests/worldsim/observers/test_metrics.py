@@ -336,6 +336,7 @@ def full_runs() -> Callable[[str], Result]:
     return run
 
 
+@pytest.mark.papers
 @pytest.mark.xdist_group("full-runs")
 @pytest.mark.parametrize(
     "name", ["paper-centralized", "paper-decentralized", "paper-timevarying", "fleet"]
@@ -351,6 +352,7 @@ def test_weights_cost_at_most_eight_bytes_a_robot_and_tick(
     assert (result.ended, result.violations, result.messages_refused) == ("done", 0, 0)
 
 
+@pytest.mark.papers
 @pytest.mark.xdist_group("full-runs")
 def test_result_has_the_stable_names(full_runs: Callable[[str], Result]) -> None:
     """result.json is read by other programs: names come, none goes."""
