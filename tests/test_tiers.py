@@ -11,10 +11,13 @@ def test_every_test_has_exactly_one_tier(request: pytest.FixtureRequest) -> None
         assert marks == [tier_of(item)], item.nodeid
 
 
-def test_two_tiers_are_refused(request: pytest.FixtureRequest) -> None:
-    request.node.add_marker("papers")
+def test_two_tiers_are_refused(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    marks = [pytest.mark.unit.mark, pytest.mark.papers.mark]
+    monkeypatch.setattr(request.node, "own_markers", marks)
 
-    with pytest.raises(pytest.UsageError, match=r"several tiers: .*; keep one"):
+    with pytest.raises(pytest.UsageError, match=r"several tiers: unit, papers; keep one"):
         tier_of(request.node)
 
 
