@@ -13,7 +13,7 @@ from kantor_fleet.campaign.process_scenarios import (
     is_lockstep,
     process_scenario,
 )
-from kantor_fleet.campaign.processes import ProcessMission, Soak, Terms, Totals
+from kantor_fleet.campaign.processes import ProcessMission, Soak, SoakTerms, SoakTotals
 from kantor_fleet.campaign.rss_monitor import Grown
 from kantor_fleet.execution.in_process_team import play
 from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM
@@ -101,14 +101,14 @@ def test_the_first_violation_ends_a_soak_with_all_that_repeats_it(
 ) -> None:
     """Seed, commit, command, and the folder that is kept."""
 
-    def run_mission(seed: int, _terms: Terms, folder: Path, *_: object) -> ProcessMission:
+    def run_mission(seed: int, _terms: SoakTerms, folder: Path, *_: object) -> ProcessMission:
         folder.mkdir(parents=True)
         wrong = ("energy: t=1.000 s: r1: spends what it has not",) if seed == 2 else ()
         return ProcessMission(seed, "wall", "done", 1.0, wrong, Counter(kill=3), (0.5,), (1.0,))
 
     monkeypatch.setattr(processes, "run_mission", run_mission)
     monkeypatch.setattr(processes, "warm_up", lambda: None)
-    code = processes.soak(Soak(range(5), tmp_path, Terms(8.0, 40.0)))
+    code = processes.soak(Soak(range(5), tmp_path, SoakTerms(8.0, 40.0)))
 
     told = capsys.readouterr().out
     assert code == 1
@@ -128,7 +128,7 @@ def test_a_soak_is_met_if_all_are_back_in_time_and_memory_is_flat(
     rejoined_s: float, grown_mb: float, *, met: bool
 ) -> None:
     """The bounds are those that the totals print."""
-    totals = Totals()
+    totals = SoakTotals()
     grown = {"robot": Grown(1, 1000, grown_mb, grown_mb, 100.0)}
     totals.add(ProcessMission(0, "wall", "done", 40.0, (), Counter(), (rejoined_s,), grown=grown))
     assert totals.met is met

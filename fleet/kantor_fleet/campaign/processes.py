@@ -59,7 +59,7 @@ _ORPHANS_S = 60.0
 """How long a process that was killed may be seen yet."""
 
 
-class Terms(NamedTuple):
+class SoakTerms(NamedTuple):
     """How storms are drawn and missions are run."""
 
     speed: float
@@ -73,7 +73,7 @@ class Soak(NamedTuple):
 
     seeds: Sequence[int]
     folder: Path
-    terms: Terms
+    terms: SoakTerms
     minutes: float | None = None
     """Real time after which no further mission begins."""
     rejoin_s: float = REJOIN_S
@@ -103,7 +103,7 @@ class ProcessMission(NamedTuple):
 def soak(config: Soak) -> Exit:
     """Run mission after mission, up to the first that breaks a rule; the exit code."""
     started_s = time.monotonic()
-    totals = Totals(config.rejoin_s)
+    totals = SoakTotals(config.rejoin_s)
     with Interrupts() as interrupts, _own_temporary_folder() as temporary:
         print(f"warming up; {config.terms.storm_s:g} s of storm in each mission", flush=True)
         warm_up()
@@ -127,13 +127,13 @@ def soak(config: Soak) -> Exit:
     return interrupts.code or (Exit.DONE if totals.met else Exit.NOT_MET)
 
 
-def replay(seed: int, folder: Path, terms: Terms) -> Exit:
+def replay(seed: int, folder: Path, terms: SoakTerms) -> Exit:
     """Run the mission of one seed, and leave its run folder."""
     with Interrupts() as interrupts, _own_temporary_folder() as temporary:
         warm_up()
         place = folder / FOLDER / f"seed-{seed}"
         mission = run_mission(seed, terms, place, interrupts, temporary)
-    totals = Totals()
+    totals = SoakTotals()
     totals.add(mission)
     print(_line(mission, totals, mission.wall_s))
     for violation in mission.complaints:
@@ -143,7 +143,7 @@ def replay(seed: int, folder: Path, terms: Terms) -> Exit:
 
 
 def run_mission(
-    seed: int, terms: Terms, folder: Path, stopped: Interrupts, temporary: Path
+    seed: int, terms: SoakTerms, folder: Path, stopped: Interrupts, temporary: Path
 ) -> ProcessMission:
     """Run and check one mission. folder: for its files, emptied before. temporary: where nothing may be left."""
     started_s = time.monotonic()
@@ -313,7 +313,7 @@ def _back_s(
     return tuple(back_s[False]), tuple(back_s[True])
 
 
-class Totals:
+class SoakTotals:
     """Sums over missions."""
 
     def __init__(self, rejoin_s: float = REJOIN_S) -> None:
@@ -428,7 +428,7 @@ def _quantiles(times_s: list[float], bound_s: float | None = None) -> str:
     return f"{text}; {'below' if p99 < bound_s else 'NOT BELOW'} {bound_s:g} s"
 
 
-def _line(mission: ProcessMission, totals: Totals, spent_s: float) -> str:
+def _line(mission: ProcessMission, totals: SoakTotals, spent_s: float) -> str:
     """A mission in one line, with the signals of the campaign so far."""
     minutes, seconds = divmod(round(spent_s), 60)
     verdict = "all rules held" if not mission.complaints else "VIOLATION"

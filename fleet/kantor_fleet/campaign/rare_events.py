@@ -48,7 +48,7 @@ class _Detector:
     def batch(self, batch: Batch) -> None:
         """Follow a batch, after its steps."""
 
-    def process_event(self, incident: ProcessEvent) -> None:
+    def process_event(self, event: ProcessEvent) -> None:
         """Follow an event of a process."""
 
 
@@ -109,12 +109,12 @@ class _Deliveries(_Detector):
         if sequence < newest and link[0] in self._restarted:
             self.seen["stale word after a restart"] += 1
 
-    def process_event(self, incident: ProcessEvent) -> None:
-        if incident.kind == "start" and incident.step > 0:
-            self._restarted.add(incident.who)
-            self._refused[incident.who] = 0
-            if incident.incarnation:
-                self._born[incident.who] = incident.step
+    def process_event(self, event: ProcessEvent) -> None:
+        if event.kind == "start" and event.step > 0:
+            self._restarted.add(event.who)
+            self._refused[event.who] = 0
+            if event.incarnation:
+                self._born[event.who] = event.step
 
 
 class _Restarts(_Detector):
@@ -145,10 +145,10 @@ class _Restarts(_Detector):
                 by_supervisor = decision.source == SUPERVISOR
                 self._due_ns[by_supervisor] = max(self._due_ns[by_supervisor], decision.due_ns)
 
-    def process_event(self, incident: ProcessEvent) -> None:
-        who, now_ns = incident.who, incident.now_ns
-        if incident.kind == "kill":
-            fault = self.scenario.faults[incident.fault]
+    def process_event(self, event: ProcessEvent) -> None:
+        who, now_ns = event.who, event.now_ns
+        if event.kind == "kill":
+            fault = self.scenario.faults[event.fault]
             if isinstance(fault, Kill) and fault.mid_step:
                 self.seen["death between note and answer"] += 1
             self.seen["two dead at once"] += bool(self._dead - {who})
@@ -157,7 +157,7 @@ class _Restarts(_Detector):
             if who == WORLD_SIM and max(self._due_ns.values()) > now_ns:
                 self.seen["world-sim restarted with messages under way"] += 1
             self._dead.add(who)
-        elif incident.kind == "start":
+        elif event.kind == "start":
             self._dead.discard(who)
             if any(cut.from_ns <= now_ns < (cut.until_ns or 2**63) for cut in self._cuts):
                 self.seen["restart during a partition"] += 1
@@ -191,11 +191,11 @@ class _Recoveries(_Detector):
             self.seen["log of a former incarnation came back"] += 1
             del self._lost[name]
 
-    def process_event(self, incident: ProcessEvent) -> None:
-        if incident.kind != "start":
+    def process_event(self, event: ProcessEvent) -> None:
+        if event.kind != "start":
             return
-        who = incident.who
-        if incident.fault >= 0 and isinstance(self.scenario.faults[incident.fault], Late):
+        who = event.who
+        if event.fault >= 0 and isinstance(self.scenario.faults[event.fault], Late):
             known = [
                 self._version_vector(body)
                 for name, body in self._last_bodies.items()
@@ -208,9 +208,9 @@ class _Recoveries(_Detector):
             ]
             if any(most):
                 self._wanted[who] = most
-        elif incident.incarnation and who in self._last_bodies:
+        elif event.incarnation and who in self._last_bodies:
             count = len(self._names)
-            self._lost[who] = (incident.incarnation - 1) * count + self._names.index(who)
+            self._lost[who] = (event.incarnation - 1) * count + self._names.index(who)
 
     def _version_vector(self, body: bytes) -> list[int]:
         """The log lengths that the sender of a message holds."""

@@ -55,7 +55,7 @@ def campaign(
             fail(Exit.USAGE, f"--storm {storm:g}: give 10 to 600 seconds")
         if not rejoin > 0.0:
             fail(Exit.USAGE, f"--rejoin {rejoin:g}: give a time above 0")
-        terms = on_processes.Terms(speed, storm)
+        terms = on_processes.SoakTerms(speed, storm)
         if replay is not None:
             return on_processes.replay(replay, out, terms)
         drawn = numbered(seeds or ("18" if minutes is None else "1000"))

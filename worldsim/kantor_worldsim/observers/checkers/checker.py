@@ -234,28 +234,28 @@ class Checker:
                 what = f"its clock is {step_record.skew_ns} ns ahead, by its faults {most_ns}"
                 self._report("clock", step_record.name, what)
 
-    def _follow_event(self, incident: ProcessEvent) -> None:
+    def _follow_event(self, process_event: ProcessEvent) -> None:
         """Follow an event of a process."""
-        self._pass_time(incident.now_ns)
-        name, kind = incident.who, incident.kind
+        self._pass_time(process_event.now_ns)
+        name, kind = process_event.who, process_event.kind
         if name not in self._stopped:
             self._report("incident", name, "not in the roster")
             return
-        self._check_cause(incident)
+        self._check_cause(process_event)
         if EVENTS[kind].ended_by is not None:
-            self._stop(name, kind, incident.now_ns)
+            self._stop(name, kind, process_event.now_ns)
         elif kind in TAKE_OVER and name in self._places:
-            self._check_start(incident, self._places[name])
+            self._check_start(process_event, self._places[name])
         for cause in tuple(self._stopped[name]):
             if EVENTS[cause].ended_by == kind or kind in TAKE_OVER:
                 del self._stopped[name][cause]
         self._note_stopped(name)
         if self._map_checker is not None:
-            self._map_checker.follow_event(incident)
+            self._map_checker.follow_event(process_event)
 
-    def _check_cause(self, incident: ProcessEvent) -> None:
+    def _check_cause(self, process_event: ProcessEvent) -> None:
         """A fault causes the event, or it is one that needs none."""
-        fault, name, kind = incident.fault, incident.who, incident.kind
+        fault, name, kind = process_event.fault, process_event.who, process_event.kind
         if kind is ProcessEventKind.IMPOSTOR_ADMITTED:
             self._report("epoch", name, "an impostor was let in")
             kind = ProcessEventKind.IMPOSTOR_REFUSED
@@ -266,7 +266,7 @@ class Checker:
         caused = self._due.pop((fault, name, kind), None)
         if caused is None:
             self._report("incident", name, f"{kind}, which fault {fault} does not cause, or once")
-        elif incident.now_ns < caused.at_ns:
+        elif process_event.now_ns < caused.at_ns:
             self._report("incident", name, f"{kind} before {caused.at_ns * 1e-9:.3f} s")
 
     def _stop(self, name: ParticipantId, kind: ProcessEventKind, now_ns: int) -> None:
@@ -278,28 +278,30 @@ class Checker:
             since_ns = min(self._stopped[name].values(), default=NOT_STOPPED)
             self._state.participants[self._places[name], STOPPED_NS] = since_ns
 
-    def _check_start(self, incident: ProcessEvent, place: int) -> None:
+    def _check_start(self, process_event: ProcessEvent, place: int) -> None:
         """A process starts to drive a body, as the incarnation before it or as the next one."""
         participant = self._state.participants[place]
         steps, incarnation = (
             participant.item(STEPS),
             participant.item(INCARNATION_ID) // len(self._names),
         )
-        disk = self._disk_of(incident.fault)
+        disk = self._disk_of(process_event.fault)
         expected = {incarnation}
         if steps and disk != "kept":
             expected = {incarnation + 1} if disk == "lost" else {incarnation, incarnation + 1}
-        if incident.incarnation not in expected:
-            what = f"incarnation {incident.incarnation} after {incarnation}, its disk is {disk}"
-            self._report("epoch", incident.who, what)
+        if process_event.incarnation not in expected:
+            what = (
+                f"incarnation {process_event.incarnation} after {incarnation}, its disk is {disk}"
+            )
+            self._report("epoch", process_event.who, what)
         # The last step of an incarnation may be in its log and not in the record.
-        ahead = 1 if incident.incarnation == incarnation else 0
-        if not steps <= incident.step <= steps + ahead:
-            what = f"goes on from step {incident.step}, its last was {steps}"
-            self._report("epoch", incident.who, what)
-        self._drop_undelivered(place, incident.now_ns)
-        if incident.incarnation > incarnation:
-            self._begin_incarnation(incident, place)
+        ahead = 1 if process_event.incarnation == incarnation else 0
+        if not steps <= process_event.step <= steps + ahead:
+            what = f"goes on from step {process_event.step}, its last was {steps}"
+            self._report("epoch", process_event.who, what)
+        self._drop_undelivered(place, process_event.now_ns)
+        if process_event.incarnation > incarnation:
+            self._begin_incarnation(process_event, place)
 
     def _disk_of(self, fault: int) -> str:
         """The disk that a fault leaves; unknown for a process that came without one."""
@@ -321,12 +323,12 @@ class Checker:
         deliveries[: kept.shape[0]] = kept
         participant[UNDER_WAY] = kept.shape[0]
 
-    def _begin_incarnation(self, incident: ProcessEvent, place: int) -> None:
+    def _begin_incarnation(self, process_event: ProcessEvent, place: int) -> None:
         """A new incarnation knows nothing: its vector is full, it holds no entry, its own log is empty."""
         if self._limits.ledger and self._state.participants[place, VECTOR_SENT]:
-            self._check_view(incident.who, place)
+            self._check_view(process_event.who, place)
         roster = len(self._names)
-        incarnation_id = incident.incarnation * roster + place
+        incarnation_id = process_event.incarnation * roster + place
         while incarnation_id >= self._state.shipped.shape[0]:
             self._keep(self._state.with_incarnations(roster))
         state = self._state

@@ -175,20 +175,20 @@ class LivenessChecker:
             self._reported.add((rule, step_record.name))
             self._report(rule, step_record.now_ns, step_record.name, what)
 
-    def _follow_event(self, incident: ProcessEvent) -> None:
-        self._changed_ns = max(self._changed_ns, incident.now_ns)
-        state = self._states.get(incident.who)
+    def _follow_event(self, event: ProcessEvent) -> None:
+        self._changed_ns = max(self._changed_ns, event.now_ns)
+        state = self._states.get(event.who)
         if state is None:
             return
-        if incident.kind in {ProcessEventKind.KILL, ProcessEventKind.LEAVE}:
+        if event.kind in {ProcessEventKind.KILL, ProcessEventKind.LEAVE}:
             state.alive = False
-        elif incident.kind in TAKE_OVER:
+        elif event.kind in TAKE_OVER:
             state.alive = True
             roster = len(self._names)
-            incarnation_id = incident.incarnation * roster + state.incarnation_id % roster
+            incarnation_id = event.incarnation * roster + state.incarnation_id % roster
             if incarnation_id != state.incarnation_id:
                 state.incarnation_id, state.last, state.lowered = incarnation_id, None, []
-                state.unheard_steps = -ack_timeout_steps(incident.who, self._scenario)
+                state.unheard_steps = -ack_timeout_steps(event.who, self._scenario)
 
     def _end(self, ending: Ending) -> None:
         if ending.reason != "interrupted":

@@ -84,10 +84,10 @@ class MapChecker:
             if not self._is_free(name):
                 self._report("wall", name, "starts where it is not free")
 
-    def follow_event(self, incident: ProcessEvent) -> None:
+    def follow_event(self, event: ProcessEvent) -> None:
         """Follow an event of a process."""
         if self._own_tracker:
-            self._map_tracker.follow_event(incident)
+            self._map_tracker.follow_event(event)
 
     def check(self, batch: Batch, decoded: DecodedRecord) -> int:
         """Follow one batch; the number of violations beyond those that are kept as texts."""

@@ -165,13 +165,13 @@ class RunMetrics:
                 self._begin_incarnation(event)
             self._gone.discard(name)
 
-    def _begin_incarnation(self, incident: ProcessEvent) -> None:
-        name = incident.who
+    def _begin_incarnation(self, process_event: ProcessEvent) -> None:
+        name = process_event.who
         if name in self._gone:
-            self._started_ns[name] = incident.now_ns
-        if incident.incarnation <= self._incarnations[name]:
+            self._started_ns[name] = process_event.now_ns
+        if process_event.incarnation <= self._incarnations[name]:
             return
-        self._incarnations[name] = incident.incarnation
+        self._incarnations[name] = process_event.incarnation
         place = self._scenario.roster.index(name)
         begin_anew(*self._tally, place, self._units.sample)
 

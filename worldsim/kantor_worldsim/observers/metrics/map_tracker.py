@@ -216,13 +216,13 @@ class MapTracker:
         scenario = self._scenario
         return OccupancyLog(self.frame, scenario.sensor, ranges=scenario.learns_ranges)
 
-    def _begin_incarnation(self, incident: ProcessEvent) -> None:
+    def _begin_incarnation(self, process_event: ProcessEvent) -> None:
         """A new incarnation of a robot knows nothing, and writes a new log."""
         names = self._scenario.roster
-        if incident.who not in names:
+        if process_event.who not in names:
             return
-        who, roster = names.index(incident.who), len(names)
-        incarnation_id = incident.incarnation * roster + who
+        who, roster = names.index(process_event.who), len(names)
+        incarnation_id = process_event.incarnation * roster + who
         if not self.state.incarnation_ids[who] < incarnation_id <= INCARNATIONS_MAX * roster + who:
             return
         while incarnation_id >= self.state.version_vector.shape[1]:
