@@ -798,7 +798,7 @@ def befell(records: Records, what: str = "") -> list[ProcessEvent]:
     ]
 
 
-def changed(records: Records, kind: str, **values: Any) -> list[Record]:
+def changed(records: Records, kind: str, /, **values: Any) -> list[Record]:
     """The records with the first incident of a kind changed."""
     incident = befell(records, kind)[0]
     return put(records, incident, msgspec.structs.replace(incident, **values))
