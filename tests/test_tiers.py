@@ -11,8 +11,11 @@ def test_every_test_has_exactly_one_tier(request: pytest.FixtureRequest) -> None
         assert marks == [tier_of(item)], item.nodeid
 
 
-def test_two_tiers_are_refused(request: pytest.FixtureRequest) -> None:
-    request.node.add_marker("papers")
+def test_two_tiers_are_refused(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tiers = [pytest.mark.unit.mark, pytest.mark.papers.mark]
+    monkeypatch.setattr(request.node, "own_markers", tiers)
 
     with pytest.raises(pytest.UsageError, match=r"several tiers: .*; keep one"):
         tier_of(request.node)
@@ -21,7 +24,7 @@ def test_two_tiers_are_refused(request: pytest.FixtureRequest) -> None:
 def test_a_folder_without_a_tier_is_refused(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("conftest.TIER_OF_PLACE", {})
+    monkeypatch.setitem(tier_of.__globals__, "TIER_OF_PLACE", {})
     monkeypatch.setattr(request.node, "own_markers", [])
 
     with pytest.raises(pytest.UsageError, match=r"no tier; add test_tiers.py to tests/conftest.py"):

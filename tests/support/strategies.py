@@ -67,7 +67,7 @@ def examples(count: int) -> settings:
 
     Nothing is timed: the first call may compile kernels, and the machine may have other work.
     """
-    share = settings().max_examples / settings.get_profile("kantor").max_examples
+    share = settings().max_examples / settings.get_profile("default").max_examples
     return settings(
         max_examples=max(1, round(count * share)),
         deadline=None,

@@ -797,9 +797,9 @@ def befell(records: Records, what: str = "") -> list[ProcessEvent]:
     ]
 
 
-def changed(records: Records, kind: str, **values: Any) -> list[Record]:
+def changed(records: Records, of_kind: str, **values: Any) -> list[Record]:
     """The records with the first incident of a kind changed."""
-    incident = befell(records, kind)[0]
+    incident = befell(records, of_kind)[0]
     return put(records, incident, msgspec.structs.replace(incident, **values))
 
 
@@ -1045,7 +1045,7 @@ def _speaks_as_another_incarnation_without_a_ledger(records: Records) -> list[Re
 
 @breaks("epoch", run=COPIED)
 def _impostor_is_let_in(records: Records) -> list[Record]:
-    return changed(records, "pretend", what="let in")
+    return changed(records, "pretend", kind="let in")
 
 
 @breaks("refusal")
