@@ -154,7 +154,7 @@ def _run(setting: Setting, site: WorldSetup, *, recorded: bool) -> Cost:
     simulation = Simulation(scenario, 0, site, [recording.observe] if recording else [])
     exchange = InProcessExchange(team(scenario, 0, site))
     start_s = time.process_time()
-    simulate(simulation, exchange, 0, lambda: False)
+    simulate(simulation, exchange, 0, lambda: False, exchange)
     cpu_s = time.process_time() - start_s
     steps = setting.ticks * scenario.robots.count
     return Cost(steps / cpu_s, _heard(recording.finish()) if recording else 0.0)

@@ -35,7 +35,8 @@ def measure(*, quick: bool) -> Table:
         site = WorldSetup.of(scenario, 0)
         recording = Recording(scenario, 0, "in-process")
         simulation = Simulation(scenario, 0, site, [recording.observe])
-        simulate(simulation, InProcessExchange(team(scenario, 0, site)), 0, lambda: False)
+        exchange = InProcessExchange(team(scenario, 0, site))
+        simulate(simulation, exchange, 0, lambda: False, exchange)
         wire = recording.finish().bytes_per_robot_tick
         whole = 8 * site.samples_m.shape[0]
         reached = wire.weights <= WEIGHTS_MAX

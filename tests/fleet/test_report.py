@@ -70,7 +70,8 @@ def play(*overrides: str, seed: int = 1) -> list[Record]:
     site = WorldSetup.of(scenario, seed)
     records: list[Record] = []
     simulation = Simulation(scenario, seed, site, [records.append])
-    simulate(simulation, InProcessExchange(team(scenario, seed, site)), seed, lambda: False)
+    exchange = InProcessExchange(team(scenario, seed, site))
+    simulate(simulation, exchange, seed, lambda: False, exchange)
     return records
 
 

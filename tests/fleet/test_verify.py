@@ -77,8 +77,8 @@ def recorded(scenario: Scenario, folder: Path, machines: Exchange | None = None)
     recording = Recording(scenario, 1, "in-process", folder)
     site = WorldSetup.of(scenario, 1)
     simulation = Simulation(scenario, 1, site, [recording.observe])
-    own = InProcessExchange(team(scenario, 1, site))
-    simulate(simulation, machines or own, 1, lambda: False, own)
+    exchange = InProcessExchange(team(scenario, 1, site))
+    simulate(simulation, machines or exchange, 1, lambda: False, exchange)
     return recording.finish()
 
 

@@ -24,7 +24,6 @@ from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_protocol.wire.weights import WeightsMessage, WeightsSubscriber
 from kantor_worldsim.observers.checkers.checker import Checker, check
 from kantor_worldsim.radio.channel import DROPPED, DeliveryDecision
-from kantor_worldsim.record.process_events import ProcessEventKind
 from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record, StepRecord
 from support.checkers import listed, rules
 from support.replicas import read_logs
@@ -798,9 +797,9 @@ def befell(records: Records, what: str = "") -> list[ProcessEvent]:
     ]
 
 
-def changed(records: Records, kind: str, /, **values: Any) -> list[Record]:
+def changed(records: Records, of_kind: str, **values: Any) -> list[Record]:
     """The records with the first incident of a kind changed."""
-    incident = befell(records, kind)[0]
+    incident = befell(records, of_kind)[0]
     return put(records, incident, msgspec.structs.replace(incident, **values))
 
 
@@ -1046,7 +1045,7 @@ def _speaks_as_another_incarnation_without_a_ledger(records: Records) -> list[Re
 
 @breaks("epoch", run=COPIED)
 def _impostor_is_let_in(records: Records) -> list[Record]:
-    return changed(records, "pretend", kind=ProcessEventKind.IMPOSTOR_ADMITTED)
+    return changed(records, "pretend", kind="let in")
 
 
 @breaks("refusal")

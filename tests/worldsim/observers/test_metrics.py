@@ -299,7 +299,8 @@ def test_views_follow_the_robots(coordination: str, merge: tuple[str, ...]) -> N
             compared += 1
 
     simulation = Simulation(scenario, 1, site, [compare])
-    simulate(simulation, InProcessExchange(machines), 1, lambda: False)
+    exchange = InProcessExchange(machines)
+    simulate(simulation, exchange, 1, lambda: False, exchange)
 
     assert compared > 80
 
