@@ -2,7 +2,7 @@
 
 import pytest
 
-from conftest import TIERS, tier_of
+from support.tiers import TIER_OF_PLACE, TIERS, tier_of
 
 
 def test_every_test_has_exactly_one_tier(request: pytest.FixtureRequest) -> None:
@@ -14,20 +14,22 @@ def test_every_test_has_exactly_one_tier(request: pytest.FixtureRequest) -> None
 def test_two_tiers_are_refused(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tiers = [pytest.mark.unit.mark, pytest.mark.papers.mark]
-    monkeypatch.setattr(request.node, "own_markers", tiers)
+    marks = [pytest.mark.unit.mark, pytest.mark.papers.mark]
+    monkeypatch.setattr(request.node, "own_markers", marks)
 
-    with pytest.raises(pytest.UsageError, match=r"several tiers: .*; keep one"):
+    with pytest.raises(pytest.UsageError, match=r"several tiers: unit, papers; keep one"):
         tier_of(request.node)
 
 
 def test_a_folder_without_a_tier_is_refused(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(tier_of.__globals__, "TIER_OF_PLACE", {})
+    monkeypatch.delitem(TIER_OF_PLACE, "test_tiers.py")
     monkeypatch.setattr(request.node, "own_markers", [])
 
-    with pytest.raises(pytest.UsageError, match=r"no tier; add test_tiers.py to tests/conftest.py"):
+    with pytest.raises(
+        pytest.UsageError, match=r"no tier; add test_tiers.py to tests/support/tiers.py"
+    ):
         tier_of(request.node)
 
 

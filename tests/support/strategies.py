@@ -63,7 +63,7 @@ MINIMUM = ("merge=min", "claims=false")
 
 
 def examples(count: int) -> settings:
-    """How many examples a property is tried on; the profile `fast` tries a quarter of them.
+    """How many examples a property is tried on; the profile `fast` tries a tenth of them.
 
     Nothing is timed: the first call may compile kernels, and the machine may have other work.
     """
