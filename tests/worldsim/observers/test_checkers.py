@@ -24,6 +24,7 @@ from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_protocol.wire.weights import WeightsMessage, WeightsSubscriber
 from kantor_worldsim.observers.checkers.checker import Checker, check
 from kantor_worldsim.radio.channel import DROPPED, DeliveryDecision
+from kantor_worldsim.record.process_events import ProcessEventKind
 from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent, Record, StepRecord
 from support.checkers import listed, rules
 from support.replicas import read_logs
@@ -1045,7 +1046,7 @@ def _speaks_as_another_incarnation_without_a_ledger(records: Records) -> list[Re
 
 @breaks("epoch", run=COPIED)
 def _impostor_is_let_in(records: Records) -> list[Record]:
-    return changed(records, "pretend", kind="let in")
+    return changed(records, "pretend", kind=ProcessEventKind.IMPOSTOR_ADMITTED)
 
 
 @breaks("refusal")
