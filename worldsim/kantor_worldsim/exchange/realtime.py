@@ -74,15 +74,15 @@ class RealtimeExchange:
         lobby.open(lambda: self._now_ns)
         injector.advance(self._now_ns)
         lobby.announce_all()
+        self._welcome_newcomers()
         while True:
             reason = self._reason()
             if reason is not None:
                 self._simulation.end(reason)
                 return reason
-            while (newcomer := lobby.pop_newcomer()) is not None:
-                self._welcome(newcomer)
             report = lobby.next(self._timeout_s())
             injector.advance(self._now_ns)
+            self._welcome_newcomers()  # a participant's first message must start its clock
             if not injector.world_is_down:  # a report that is lost now is repeated
                 if report is not None:
                     self._settle(*report)
@@ -109,11 +109,12 @@ class RealtimeExchange:
         longest_s = POLL_S if self._injector.busy else PROGRESS_S
         return min(longest_s, max(0.0, min(waits_s, default=longest_s)))
 
-    def _welcome(self, name: ParticipantId) -> None:
-        """Start the clock of a participant that became ready."""
-        if self._lobby.is_ready(name):
-            self._injector.welcome(name)
-            self._set_clock(name, self._now_ns)
+    def _welcome_newcomers(self) -> None:
+        """Start the clocks of participants that became ready."""
+        while (name := self._lobby.pop_newcomer()) is not None:
+            if self._lobby.is_ready(name):
+                self._injector.welcome(name)
+                self._set_clock(name, self._now_ns)
 
     def _set_clock(self, name: ParticipantId, now_ns: int) -> None:
         self._skews_ns[name] = self._injector.skew_ns(name, now_ns)
