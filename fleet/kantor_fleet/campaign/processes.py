@@ -391,7 +391,7 @@ class SoakTotals:
             f"  disks      {', '.join(kinds)}, {self.struck['kill for good']} killed for good; "
             f"{self._incarnations} new incarnations"
         )
-        yield f"  rejoined   {_quantiles(self._rejoined_s, REJOIN_S)}"
+        yield f"  rejoined   {_quantiles(self._rejoined_s, self._rejoin_s)}"
         yield f"  resumed    world-sim {_quantiles(self._resumed_s)}"
         yield f"  liveness   {', '.join(f'{rule} judged {n}' for rule, n in sorted(self._judged.items()))}"
         yield from self._memory()
