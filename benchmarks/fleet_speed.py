@@ -61,9 +61,9 @@ def measure(*, quick: bool) -> Table:
     rows = []
     met = True
     for setting in _settings(quick=quick):
-        site = WorldSetup.of(setting.scenario, 0)
-        bare = [_run(setting, site, recorded=False) for _ in range(repeats)]
-        recorded = [_run(setting, site, recorded=True) for _ in range(repeats)]
+        setup = WorldSetup.of(setting.scenario, 0)
+        bare = [_run(setting, setup, recorded=False) for _ in range(repeats)]
+        recorded = [_run(setting, setup, recorded=True) for _ in range(repeats)]
         fast = statistics.median(cost.steps_per_s for cost in bare)
         slow = statistics.median(cost.steps_per_s for cost in recorded)
         rows.append(
@@ -147,12 +147,12 @@ def _crowd(ticks: int) -> Scenario:
     return from_tree(tree, "crowd")
 
 
-def _run(setting: Setting, site: WorldSetup, *, recorded: bool) -> Cost:
+def _run(setting: Setting, setup: WorldSetup, *, recorded: bool) -> Cost:
     """One run, without setting up its robots."""
     scenario = setting.scenario
     recording = Recording(scenario, 0, "in-process") if recorded else None
-    simulation = Simulation(scenario, 0, site, [recording.observe] if recording else [])
-    exchange = InProcessExchange(team(scenario, 0, site))
+    simulation = Simulation(scenario, 0, setup, [recording.observe] if recording else [])
+    exchange = InProcessExchange(team(scenario, 0, setup))
     start_s = time.process_time()
     simulate(simulation, exchange, 0, lambda: False, exchange)
     cpu_s = time.process_time() - start_s

@@ -87,15 +87,15 @@ def measure(*, quick: bool) -> Table:
 
 def _run(name: str, overrides: tuple[str, ...], seed: int) -> Cost:
     scenario = find(name, overrides)
-    site = WorldSetup.of(scenario, seed)
+    setup = WorldSetup.of(scenario, seed)
     recording = Recording(scenario, seed, "in-process")
     start_s = time.process_time()
-    play(scenario, seed, site, [recording.observe])
+    play(scenario, seed, setup, [recording.observe])
     spent_s = time.process_time() - start_s
     result = recording.finish()
     assert result.map is not None
-    assert site.ground is not None
+    assert setup.ground is not None
     steps = result.ticks * result.robots
     return Cost(
-        steps / spent_s, spent_s, result.map.log_bytes_per_robot_tick, site.ground.frame.cells
+        steps / spent_s, spent_s, result.map.log_bytes_per_robot_tick, setup.ground.frame.cells
     )

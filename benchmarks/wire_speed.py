@@ -32,19 +32,19 @@ def measure(*, quick: bool) -> Table:
     rows, met = [], True
     for name in SCENARIOS[1:4] if quick else SCENARIOS:
         scenario = find(name)
-        site = WorldSetup.of(scenario, 0)
+        setup = WorldSetup.of(scenario, 0)
         recording = Recording(scenario, 0, "in-process")
-        simulation = Simulation(scenario, 0, site, [recording.observe])
-        exchange = InProcessExchange(team(scenario, 0, site))
+        simulation = Simulation(scenario, 0, setup, [recording.observe])
+        exchange = InProcessExchange(team(scenario, 0, setup))
         simulate(simulation, exchange, 0, lambda: False, exchange)
         wire = recording.finish().bytes_per_robot_tick
-        whole = 8 * site.samples_m.shape[0]
+        whole = 8 * setup.samples_m.shape[0]
         reached = wire.weights <= WEIGHTS_MAX
         met = met and reached
         rows.append(
             (
                 name,
-                f"{site.samples_m.shape[0]:,}",
+                f"{setup.samples_m.shape[0]:,}",
                 f"{wire.weights:.2f}",
                 f"{WEIGHTS_MAX:g}",
                 verdict(met=reached),

@@ -12,7 +12,7 @@ from kantor_agent.coordination.assignment import (
 )
 from kantor_agent.mapping.cost_map import CostMap
 from kantor_agent.mapping.fused_map import FusedMap
-from kantor_agent.planners.map_base import Member, Task, past_or_long_ago
+from kantor_agent.planners.map_base import Task, TeamMember, past_or_long_ago
 from kantor_protocol.base.grid import Frame
 from kantor_protocol.base.machine import Body, Inputs, Outputs, ParticipantId, State
 from kantor_protocol.replication.gossip import Gossip, build_replica
@@ -73,7 +73,7 @@ class MappingSupervisor:
         assert registers.values[registers.me, MEMO : MEMO + self._robots].tolist() == expected
         assert {robot for robot, task in self._tasks.items() if task != Task()} <= set(self._since)
 
-    def _visible_team(self, tick: int) -> tuple[list[Member], list[int]]:
+    def _visible_team(self, tick: int) -> tuple[list[TeamMember], list[int]]:
         """The robots in contact with the tasks that they have been given; the targets of the others."""
         team, absent = visible_team(
             self._replica.registers, self._robots, self._frame, tick, self._contact_limits
@@ -81,7 +81,7 @@ class MappingSupervisor:
         self._tasks = {member.robot: self._tasks.get(member.robot, Task()) for member in team}
         return [self._as_assigned(member, tick) for member in team], absent
 
-    def _as_assigned(self, member: Member, tick: int) -> Member:
+    def _as_assigned(self, member: TeamMember, tick: int) -> TeamMember:
         """A member with its assigned task: what its register says of another task does not count."""
         task = self._tasks[member.robot]
         since = past_or_long_ago(self._since.get(member.robot, 0), tick)

@@ -46,7 +46,7 @@ def late_write(patch: Patch) -> None:
 
 
 @mutant("a torn log is taken for whole", has(Kill, disk=("torn",)))
-def torn_diary_taken_for_whole(patch: Patch) -> None:
+def torn_wal_taken_for_whole(patch: Patch) -> None:
     patch.setattr(
         recovery,
         "_covers",

@@ -67,10 +67,10 @@ Cut = Callable[[list[Record]], list[Record]]
 def play(*overrides: str, seed: int = 1) -> list[Record]:
     """The whole record of a small mission with `key.sub=value` overrides."""
     scenario = parse(MISSION, "small", overrides)
-    site = WorldSetup.of(scenario, seed)
+    setup = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    simulation = Simulation(scenario, seed, site, [records.append])
-    exchange = InProcessExchange(team(scenario, seed, site))
+    simulation = Simulation(scenario, seed, setup, [records.append])
+    exchange = InProcessExchange(team(scenario, seed, setup))
     simulate(simulation, exchange, seed, lambda: False, exchange)
     return records
 
@@ -274,9 +274,9 @@ def test_targets_walk_as_in_the_world() -> None:
     run = followed(until[:-1])  # without the ending, which comes later
 
     assert last_s > 0.0
-    walked_m = run.walked(run.site.targets_m, 3.0, Purpose.TARGET_WALK)
+    walked_m = run.walked(run.setup.targets_m, 3.0, Purpose.TARGET_WALK)
     assert walked_m[target].tolist() == [x_m, y_m]
-    assert walked_m[target].tolist() != run.site.targets_m[target].tolist()
+    assert walked_m[target].tolist() != run.setup.targets_m[target].tolist()
 
 
 def step_record(

@@ -19,7 +19,7 @@ from kantor_worldsim.observers.metrics.mapping import MapMetrics
 from kantor_worldsim.record.records import Batch, Record, opening_of
 from kantor_worldsim.world.maps import Ground
 from support.grounds import drawn
-from support.missions import ROOMS, explored, on_map, site_of
+from support.missions import ROOMS, explored, on_map, setup_of
 
 Records = Sequence[Record]
 TEN = "[" + ", ".join(f"[{1.5 + x}, {1.5 + y}]" for x in range(5) for y in range(2)) + "]"
@@ -98,7 +98,7 @@ def test_any_map_has_a_picture(ground: Ground, tmp_path: Path) -> None:
     """One that is small, large, narrow, or nothing but edges."""
     start = ground.frame.centre_of(0)
     scenario = on_map("robots.count=1", f"starts.poses_m=[{list(start)}]")
-    opening = opening_of(scenario, 1, site_of(scenario, ground), {"r1": ()})
+    opening = opening_of(scenario, 1, setup_of(scenario, ground), {"r1": ()})
 
     assert picture([opening], tmp_path / "report.png").size == (1540, 880)
 
@@ -113,7 +113,7 @@ def test_colours_are_those_of_the_stamps() -> None:
     ticks = exploration.map_tracker.state.first_tick.reshape(ROOMS.cells.shape)
     free = ROOMS.cells == 1
 
-    assert run.site.ground is not None
+    assert run.setup.ground is not None
     assert image.get_extent() == list(ROOMS.frame.extent_m)
     assert (colours[free & (ticks < 0)] == 1.0).all()
     assert np.unique(colours[~free & (ticks < 0)]).size == 1

@@ -75,9 +75,9 @@ def troubled(*overrides: str) -> Scenario:
 def recorded(scenario: Scenario, folder: Path, machines: Exchange | None = None) -> Result:
     """Play a mission into a run folder."""
     recording = Recording(scenario, 1, "in-process", folder)
-    site = WorldSetup.of(scenario, 1)
-    simulation = Simulation(scenario, 1, site, [recording.observe])
-    exchange = InProcessExchange(team(scenario, 1, site))
+    setup = WorldSetup.of(scenario, 1)
+    simulation = Simulation(scenario, 1, setup, [recording.observe])
+    exchange = InProcessExchange(team(scenario, 1, setup))
     simulate(simulation, machines or exchange, 1, lambda: False, exchange)
     return recording.finish()
 

@@ -54,7 +54,7 @@ from kantor_worldsim.record.records import (
     encode_record,
 )
 from kantor_worldsim.world.world import WorldSetup
-from support.missions import ROOMS_MISSION, on_map, site_of
+from support.missions import ROOMS_MISSION, on_map, setup_of
 from support.strategies import SMALL, mission
 
 GOODS = 48
@@ -67,11 +67,11 @@ GOODS = 48
 class Played:
     """A small mission with all that went through it."""
 
-    def __init__(self, scenario: Scenario, site: WorldSetup | None = None) -> None:
+    def __init__(self, scenario: Scenario, setup: WorldSetup | None = None) -> None:
         self.scenario = scenario
-        self.site = site or WorldSetup.of(scenario, 1)
+        self.setup = setup or WorldSetup.of(scenario, 1)
         self.records: list[Record] = []
-        play(scenario, 1, self.site, [self.records.append])
+        play(scenario, 1, self.setup, [self.records.append])
         mailbag = EnvelopeIndex()
         self.inputs: list[Inputs] = []
         self.outputs: list[Outputs] = []
@@ -124,7 +124,7 @@ def played(name: str) -> Played:
     if name in DENSITY:
         return Played(mission(*SHORT, *DENSITY[name]))
     scenario = on_map("limit_s=3.0", *MAP[name])
-    return Played(scenario, site_of(scenario))
+    return Played(scenario, setup_of(scenario))
 
 
 def _every(names: Iterable[str] = _ALL) -> Iterator[Played]:
@@ -195,8 +195,8 @@ def from_participants() -> Mutations:
 def to_participants() -> Mutations:
     """Missions, turns, and the rest."""
     told = [
-        encode(Mission(VERSION, "ab", each.scenario, 1, Array.of(each.site.starts_m),
-                       Array.of(each.site.samples_m), "wall", each.opening.frame, "run",
+        encode(Mission(VERSION, "ab", each.scenario, 1, Array.of(each.setup.starts_m),
+                       Array.of(each.setup.samples_m), "wall", each.opening.frame, "run",
                        Body(Pose(1.0, 2.0), 3, 4, 1)))
         for each in _every()
     ]  # fmt: skip
@@ -338,23 +338,23 @@ def journals() -> Mutations:
     return files(contents)
 
 
-def diary_files() -> Mutations:
-    """Diaries on disk."""
+def wal_files() -> Mutations:
+    """Write-ahead logs on disk."""
     given = played("ledger").inputs
     with tempfile.TemporaryDirectory() as folder:
         contents = []
         for pages in (0, 1, 3):
             path = Path(folder) / str(pages)
-            diary = WalFile(path, "run")
-            diary.reset(Body(Pose(1.0, 2.0)))
+            wal = WalFile(path, "run")
+            wal.reset(Body(Pose(1.0, 2.0)))
             for inputs in given[:pages]:
-                diary.append(encode(inputs))
-            diary.close()
+                wal.append(encode(inputs))
+            wal.close()
             contents.append(path.read_bytes())
     return files(contents)
 
 
-def diaries() -> Framed:
+def wals() -> Framed:
     """The frames of a write-ahead log: its header, an entry, another one, and a torn end."""
     header = encode(("run", Body(Pose(1.0, 2.0))))
     pages = [bytes(8) + encode(inputs) for inputs in played("ledger").inputs[:GOODS]]

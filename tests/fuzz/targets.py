@@ -26,7 +26,7 @@ from kantor_fleet.sweep.plan import RunKey, SweepError
 from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN
 from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Pose, StateMachine
 from kantor_protocol.base.varint import Pairs, pack_pairs, sum_pairs
-from kantor_protocol.node import wal as diary_module
+from kantor_protocol.node import wal as wal_module
 from kantor_protocol.node.recovery import RecoverableNode, WalContents
 from kantor_protocol.node.wal import WalFile
 from kantor_protocol.replication.gossip import build_replica
@@ -54,7 +54,14 @@ from kantor_protocol.wire.messages import (
 from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_protocol.wire.weights import Units, WeightsSubscriber
 from kantor_worldsim.record import columnar
-from kantor_worldsim.record.columnar import ACTS, ALL_HEARD, ALL_SENT, INJECTED, PAIRS, VERDICTS
+from kantor_worldsim.record.columnar import (
+    ALL_HEARD,
+    ALL_SENT,
+    DECISIONS,
+    INJECTED,
+    PAIRS,
+    STEP_RECORDS,
+)
 from kantor_worldsim.record.journal import read as read_journal
 from kantor_worldsim.record.records import decode_record, encode_record
 from kantor_worldsim.world import density, maps
@@ -65,31 +72,31 @@ from support.strategies import mission
 Decode = Callable[[bytes], bool]
 
 
-class Inventive(Protocol):
-    """Makes inputs."""
+class Corpus(Protocol):
+    """A corpus: makes the inputs of a target."""
 
     def batch(self, name: object, count: int) -> list[bytes]:
-        """So many; the same for the same name."""
+        """Return `count` inputs; the same ones for the same name."""
         ...
 
 
 class Target(NamedTuple):
     """A decoder under test."""
 
-    inputs: Callable[[], Inventive]
+    inputs: Callable[[], Corpus]
     start: Callable[[Path], Decode]
-    """A decoder as it is at the beginning of every batch. The folder is for files."""
+    """Returns a fresh decoder, called at the start of each batch. The folder is for its files."""
     in_kernels: bool = False
-    """Compiled code sees the bytes, which coverage does not."""
+    """Whether compiled code reads the bytes: coverage cannot guide the search there."""
 
 
 def _same(decode: Decode) -> Callable[[Path], Decode]:
-    """A decoder that keeps nothing."""
+    """A decoder without state."""
     return lambda _folder: decode
 
 
 def _refuses(error: type[Exception], decode: Callable[[bytes], object]) -> Decode:
-    """Whatever is not taken in raises this error, with one line."""
+    """A refused input raises this error, with one line."""
 
     def attempt(content: bytes) -> bool:
         try:
@@ -196,16 +203,16 @@ def _pairs(_folder: Path) -> Decode:
 
 
 def _learning(name: str, me: str = "r1", samples: int | None = None) -> Callable[[Path], Decode]:
-    """A replica learns; when it refuses, nothing is changed."""
+    """A replica merges a message; a refused one changes nothing."""
 
     def start(_folder: Path) -> Decode:
         played = corpora.played(name)
         scenario = played.scenario
         if scenario.mapping:
-            assert played.site.ground is not None
-            bound, units = entries(played.site.ground.frame), None
+            assert played.setup.ground is not None
+            bound, units = entries(played.setup.ground.frame), None
         else:
-            bound, units = played.site.samples_m.shape[0], units_of(scenario, 12)
+            bound, units = played.setup.samples_m.shape[0], units_of(scenario, 12)
         replica = build_replica(me, scenario, units, bound)
         registers = replica.registers
 
@@ -227,7 +234,7 @@ def _learning(name: str, me: str = "r1", samples: int | None = None) -> Callable
 
 
 def _state(replica: Replica) -> list[bytes]:
-    """All that it holds; not how much room it has."""
+    """The contents of a replica, without the capacity of its arrays."""
     store, registers = replica.store, replica.registers
     arrays = (
         *(store.weights, store.length, store.known, store.sending, store.claims),
@@ -251,7 +258,7 @@ def _is_sound(replica: Replica) -> None:
 
 
 def _registers(_folder: Path) -> Decode:
-    """Registers are read and learnt by themselves; what is sound can be read."""
+    """Registers are decoded and merged without a replica; what was merged can be read."""
     scenario = mission(*corpora.SHORT, *corpora.DENSITY["spectral"])
     registers = build_replica("r1", scenario, Units.of(30, 12), 12).registers
     width = registers.values.shape[1]
@@ -271,7 +278,7 @@ def _registers(_folder: Path) -> Decode:
     return take
 
 
-def _register_inputs() -> Inventive:
+def _register_inputs() -> Corpus:
     from fuzz.mutations import LEB_TOKENS, Framed, pick
 
     told = [
@@ -313,7 +320,7 @@ def _evidence(_folder: Path) -> Decode:
 
 
 def _reader(_folder: Path) -> Decode:
-    """The kernel that fills a reader's tables, on any bytes and with too few rows."""
+    """The kernel that fills a decoder's tables, on any bytes and with too few rows."""
     tables = columnar.ColumnarDecoder()
     tables._make_room(64)
     sizes = tables._tables[0]
@@ -322,7 +329,9 @@ def _reader(_folder: Path) -> Decode:
         at = columnar._read_batch(content, *tables._tables, tables._pose_bits, 3, 3, 12)
         assert at <= len(content), "read beyond the end"
         if at >= 0:
-            counts = sizes[[ACTS, ACTS, ALL_HEARD, ALL_SENT, VERDICTS, PAIRS, INJECTED]].tolist()
+            counts = sizes[
+                [STEP_RECORDS, STEP_RECORDS, ALL_HEARD, ALL_SENT, DECISIONS, PAIRS, INJECTED]
+            ].tolist()
             for table, rows in zip(tables._tables[1:], counts, strict=True):
                 assert 0 <= rows <= table.shape[0]
         return at >= 0
@@ -360,12 +369,12 @@ def _parts_of_weights(content: bytes) -> bool:
 
 
 def _newborn(me: str, played: corpora.Played) -> StateMachine:
-    scenario, site = played.scenario, played.site
-    return participant(me, scenario, 1, site, Body(site.poses(scenario)[me]))
+    scenario, setup = played.scenario, played.setup
+    return participant(me, scenario, 1, setup, Body(setup.poses(scenario)[me]))
 
 
 def _machine(name: str, me: str) -> Callable[[Path], Decode]:
-    """A whole participant hears an envelope in each step."""
+    """A whole participant receives an envelope in each step."""
 
     def start(_folder: Path) -> Decode:
         played = corpora.played(name)
@@ -391,25 +400,25 @@ def _machine(name: str, me: str) -> Callable[[Path], Decode]:
     return start
 
 
-class _Leaf:
+class _OneEntryLog:
     """A write-ahead log of one entry."""
 
     def __init__(self, page: bytes) -> None:
         self._page = page
 
     def read(self) -> WalContents:
-        """What it holds."""
+        """Return the entry."""
         return WalContents(Body(Pose(10.0, 10.0)), (self._page,))
 
     def reset(self, initial_state: Body) -> None:
-        """Never."""
+        """Fail: nothing is written here."""
         raise AssertionError("a log that covers all is thrown away")
 
     def append(self, inputs: bytes) -> None:
-        """Forget it."""
+        """Drop the entry."""
 
 
-def _life(name: str, me: str) -> Callable[[Path], Decode]:
+def _recovery(name: str, me: str) -> Callable[[Path], Decode]:
     """A node recovers from an entry that was tampered with."""
 
     def start(_folder: Path) -> Decode:
@@ -417,27 +426,27 @@ def _life(name: str, me: str) -> Callable[[Path], Decode]:
         machine = _newborn(me, played)
 
         def live(content: bytes) -> None:
-            RecoverableNode(lambda _body: machine, _Leaf(content), Body(Pose(10.0, 10.0)))
+            RecoverableNode(lambda _body: machine, _OneEntryLog(content), Body(Pose(10.0, 10.0)))
 
         return _refuses(RefusedError, live)
 
     return start
 
 
-def _diary(folder: Path, *, framed: bool) -> Decode:
+def _wal(folder: Path, *, framed: bool) -> Decode:
     """A write-ahead log on disk: its sound beginning is read, and every entry can be stepped through.
 
     framed: length and checksum of every frame are right, whatever is in it.
     """
-    path = folder / "diary"
+    path = folder / "wal"
 
     def read(content: bytes) -> bool:
         path.write_bytes(_in_frames(unframe(content)) if framed else content)
-        diary = WalFile(path, "run")
+        wal = WalFile(path, "run")
         try:
-            pages = diary.read()
+            pages = wal.read()
         finally:
-            diary.close()
+            wal.close()
         for page in pages.inputs if pages else ():
             decode_inputs(page)
         return pages is not None
@@ -446,9 +455,9 @@ def _diary(folder: Path, *, framed: bool) -> Decode:
 
 
 def _in_frames(parts: tuple[bytes, ...]) -> bytes:
-    content, crc = diary_module._MAGIC, zlib.crc32(diary_module._MAGIC)
+    content, crc = wal_module._MAGIC, zlib.crc32(wal_module._MAGIC)
     for part in parts[:-1]:
-        frame, crc = diary_module._frame(part, crc)
+        frame, crc = wal_module._frame(part, crc)
         content += frame
     return content + parts[-1]
 
@@ -487,7 +496,7 @@ class Trees:
         self._keys = sorted(names | {"x", "", "kind", "until_s", "a\nb", "mapp", "probabilty"})
 
     def batch(self, name: object, count: int) -> list[bytes]:
-        """So many inputs; the same for the same name."""
+        """Return `count` inputs; the same ones for the same name."""
         import random
 
         draw = random.Random(str(name))
@@ -504,7 +513,7 @@ class Trees:
         return msgspec.msgpack.encode(self._trees[i])
 
     def _change(self, tree: Any, draw: Callable[[], float]) -> None:
-        """One value somewhere, one key more or less, one row twice."""
+        """Replace a value, add or remove a key, or repeat a row."""
         while True:
             among = list(tree) if isinstance(tree, dict) else list(range(len(tree)))
             if not among:
@@ -571,13 +580,13 @@ def _identity(folder: Path) -> Decode:
 
 
 class _InMemory:
-    """A file that is read."""
+    """A path whose file is in memory."""
 
     def __init__(self, content: bytes) -> None:
         self._content = content
 
     def open(self, _mode: str) -> BytesIO:
-        """Its bytes."""
+        """Open the bytes for reading."""
         return BytesIO(self._content)
 
 
@@ -587,7 +596,7 @@ def _journal(content: bytes) -> bool:
 
 
 def runs_of_sweeps() -> Sequence[bytes]:
-    """A file of runs, and a torn one."""
+    """A file of runs, whole or torn."""
     import tempfile
 
     with tempfile.TemporaryDirectory() as folder:
@@ -681,10 +690,10 @@ TARGETS: dict[str, Target] = {
     "allocation": Target(
         lambda: corpora.news("allocated"), _machine("allocated", "supervisor"), True
     ),
-    "life": Target(corpora.inputs, _life("ledger", "r1"), True),
-    "life-on-map": Target(corpora.inputs, _life("burgard", "r1"), True),
-    "diary": Target(corpora.diaries, partial(_diary, framed=True)),
-    "diary-file": Target(corpora.diary_files, partial(_diary, framed=False)),
+    "life": Target(corpora.inputs, _recovery("ledger", "r1"), True),
+    "life-on-map": Target(corpora.inputs, _recovery("burgard", "r1"), True),
+    "wal": Target(corpora.wals, partial(_wal, framed=True)),
+    "wal-file": Target(corpora.wal_files, partial(_wal, framed=False)),
     "scenario-tree": Target(Trees, _same(_refuses(ScenarioError, _tree))),
     "scenario-text": Target(corpora.scenarios, _same(_refuses(ScenarioError, _parse))),
     "chaos-file": Target(corpora.storms, _storm),

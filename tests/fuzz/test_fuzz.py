@@ -11,14 +11,14 @@ import pytest
 
 from fuzz import fuzz
 from fuzz.mutations import LEB_TOKENS, MSGPACK_TOKENS, leb, msgpack_spans, number_spans
-from fuzz.targets import TARGETS, Decode, Inventive, Target
+from fuzz.targets import TARGETS, Corpus, Decode, Target
 from kantor_protocol.wire.messages import encode
 
 BATCH = 500
 SEED = 20
 
 SLOW = {
-    *("scenario-text", "scenario-tree", "override", "chaos-file", "credentials", "diary-file"),
+    *("scenario-text", "scenario-tree", "override", "chaos-file", "credentials", "wal-file"),
     *("runs-of-sweep", "map-nav2", "map-movingai", "map-pgm", "map-png", "map-tiff"),
     *("points-csv", "points-npy", "points-image", "mapper", "allocation", "journal"),
 }
@@ -29,17 +29,15 @@ SLOW = {
 def test_bad_input_is_refused_and_changes_nothing(name: str, tmp_path: Path) -> None:
     """No exception but the documented one; what a target asserts itself; both outcomes are seen."""
     target, batches = TARGETS[name], 4 if name in SLOW else 30
-    inventive = target.inputs()
-    taken = sum(
-        _one_batch(target, inventive, f"{name} {SEED} {i}", tmp_path) for i in range(batches)
-    )
+    corpus = target.inputs()
+    taken = sum(_one_batch(target, corpus, f"{name} {SEED} {i}", tmp_path) for i in range(batches))
 
     assert 0 < taken < batches * BATCH
 
 
-def _one_batch(target: Target, inventive: Inventive, batch: str, folder: Path) -> int:
+def _one_batch(target: Target, corpus: Corpus, batch: str, folder: Path) -> int:
     decode, taken = target.start(folder), 0
-    for i, content in enumerate(inventive.batch(batch, BATCH)):
+    for i, content in enumerate(corpus.batch(batch, BATCH)):
         try:
             taken += decode(content)
         except Exception as error:
@@ -50,10 +48,10 @@ def _one_batch(target: Target, inventive: Inventive, batch: str, folder: Path) -
 
 
 def test_inputs_are_the_same_for_the_same_name() -> None:
-    inventive = TARGETS["learn-ledger"].inputs()
+    corpus = TARGETS["learn-ledger"].inputs()
 
-    assert inventive.batch("a", 50) == TARGETS["learn-ledger"].inputs().batch("a", 50)
-    assert inventive.batch("a", 50) != inventive.batch("b", 50)
+    assert corpus.batch("a", 50) == TARGETS["learn-ledger"].inputs().batch("a", 50)
+    assert corpus.batch("a", 50) != corpus.batch("b", 50)
 
 
 def test_spans_are_whole_values() -> None:

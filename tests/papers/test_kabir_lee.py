@@ -48,9 +48,9 @@ class Flight(NamedTuple):
 def flown(name: str, overrides: tuple[str, ...], seed: int) -> Flight:
     """A packaged mission, run once in process; no rule may be broken on the way."""
     scenario = find(name, overrides)
-    site = WorldSetup.of(scenario, seed)
+    setup = WorldSetup.of(scenario, seed)
     recording = Recording(scenario, seed, "in-process")
-    play(scenario, seed, site, [recording.observe])
+    play(scenario, seed, setup, [recording.observe])
     result = recording.finish()
     assert result.complaints == ()
     return Flight(result, recording.metrics.rows)
@@ -312,11 +312,11 @@ class Small(NamedTuple):
 def small(*overrides: str) -> Small:
     """The small mission: N = 12, M = 30."""
     scenario = mission("metrics.every=1", *overrides)
-    site = WorldSetup.of(scenario, 1)
+    setup = WorldSetup.of(scenario, 1)
     metrics = DensityMetrics()
     pipeline = Pipeline(metrics)
     shipped: list[tuple[float, float]] = []
-    robots_m = site.starts_m.copy()
+    robots_m = setup.starts_m.copy()
     told: list[tuple[int, list[tuple[float, float]], Places]] = [(0, [], robots_m.copy())]
 
     def follow(record: Record) -> None:
@@ -333,13 +333,13 @@ def small(*overrides: str) -> Small:
             shipped.extend([place] if step_record.outputs.spent else [])
             told.append((step_record.now_ns // scenario.period_ns, shipped.copy(), robots_m.copy()))
 
-    play(scenario, 1, site, [follow])
+    play(scenario, 1, setup, [follow])
     at_end_of = {tick: (points, places) for tick, points, places in told}
     instants = [
         Instant(row, np.array(at_end_of[row.tick][0]).reshape(-1, 2), at_end_of[row.tick][1])
         for row in metrics.rows
     ]
-    return Small(scenario, site.samples_m, instants)
+    return Small(scenario, setup.samples_m, instants)
 
 
 def wasserstein(points_m: Places, masses: Sequence[float], samples_m: Places) -> float:
@@ -433,9 +433,9 @@ def test_theorem_2_is_loose_by_the_number_of_robots() -> None:
 
 def shipments(scenario: Scenario) -> Iterator[tuple[Places, dict[int, int], Places, list[int]]]:
     """Each point of a lone robot: from where, what it filled, the samples, and what they had left."""
-    site = WorldSetup.of(scenario, 1)
+    setup = WorldSetup.of(scenario, 1)
     records: list[Record] = []
-    play(scenario, 1, site, [records.append])
+    play(scenario, 1, setup, [records.append])
     left = [5] * 12
     pairs = Pairs()
     for record in records:
@@ -445,7 +445,7 @@ def shipments(scenario: Scenario) -> Iterator[tuple[Places, dict[int, int], Plac
             assert filled is not None
             plan = dict(zip(filled[0].tolist(), filled[1].tolist(), strict=True))
             place = np.array([step_record.outputs.pose.x_m, step_record.outputs.pose.y_m])
-            yield place, plan, site.samples_m, left.copy()
+            yield place, plan, setup.samples_m, left.copy()
             for sample, units in plan.items():
                 left[sample] -= units
 

@@ -46,7 +46,7 @@ class Flight(NamedTuple):
 def flown(overrides: tuple[str, ...], seed: int) -> Flight:
     """Section VI-A's mission, run once in process."""
     scenario = find("paper-centralized", overrides)
-    site, metrics, checker = WorldSetup.of(scenario, seed), DensityMetrics(), Checker()
+    setup, metrics, checker = WorldSetup.of(scenario, seed), DensityMetrics(), Checker()
     step_records: list[StepRecord] = []
 
     def keep(record: Record) -> None:
@@ -57,9 +57,9 @@ def flown(overrides: tuple[str, ...], seed: int) -> Flight:
                 if step_record.outputs and step_record.outputs.spent
             )
 
-    play(scenario, seed, site, [Pipeline(metrics, checker).observe, keep])
+    play(scenario, seed, setup, [Pipeline(metrics, checker).observe, keep])
     assert checker.violations == []
-    return Flight(scenario, 100.0 * len(metrics.finds) / len(site.targets_m), step_records)
+    return Flight(scenario, 100.0 * len(metrics.finds) / len(setup.targets_m), step_records)
 
 
 def median_detected(*overrides: str) -> float:

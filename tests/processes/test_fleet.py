@@ -29,9 +29,9 @@ LOSSY = (
 
 def detection(scenario: Scenario, seed: int) -> float:
     """The detection rate in virtual time."""
-    site, metrics = WorldSetup.of(scenario, seed), DensityMetrics()
-    play(scenario, seed, site, [Pipeline(metrics).observe])
-    return len(metrics.finds) / len(site.targets_m)
+    setup, metrics = WorldSetup.of(scenario, seed), DensityMetrics()
+    play(scenario, seed, setup, [Pipeline(metrics).observe])
+    return len(metrics.finds) / len(setup.targets_m)
 
 
 def test_same_seed_same_digest_in_process_and_over_the_bus(kantor: "Kantor") -> None:

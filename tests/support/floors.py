@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from kantor_agent.mapping.cost_map import CostMap
 from kantor_agent.mapping.fused_map import FusedMap
-from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_agent.planners.map_base import Situation, Task, TeamMember
 from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame
 from kantor_protocol.replication.occupancy_log import dead_frontier, entries
 from kantor_protocol.replication.replica import Replica
@@ -64,8 +64,8 @@ class Floor:
 
     def situation(
         self,
-        members: Sequence[Member],
-        others: Sequence[Member] = (),
+        members: Sequence[TeamMember],
+        others: Sequence[TeamMember] = (),
         absent: Sequence[int] = (),
         but: Sequence[int] = (),
     ) -> Situation:
@@ -80,9 +80,9 @@ def drawn(plan: Sequence[str], *overrides: str) -> Floor:
     return Floor(np.array([[_KINDS[c] for c in row] for row in plan], dtype=np.uint8), *overrides)
 
 
-def robot(place: int, cell: int, target: int = NOWHERE, *, arrived: bool = False) -> Member:
+def robot(place: int, cell: int, target: int = NOWHERE, *, arrived: bool = False) -> TeamMember:
     """A member of the visible team."""
-    return Member(place, cell, Task(target), 0, arrived)
+    return TeamMember(place, cell, Task(target), 0, arrived)
 
 
 @st.composite

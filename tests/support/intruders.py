@@ -13,7 +13,7 @@ from kantor_protocol.transport import zenoh_config
 def plain_session(
     endpoint: str, proof: zenoh_config.ZenohConfig, mode: str = "client", listen: str | None = None
 ) -> Iterator[zenoh.Session]:
-    """Open plain Zenoh, with some credentials or none, without asking for admission first."""
+    """Open plain Zenoh, with some credentials or none, without asking for membership first."""
     config = zenoh.Config()
     known = zenoh_config.common_config(mode, endpoint, listen) | {"connect/timeout_ms": 1000}
     for key, value in (known | proof).items():

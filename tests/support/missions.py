@@ -60,7 +60,7 @@ def on_map(*overrides: str) -> Scenario:
     return parse(ROOMS_MISSION, "rooms", overrides)
 
 
-def site_of(scenario: Scenario, ground: Ground = ROOMS) -> WorldSetup:
+def setup_of(scenario: Scenario, ground: Ground = ROOMS) -> WorldSetup:
     """What such a mission starts from, on a map of the test's own."""
     return WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), np.array(scenario.starts.poses_m), ground)
 
@@ -70,5 +70,5 @@ def explored(*overrides: str, seed: int = 1) -> tuple[Record, ...]:
     """The records of a mission in these rooms, played to its end."""
     scenario = on_map(*overrides)
     records: list[Record] = []
-    play(scenario, seed, site_of(scenario), [records.append])
+    play(scenario, seed, setup_of(scenario), [records.append])
     return tuple(records)

@@ -17,9 +17,9 @@ ROOMY = ("samples.count=60", "energy.points=90", "energy.steps=60", "targets.cou
 
 @functools.cache
 def _played(scenario: Scenario, seed: int) -> tuple[Record, ...]:
-    site = WorldSetup.of(scenario, seed)
+    setup = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    play(scenario, seed, site, [records.append])
+    play(scenario, seed, setup, [records.append])
     return tuple(records)
 
 

@@ -21,7 +21,7 @@ from kantor_protocol.replication.registers import Registers
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import (
     LOWERED,
-    NOBODY,
+    NO_INDEX,
     ReplicaArrays,
     ReplicaConfig,
     spend,
@@ -190,10 +190,10 @@ class Belief:
             store.claims,
             store.counters,
             np.zeros(self.replica.origins, dtype=np.int64),
-            config.me if config.claims else NOBODY,
+            config.me if config.claims else NO_INDEX,
         )
         """Arguments of a planner's kernel (see `kernels.kernel`): the arrays of `grid`; weights, claims and
-        counters of `_store`; scratch for one claim of each incarnation; the own incarnation id, or NOBODY
+        counters of `_store`; scratch for one claim of each incarnation; the own incarnation id, or NO_INDEX
         in a mission without claims."""
 
     def validate(self) -> None:

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_agent.mapping.cost_map import CostMap
-from kantor_agent.planners.map_base import Member, Situation, Task, past_or_long_ago
+from kantor_agent.planners.map_base import Situation, Task, TeamMember, past_or_long_ago
 from kantor_agent.planners.map_registry import ALLOCATORS
 from kantor_protocol.base.grid import NOWHERE, Frame
 from kantor_protocol.replication.gossip import CONTACT_PERIODS
@@ -53,7 +53,7 @@ class ContactLimits(NamedTuple):
         )
 
 
-def robot_register(member: Member, *, resting: bool) -> list[int]:
+def robot_register(member: TeamMember, *, resting: bool) -> list[int]:
     """The numbers of a robot's register."""
     flags = ARRIVED * member.arrived | RESTING * resting
     return [member.cell + 1, flags, member.task.target + 1, member.since, *member.task.memo]
@@ -61,7 +61,7 @@ def robot_register(member: Member, *, resting: bool) -> list[int]:
 
 def read_member(
     robot: int, register: npt.NDArray[np.int64], cells: int, tick: int
-) -> Member | None:
+) -> TeamMember | None:
     """The robot that a register describes; None if it is resting, or the register empty or malformed.
 
     cells: of the map. tick: now; a later `since` is of a wrong clock.
@@ -72,12 +72,12 @@ def read_member(
     used = register.nonzero()[0]
     memo = tuple(register[MEMO : used[-1] + 1].tolist())  # registers lose zeros at the end too
     since, arrived = past_or_long_ago(since, tick), bool(flags & ARRIVED)
-    return Member(robot, cell - 1, Task(target - 1, memo), since, arrived=arrived)
+    return TeamMember(robot, cell - 1, Task(target - 1, memo), since, arrived=arrived)
 
 
 def visible_team(
     registers: Registers, robots: int, frame: Frame, tick: int, limits: ContactLimits
-) -> tuple[list[Member], list[int]]:
+) -> tuple[list[TeamMember], list[int]]:
     """The robots in contact, in roster order, as all others know them; the targets of robots out of contact."""
     team, absent = [], []
     for robot in range(robots):
@@ -120,7 +120,9 @@ class Assignment:
         self._asked: dict[int, int] = {}
         """By robot in contact: the revision of the fused map when a target for it was last asked for."""
 
-    def decide(self, team: Sequence[Member], absent: Sequence[int], tick: int) -> dict[int, Task]:
+    def decide(
+        self, team: Sequence[TeamMember], absent: Sequence[int], tick: int
+    ) -> dict[int, Task]:
         """New tasks, by robot, for those that get one now.
 
         team: all robots in contact, in roster order. absent: targets of robots out of contact.
@@ -139,8 +141,8 @@ class Assignment:
         return {member.robot: task for member, task in zip(members, tasks, strict=True)}
 
     def _split(
-        self, team: Sequence[Member], tick: int
-    ) -> tuple[tuple[Member, ...], tuple[Member, ...]]:
+        self, team: Sequence[TeamMember], tick: int
+    ) -> tuple[tuple[TeamMember, ...], tuple[TeamMember, ...]]:
         """The members that get a target now, and those that keep the one they have."""
         if self._allocator.negotiates:
             mine = tuple(m for m in team if self._me in (None, m.robot))
@@ -155,7 +157,7 @@ class Assignment:
             tuple(m for m, now in zip(team, due, strict=True) if not now),
         )
 
-    def _needs_target(self, member: Member) -> bool:
+    def _needs_target(self, member: TeamMember) -> bool:
         fused_map, target = self._cost_map.fused_map, member.task.target
         if target == NOWHERE:
             return self._asked.get(member.robot) != fused_map.revision
@@ -163,7 +165,7 @@ class Assignment:
             return True
         return self._on_events and not fused_map.is_frontier(target)
 
-    def _frontiers(self, team: Sequence[Member]) -> npt.NDArray[np.int64]:
+    def _frontiers(self, team: Sequence[TeamMember]) -> npt.NDArray[np.int64]:
         """All frontiers but those at which a member stands and has looked around."""
         frontiers = self._cost_map.fused_map.frontiers
         looked = [m.task.target for m in team if m.arrived]

@@ -9,7 +9,7 @@ Robots do not coordinate. Robots side by side choose the same target, and do so 
 
 import numpy as np
 
-from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_agent.planners.map_base import Situation, Task, TeamMember
 from kantor_protocol.scenario.schema import Scenario
 
 
@@ -31,7 +31,7 @@ class Frontier:
             for member in situation.members
         ]
 
-    def _nearest(self, member: Member, situation: Situation) -> Task:
+    def _nearest(self, member: TeamMember, situation: Situation) -> Task:
         visited = self._visited.setdefault(member.robot, [])
         if member.arrived and member.task.target not in visited:
             visited.append(member.task.target)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from kantor_agent.mapping.cost_map import CostMap
 from kantor_agent.mapping.fused_map import FusedMap
-from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_agent.planners.map_base import Situation, Task, TeamMember
 from kantor_protocol.base.counter_rng import Purpose, uniform
 from kantor_protocol.base.grid import NOWHERE, OCCUPIED, UNKNOWN, Frame, neighbour
 from kantor_protocol.base.kernels import kernel
@@ -385,7 +385,7 @@ class KMeans:
         targets = choose_targets(situation, regions, travel, mine)
         return [Task(targets[i], (_assignments(team[i], 1), *regions.places[i])) for i in mine]
 
-    def _start(self, member: Member, frame: Frame) -> tuple[int, int]:
+    def _start(self, member: TeamMember, frame: Frame) -> tuple[int, int]:
         """The initial centroid of a robot: that of its region, or drawn from the whole map."""
         row, column = PARTS * (frame.rows - 1), PARTS * (frame.columns - 1)
         count = _assignments(member)
@@ -396,7 +396,7 @@ class KMeans:
         return round(uniform(*key, 0) * row), round(uniform(*key, 1) * column)
 
 
-def _assignments(member: Member, more: int = 0) -> int:
+def _assignments(member: TeamMember, more: int = 0) -> int:
     """Assignments that a robot has had, and `more`, up to RANDOM_ASSIGNMENTS."""
     before = max(0, member.task.memo[0]) if member.task.memo else 0
     return min(before + more, RANDOM_ASSIGNMENTS)

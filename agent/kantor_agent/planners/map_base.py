@@ -32,7 +32,7 @@ class Task(NamedTuple):
     `Scenario.register_width` - 4 of them, each below 2^52 in size."""
 
 
-class Member(NamedTuple):
+class TeamMember(NamedTuple):
     """A robot of the visible team, as every other robot of the team knows it."""
 
     robot: int
@@ -53,9 +53,9 @@ class Situation(NamedTuple):
     cost_map: CostMap
     frontiers: npt.NDArray[np.int64]
     """Cells to choose from, rising."""
-    members: tuple[Member, ...]
+    members: tuple[TeamMember, ...]
     """The robots that get a target now."""
-    others: tuple[Member, ...]
+    others: tuple[TeamMember, ...]
     """The robots in contact that keep the target they have."""
     absent: tuple[int, ...]
     """The last known targets of robots that are out of contact."""

@@ -14,7 +14,7 @@ from kantor_agent.belief.sample_index import SampleIndex, nearest
 from kantor_agent.planners.base import Goal
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.machine import Pose
-from kantor_protocol.replication.replica_kernels import NOBODY, claim, claimed_by_others
+from kantor_protocol.replication.replica_kernels import NO_INDEX, claim, claimed_by_others
 
 
 @kernel
@@ -67,10 +67,10 @@ def choose_sample(
     near: np.ndarray,
     cost_to_go: np.ndarray,
 ) -> int:
-    """The goal of eq. 2-3 among samples that are not in `skip`, or NOBODY."""
+    """The goal of eq. 2-3 among samples that are not in `skip`, or NO_INDEX."""
     count = nearest(grid, x, y, skip, best, near)
     if count == 0:
-        return NOBODY
+        return NO_INDEX
     return near[first_of_best_order(grid.xy_m, weights, x, y, near, count, cost_to_go)]
 
 
@@ -97,17 +97,17 @@ def _choose(
 ) -> tuple[int, float, float]:
     """The goal and its position, for calls from Python; see `Transport.choose`.
 
-    held: scratch for the samples that others have claimed. me: NOBODY in a mission without claims.
+    held: scratch for the samples that others have claimed. me: NO_INDEX in a mission without claims.
     """
     grid = SampleIndex(xy_m, order, cell, first, alive, frame, levels)
-    skip = held[: claimed_by_others(claims, counters, me, held) if me != NOBODY else 0]
+    skip = held[: claimed_by_others(claims, counters, me, held) if me != NO_INDEX else 0]
     sample = choose_sample(grid, weights, x, y, skip, best, near, cost_to_go)
-    if sample == NOBODY and skip.shape[0] > 0:
+    if sample == NO_INDEX and skip.shape[0] > 0:
         sample = choose_sample(grid, weights, x, y, skip[:0], best, near, cost_to_go)
-    if me != NOBODY:
+    if me != NO_INDEX:
         claim(claims, counters, me, sample, now_ns)
-    if sample == NOBODY:
-        return NOBODY, x, y
+    if sample == NO_INDEX:
+        return NO_INDEX, x, y
     return sample, xy_m[sample, 0], xy_m[sample, 1]
 
 
@@ -125,4 +125,4 @@ class Transport:
     def choose(self, belief: Belief, pose: Pose, now_ns: int, /) -> Goal | None:
         """The first sample of the best order; one that another robot has claimed only if all are claimed."""
         sample, x_m, y_m = _choose(*belief.to_choose, *self._scratch, pose.x_m, pose.y_m, now_ns)
-        return None if sample == NOBODY else Goal(x_m, y_m, sample)
+        return None if sample == NO_INDEX else Goal(x_m, y_m, sample)

@@ -11,7 +11,7 @@ from kantor_protocol.base.counter_rng import Purpose
 from kantor_protocol.base.machine import Body, Inputs, Observation, Outputs, ParticipantId, State
 from kantor_protocol.base.random_walk import RandomWalk
 from kantor_protocol.replication.gossip import Gossip, build_replica
-from kantor_protocol.replication.replica_kernels import NOBODY
+from kantor_protocol.replication.replica_kernels import NO_INDEX
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.weights import Units, WeightsPublisher
 
@@ -102,7 +102,7 @@ class DensityRobot:
         state, replica = self._state, self._replica
         if state is not State.EXPLORING:
             self._goal = None
-            replica.claim(NOBODY, self._now_ns)
+            replica.claim(NO_INDEX, self._now_ns)
         lowered = replica.packed_lowered()
         weights = self._publisher.step(replica.lowered(), last=state is not State.EXPLORING)
         envelope = self._gossip.compose(replica, self._step, self._pose)

@@ -21,7 +21,7 @@ from kantor_agent.coordination.assignment import (
 from kantor_agent.mapping.cost_map import CostMap
 from kantor_agent.mapping.fused_map import FusedMap
 from kantor_agent.mapping.navigation import Navigator
-from kantor_agent.planners.map_base import Member, Task
+from kantor_agent.planners.map_base import Task, TeamMember
 from kantor_agent.vehicles import VEHICLES, StepTimer
 from kantor_protocol.base.grid import NOWHERE, Frame
 from kantor_protocol.base.machine import (
@@ -247,5 +247,5 @@ class MappingRobot:
 
     def _own_register(self) -> list[int]:
         cell = self._frame.cell_of(self._pose.x_m, self._pose.y_m)
-        me = Member(self._me, cell, self._task, self._since, self._arrived)
+        me = TeamMember(self._me, cell, self._task, self._since, self._arrived)
         return robot_register(me, resting=self._resting)

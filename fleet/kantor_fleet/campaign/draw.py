@@ -235,7 +235,7 @@ def _radio(seed: int, tree: Tree) -> Tree:
     return radio
 
 
-class Setting(NamedTuple):
+class FaultedMission(NamedTuple):
     """The mission for which faults are drawn."""
 
     scenario: Scenario
@@ -272,7 +272,7 @@ class Setting(NamedTuple):
         return {"who": list(others) or self.draws.some_of(self.roster)}
 
 
-def _partition(at: Setting) -> Tree:
+def _partition(at: FaultedMission) -> Tree:
     draws = at.draws
     shape = draws.one_of(["halves", "ring", "bridge", "isolate", "groups"])
     tree: Tree = {"shape": shape, **at.window(0.8 * at.calm_s)}
@@ -290,12 +290,12 @@ def _partition(at: Setting) -> Tree:
     return tree
 
 
-def _one_way(at: Setting) -> Tree:
+def _one_way(at: FaultedMission) -> Tree:
     ends = at.draws.one_of([("senders",), ("receivers",), ("senders", "receivers")])
     return at.window(at.calm_s) | {end: at.draws.some_of(at.roster) for end in ends}
 
 
-def _burst(at: Setting) -> Tree:
+def _burst(at: FaultedMission) -> Tree:
     return {
         "good_s": at.draws.scale(at.period_s, 30.0 * at.period_s),
         "bad_s": at.draws.scale(at.period_s, 30.0 * at.period_s),
@@ -304,12 +304,12 @@ def _burst(at: Setting) -> Tree:
     }
 
 
-def _bandwidth(at: Setting) -> Tree:
+def _bandwidth(at: FaultedMission) -> Tree:
     tree: Tree = {"bytes_per_s": short(at.draws.scale(10.0, 1000.0) / at.period_s)}
     return tree | ({"queue_bytes": round(at.draws.scale(10, 3000))} if at.draws.coin() else {})
 
 
-def _range(at: Setting) -> Tree:
+def _range(at: FaultedMission) -> Tree:
     scenario = at.scenario
     reach_m = scenario.supervisor.range_m if scenario.centralized else scenario.radio.range_m
     if reach_m < 1e9 and at.draws.coin():
@@ -317,7 +317,7 @@ def _range(at: Setting) -> Tree:
     return {"range_m": short(min(reach_m, 200.0) * at.draws.between(0.0, 0.9))}
 
 
-def _kill(at: Setting) -> Tree:
+def _kill(at: FaultedMission) -> Tree:
     draws = at.draws
     who = at.who(WORLD_SIM)
     tree = at.window(0.3 * at.calm_s) | who
@@ -329,11 +329,11 @@ def _kill(at: Setting) -> Tree:
     return tree | {"disk": disk, "mid_step": draws.coin(0.4)}
 
 
-def _late(at: Setting) -> Tree:
+def _late(at: FaultedMission) -> Tree:
     return {"until_s": short(at.draws.between(0.05, 0.8) * at.calm_s), **at.who()}
 
 
-def _clock_fault(at: Setting) -> Tree:
+def _clock_fault(at: FaultedMission) -> Tree:
     draws = at.draws
     tree = at.window(at.calm_s) | at.who()
     sign = draws.one_of([-1.0, 1.0])
@@ -344,7 +344,7 @@ def _clock_fault(at: Setting) -> Tree:
     return tree
 
 
-_DRAWN: dict[str, Callable[[Setting], Tree]] = {
+_DRAWN: dict[str, Callable[[FaultedMission], Tree]] = {
     "drop": lambda at: {"probability": at.draws.between(0.05, 0.6)} | at.links(),
     "burst": lambda at: _burst(at) | at.links(),
     "delay": lambda at: {
@@ -393,7 +393,7 @@ def _faults(seed: int, scenario: Scenario, calm_s: float) -> Iterable[Fault]:
     bias = KeyedDraws(seed, _FAULTS).between(0.05, 0.5)
     taken: list[Fault] = []
     for number, kind in enumerate(KINDS):
-        at = Setting(scenario, calm_s, KeyedDraws(seed, _A_CLASS + number))
+        at = FaultedMission(scenario, calm_s, KeyedDraws(seed, _A_CLASS + number))
         if not at.draws.coin(bias):
             continue
         for _ in range(at.draws.whole(1, _MANY.get(kind, 2))):
@@ -402,7 +402,7 @@ def _faults(seed: int, scenario: Scenario, calm_s: float) -> Iterable[Fault]:
     return taken
 
 
-def candidates(at: Setting, kind: str, taken: list[Fault]) -> Iterator[Fault]:
+def candidates(at: FaultedMission, kind: str, taken: list[Fault]) -> Iterator[Fault]:
     """Faults of a class that can be there with the others."""
     for _ in range(_TRIES):
         tree = {"kind": kind, **_DRAWN[kind](at)}

@@ -1,4 +1,4 @@
-"""Coverage: how often each class of faults struck, from the record of a mission."""
+"""Coverage: how often each class of faults took effect, from the record of a mission."""
 
 from collections import Counter
 from collections.abc import Iterable

@@ -132,9 +132,9 @@ class Follower:
     def run(self) -> str:
         """Run the mission to its end, or to the first violation; why it ended."""
         scenario, seed = self._scenario, self._seed
-        site = WorldSetup.of(scenario, seed)
-        machines = team(scenario, seed, site)
-        simulation = Simulation(scenario, seed, site, [self.observe])
+        setup = WorldSetup.of(scenario, seed)
+        machines = team(scenario, seed, setup)
+        simulation = Simulation(scenario, seed, setup, [self.observe])
         if self._invariants is not None:
             self._invariants.watch({**machines, WORLD_SIM: simulation})
         exchange = InProcessExchange(machines)
@@ -208,8 +208,8 @@ def _attempt(case: Case, *, validate: bool) -> dict[str, Any]:
 def _run_again(scenario: Scenario, seed: int, digest: str) -> Iterable[str]:
     """A violation if the mission, run again from its scenario and seed, has another digest."""
     again = Digest()
-    site = WorldSetup.of(scenario, seed)
-    play(scenario, seed, site, [lambda record: again.add(encode_record(record))])
+    setup = WorldSetup.of(scenario, seed)
+    play(scenario, seed, setup, [lambda record: again.add(encode_record(record))])
     if again.hex != digest:
         yield f"digest: executed twice, and {again.hex} is not {digest}"
 

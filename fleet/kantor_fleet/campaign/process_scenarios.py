@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from kantor_fleet.campaign.draw import Setting, candidates
+from kantor_fleet.campaign.draw import FaultedMission, candidates
 from kantor_fleet.campaign.keyed_draws import KeyedDraws, short
 from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM, ParticipantId
 from kantor_protocol.scenario.dump import to_tree
@@ -71,7 +71,7 @@ def process_scenario(seed: int, speed: float = SPEED, storm_s: float = STORM_S) 
     faults: list[Fault] = list(timetable.draw())
     for number, kind in enumerate(KINDS):
         if not issubclass(KINDS[kind], OnProcesses):
-            at = Setting(scenario, pace * storm_s, KeyedDraws(seed, _SUBJECT + 10 + number))
+            at = FaultedMission(scenario, pace * storm_s, KeyedDraws(seed, _SUBJECT + 10 + number))
             faults += _of_links(at, kind)
     # Once more through the parser: what a campaign runs is what a user can write.
     whole = msgspec.structs.replace(scenario, faults=tuple(faults))
@@ -126,7 +126,7 @@ def _lingering(scenario: Scenario, speed: float) -> Scenario:
     return msgspec.structs.replace(scenario, linger_s=short(linger_s))
 
 
-def _of_links(at: Setting, kind: str) -> Iterator[Fault]:
+def _of_links(at: FaultedMission, kind: str) -> Iterator[Fault]:
     if at.draws.coin(_A_LINK):
         for _ in range(at.draws.whole(1, 2)):
             yield from (fault for fault in [next(candidates(at, kind, []), None)] if fault)

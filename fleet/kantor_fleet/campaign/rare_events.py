@@ -233,7 +233,7 @@ class _Goals(_Detector):
 
     def __init__(self, opening: Opening) -> None:
         super().__init__(opening)
-        places = opening.site.samples_m.tolist()
+        places = opening.setup.samples_m.tolist()
         self._samples = {(x, y): i for i, (x, y) in enumerate(places)}
         self._goals: dict[ParticipantId, Pair | None] = {}
         self._pairs = Pairs()

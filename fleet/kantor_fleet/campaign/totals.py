@@ -11,7 +11,7 @@ from kantor_fleet.campaign.mission import Trial
 from kantor_fleet.campaign.rare_events import RARE_EVENTS
 
 ENOUGH = 500
-"""Missions after which each class of faults must have struck, and each rare situation have been seen."""
+"""Missions after which each class of faults must have taken effect, and each rare situation have been seen."""
 
 
 class Totals:
@@ -33,7 +33,7 @@ class Totals:
         self.struck: Counter[str] = Counter()
         self.seen: Counter[str] = Counter()
         self.missions_with: Counter[str] = Counter()
-        """Missions in which a class struck, or a situation was seen."""
+        """Missions in which a class took effect, or a situation was seen."""
 
     def add(self, trial: Trial) -> None:
         """One more mission."""
@@ -56,7 +56,7 @@ class Totals:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Classes of faults that never struck, and situations that were never seen."""
+        """Classes of faults that never took effect, and situations that were never seen."""
         return tuple(
             [name for name in CLASSES if not self.struck[name]]
             + [name for name in RARE_EVENTS if not self.seen[name]]

@@ -81,7 +81,7 @@ def reason(error: BaseException) -> str:
 
 def _run(case: Case) -> Result:
     scenario, seed = case.scenario, case.seed
-    site = WorldSetup.of(scenario, seed)
+    setup = WorldSetup.of(scenario, seed)
     recording = Recording(scenario, seed, "in-process", exact_every=0 if case.exact else None)
-    play(scenario, seed, site, [recording.observe])
+    play(scenario, seed, setup, [recording.observe])
     return recording.finish()

@@ -135,7 +135,7 @@ def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> Finding:
     scenario, seed = opening.scenario, opening.seed
     world = scenario.map
     from_files = scenario.samples.file or scenario.targets.file or (world and world.file)
-    site = opening.site if from_files else WorldSetup.of(scenario, seed)
+    setup = opening.setup if from_files else WorldSetup.of(scenario, seed)
     expected = iter(payload for payload, _ in records)
     compared, differing = 0, -1
 
@@ -150,7 +150,7 @@ def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> Finding:
 
     whole = isinstance(records[-1][1], Ending)
     steps = len(records) - (1 if whole else 0)
-    play(scenario, seed, site, [compare], stopped=lambda: compared >= steps or differing >= 0)
+    play(scenario, seed, setup, [compare], stopped=lambda: compared >= steps or differing >= 0)
     if differing >= 0:
         return False, f"executed again: record {differing} differs"
     if compared < len(records):
@@ -188,8 +188,8 @@ class _ReplayedTeam:
     def __init__(self, opening: Opening) -> None:
         self.envelopes = EnvelopeIndex()
         self._opening = opening
-        self._site = opening.site
-        self._world = World(opening.scenario, opening.seed, self._site)
+        self._setup = opening.setup
+        self._world = World(opening.scenario, opening.seed, self._setup)
         self._machines: dict[ParticipantId, StateMachine] = {}
 
     @property
@@ -216,4 +216,4 @@ class _ReplayedTeam:
 
     def _participant(self, name: ParticipantId) -> StateMachine:
         opening, body = self._opening, self._world.body(name)
-        return participant(name, opening.scenario, opening.seed, self._site, body)
+        return participant(name, opening.scenario, opening.seed, self._setup, body)

@@ -362,7 +362,7 @@ def _be_world_sim(
             return
         except ResumeError:  # nothing has happened yet
             past = None
-    setup = WorldSetup.of(scenario, seed) if past is None else past.opening.site
+    setup = WorldSetup.of(scenario, seed) if past is None else past.opening.setup
     mission = MissionConfig(scenario, seed, setup, config.exchange, config.speed)
     identity = credentials.find(secrets, credentials.HOST)
     users = credentials.users_file(secrets)

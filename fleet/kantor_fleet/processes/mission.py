@@ -29,13 +29,13 @@ def run(
 
     exchange: its name on record. exact_every: periods between exact distances, 0 for the end only.
     """
-    site = WorldSetup.of(scenario, seed)
-    warn(site.warnings)
+    setup = WorldSetup.of(scenario, seed)
+    warn(setup.warnings)
     folder = folder_for(scenario, seed, out)
     with Interrupts() as interrupts:
         if exchange == "in-process":
             recording = Recording(scenario, seed, exchange, folder, exact_every)
-            code = _run_in_process(scenario, seed, site, recording, interrupts)
+            code = _run_in_process(scenario, seed, setup, recording, interrupts)
         else:
             config = FleetConfig(scenario, seed, exchange, speed, folder, exact_every)
             code = _run_processes(config, interrupts)
@@ -44,7 +44,7 @@ def run(
 
 
 def _run_in_process(
-    scenario: Scenario, seed: int, site: WorldSetup, recording: Recording, interrupts: Interrupts
+    scenario: Scenario, seed: int, setup: WorldSetup, recording: Recording, interrupts: Interrupts
 ) -> Exit:
     with ProgressView(scenario.name) as view:
         warm_up()
@@ -56,7 +56,7 @@ def _run_in_process(
                 shown_s = time.monotonic()
                 view.show(progress(recording.metrics, scenario, "running", ""))
 
-        reason = play(scenario, seed, site, [recording.observe, show], stopped=interrupts)
+        reason = play(scenario, seed, setup, [recording.observe, show], stopped=interrupts)
         view.show(progress(recording.metrics, scenario, "over", reason))
     return exit_code_of(recording.finish())
 

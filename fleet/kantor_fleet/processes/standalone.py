@@ -54,9 +54,9 @@ def host_standalone(
     from kantor_worldsim.world.world import WorldSetup  # noqa: PLC0415
 
     _check_faults(scenario, exchange)
-    site = WorldSetup.of(scenario, seed)
-    warn(site.warnings)
-    plan = MissionConfig(scenario, seed, site, exchange, speed, start_after_s)
+    setup = WorldSetup.of(scenario, seed)
+    warn(setup.warnings)
+    plan = MissionConfig(scenario, seed, setup, exchange, speed, start_after_s)
 
     def record() -> tuple[Path, "Recording"]:
         folder = folder_for(scenario, seed, out)
@@ -85,7 +85,7 @@ def _go_on(folder: Path, past: "Past", listen: str, secrets: Path, fleet: str | 
     terms, opening = past.terms, past.opening
     scenario, seed, exchange = opening.scenario, opening.seed, terms.exchange
     _check_faults(scenario, exchange)
-    plan = MissionConfig(scenario, seed, opening.site, exchange, terms.speed)
+    plan = MissionConfig(scenario, seed, opening.setup, exchange, terms.speed)
 
     def record() -> tuple[Path, "Recording"]:
         every = terms.exact_every

@@ -65,13 +65,13 @@ class RunHistory:
     """The history of a run as far as its records have been followed."""
 
     def __init__(self, opening: Opening) -> None:
-        self.scenario, self.seed, self.site = opening.scenario, opening.seed, opening.site
+        self.scenario, self.seed, self.setup = opening.scenario, opening.seed, opening.setup
         self.metrics = metrics_of(self.scenario)
         self.end_ns = 0
         self.contact_s: float | None = None
         """The time at which a robot first received a message."""
         grain_m = _GRAIN * self._diagonal_m
-        starts_m = zip(self.scenario.robot_ids, self.site.starts_m.tolist(), strict=True)
+        starts_m = zip(self.scenario.robot_ids, self.setup.starts_m.tolist(), strict=True)
         self.trails = {name: Trail(x_m, y_m, grain_m) for name, (x_m, y_m) in starts_m}
         self.outages: list[Outage] = []
         """Outages in order of their ends; those without an end come last."""
@@ -84,7 +84,7 @@ class RunHistory:
             for name in fault.who
         }
         self._units = opening.units
-        self._left = np.full(self.site.samples_m.shape[0], self._units.sample, dtype=np.int64)
+        self._left = np.full(self.setup.samples_m.shape[0], self._units.sample, dtype=np.int64)
         self._finished_ns: dict[ParticipantId, int] = {}
         self._pairs = Pairs()
         self._pipeline = Pipeline(self.metrics)
@@ -107,8 +107,8 @@ class RunHistory:
     @property
     def _diagonal_m(self) -> float:
         """Diagonal of the map or of the domain, m."""
-        if self.site.ground is not None:
-            return self.site.ground.frame.diagonal_m
+        if self.setup.ground is not None:
+            return self.setup.ground.frame.diagonal_m
         domain = self.scenario.domain
         return float(np.hypot(*np.subtract(domain.max_m, domain.min_m)))
 

@@ -109,7 +109,7 @@ def draw_trails(axes: Axes, run: RunHistory) -> None:
     size, edge = (60.0, 1.0) if few else (16.0, 0.5)
     _add_marks(
         axes,
-        run.site.starts_m,
+        run.setup.starts_m,
         s=size,
         c=INK,
         marker="x",
@@ -132,7 +132,7 @@ def draw_deaths(axes: Axes, run: RunHistory) -> None:
 
 def draw_samples(axes: Axes, run: RunHistory, *, scale: bool = True) -> None:
     """Draw samples coloured by the weight left in them. scale: add the colour scale above the map."""
-    xy_m = run.walked(run.site.samples_m, run.scenario.samples.diffusion_m, Purpose.SAMPLE_WALK)
+    xy_m = run.walked(run.setup.samples_m, run.scenario.samples.diffusion_m, Purpose.SAMPLE_WALK)
     thin = thinned(xy_m.shape[0], _POINTS_SHOWN)  # samples lie along a curve, so this is even
     xy_m, share = xy_m[thin], run.share_left[thin]
     size = _mark_size(xy_m.shape[0], 16.0)
@@ -176,7 +176,7 @@ def draw_targets(axes: Axes, run: RunHistory) -> None:
     """Mark detected targets where they were found, the others where they are at the end."""
     finds = run.metrics.finds
     found_m = np.array([(x_m, y_m) for *_, x_m, y_m in finds]).reshape(-1, 2)
-    ends_m = run.walked(run.site.targets_m, run.scenario.targets.diffusion_m, Purpose.TARGET_WALK)
+    ends_m = run.walked(run.setup.targets_m, run.scenario.targets.diffusion_m, Purpose.TARGET_WALK)
     missed_m = np.delete(ends_m, [target for _, _, target, _, _ in finds], axis=0)
     size = _mark_size(ends_m.shape[0], 24.0)
     if found_m.size:

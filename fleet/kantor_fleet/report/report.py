@@ -240,7 +240,7 @@ def _draw_bounds(
 
 
 def _draw_progress(axes: Axes, run: RunHistory, rows: Sequence[DensityRow]) -> None:
-    targets = run.site.targets_m.shape[0]
+    targets = run.setup.targets_m.shape[0]
     energy = run.scenario.steps_per_robot * run.scenario.robots.count
     if targets:
         detected = [100.0 * row.detected / targets for row in rows]

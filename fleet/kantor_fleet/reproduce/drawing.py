@@ -72,7 +72,7 @@ def trajectories(settings: Mapping[str, Setting]) -> Figure:
     ):
         *_, run = _runs_at(setting, (1000,))
         _map(place, run)
-        found = f"{len(run.metrics.finds)} of {run.site.targets_m.shape[0]} targets"
+        found = f"{len(run.metrics.finds)} of {run.setup.targets_m.shape[0]} targets"
         write_title(place, f"({letter}) {name}: {found}")
     legend_below(figure, axes[0])
     return figure
@@ -201,7 +201,7 @@ def _snapshots(
     runs = _runs_at(setting, ticks, seed)
     for place, run, tick, letter in zip(places, runs, ticks, letters, strict=False):
         _map(place, run)
-        found = f", {len(run.metrics.finds)} detected" if run.site.targets_m.size else ""
+        found = f", {len(run.metrics.finds)} detected" if run.setup.targets_m.size else ""
         write_title(place, f"({letter}) {prefix}t = {tick}{found}")
     figure = places[0].figure
     assert isinstance(figure, Figure)

@@ -91,8 +91,8 @@ def run_measured(case: Case) -> MeasuredRun:
 
 def _run_one(case: Case) -> MeasuredRun:
     scenario, seed = case.scenario, case.seed
-    site = WorldSetup.of(scenario, seed)
-    machines = team(scenario, seed, site)
+    setup = WorldSetup.of(scenario, seed)
+    machines = team(scenario, seed, setup)
     timed = {
         name: _TimedParticipant(machine)
         for name, machine in machines.items()
@@ -101,7 +101,7 @@ def _run_one(case: Case) -> MeasuredRun:
     recording = Recording(
         scenario, seed, "in-process", exact_every=EXACT_EVERY if case.exact else None
     )
-    play(scenario, seed, site, [recording.observe], machines=machines | timed)
+    play(scenario, seed, setup, [recording.observe], machines=machines | timed)
     spent_ns = sum(robot.spent_ns for name, robot in timed.items() if name != SUPERVISOR)
     result = recording.finish()
     rows = recording.metrics.rows
@@ -118,7 +118,7 @@ def _run_one(case: Case) -> MeasuredRun:
 def records_of(setting: Setting, seed: int) -> list[Record]:
     """All records of one run, for a picture."""
     scenario = setting.find()
-    site = WorldSetup.of(scenario, seed)
+    setup = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    play(scenario, seed, site, [records.append])
+    play(scenario, seed, setup, [records.append])
     return records

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.replication.registers import Registers
 from kantor_protocol.replication.replica import Replica
-from kantor_protocol.replication.replica_kernels import NOBODY
+from kantor_protocol.replication.replica_kernels import NO_INDEX
 from kantor_protocol.scenario.clocks import step_clocks
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import (
@@ -39,8 +39,8 @@ class Gossip:
         roster = scenario.roster
         self._me, self._incarnation, self._roster = me, incarnation, len(roster)
         self._places = {name: i for i, name in enumerate(roster) if name != me}
-        self._supervisor = self._supervisor_id = self._places.get(SUPERVISOR, NOBODY)
-        """Its place, and the id of its newest incarnation; NOBODY without one."""
+        self._supervisor = self._supervisor_id = self._places.get(SUPERVISOR, NO_INDEX)
+        """Its place, and the id of its newest incarnation; NO_INDEX without one."""
         self._unheard_steps = -ack_timeout_steps(me, scenario)  # its first message takes its time
         """Own steps since a message of the supervisor was received."""
 
@@ -66,8 +66,8 @@ class Gossip:
 
     def compose(self, replica: Replica, step: int, pose: Pose) -> Envelope:
         """The envelope of one step, with what its receivers lack."""
-        to_all = self._supervisor == NOBODY or self._unheard_steps > CONTACT_PERIODS
-        receiver = NOBODY if to_all else self._supervisor_id
+        to_all = self._supervisor == NO_INDEX or self._unheard_steps > CONTACT_PERIODS
+        receiver = NO_INDEX if to_all else self._supervisor_id
         target = EVERYBODY if to_all else SUPERVISOR
         version_vector, logs, claims = replica.compose(receiver)
         message = GossipMessage(

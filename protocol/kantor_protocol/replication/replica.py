@@ -51,8 +51,8 @@ from kantor_protocol.replication.replica_kernels import (
     LOWERED,
     MALFORMED,
     MERGED,
+    NO_INDEX,
     NO_ROOM_TO_PACK,
-    NOBODY,
     RECEIVED_STEP,
     REPEATED_STEP,
     SAMPLE,
@@ -225,10 +225,10 @@ class Replica:
         self.registers.widen(origins)
 
     def claim(self, sample: int, now_ns: int) -> None:
-        """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
+        """Claim a sample (or NO_INDEX) from now on, or renew the claim that is held."""
         claim(self.store.claims, self.store.counters, self.config.me, sample, now_ns)
 
-    def compose(self, target: int = NOBODY) -> tuple[bytes, bytes, bytes]:
+    def compose(self, target: int = NO_INDEX) -> tuple[bytes, bytes, bytes]:
         """(version vector, logs, claims) of one message to all in range, or to one origin."""
         end_of_vector, end_of_logs, end = compose(*self._fields, self._out, self._least, target)
         message = self._out[:end].tobytes()
@@ -347,12 +347,12 @@ class Replica:
     def _validate_claims(self) -> None:
         store, me, step = self.store, self.config.me, self.store.counters[STEP]
         sample, since_ns, stamp, stamp_step = store.claims[[SAMPLE, SINCE_NS, STAMP, STAMP_STEP]]
-        assert ((sample >= NOBODY) & (sample < store.weights.shape[0])).all()
+        assert ((sample >= NO_INDEX) & (sample < store.weights.shape[0])).all()
         assert (since_ns >= 0).all()
         assert (stamp >= 0).all()
         assert ((stamp_step >= 0) & (stamp_step <= step)).all()
         unclaimed = stamp == 0
-        assert (sample[unclaimed] == NOBODY).all()
+        assert (sample[unclaimed] == NO_INDEX).all()
         assert not since_ns[unclaimed].any()
         assert not stamp_step[unclaimed].any()
         assert stamp[me] <= step
@@ -371,5 +371,5 @@ def _nothing_sent(origins: int, ack_timeout_steps: int) -> npt.NDArray[np.int64]
 def _no_claims(origins: int) -> npt.NDArray[np.int64]:
     """`ReplicaArrays.claims` before any participant has claimed a sample."""
     claims = np.zeros((4, origins), dtype=np.int64)
-    claims[SAMPLE] = NOBODY
+    claims[SAMPLE] = NO_INDEX
     return claims

@@ -10,8 +10,8 @@ from kantor_protocol.base.varint import put_int, put_uint, read_int, read_uint, 
 from kantor_protocol.replication.registers import FRESH_STEPS
 from kantor_protocol.wire.version_vector import count_ids, raise_entries
 
-NOBODY = -1
-"""Instead of a sample: none. Instead of an origin: none; as the target of a message: all participants in range."""
+NO_INDEX = -1
+"""Instead of a sample: none. Instead of an incarnation id: none; as the target of a message: all participants in range."""
 
 MERGED, MALFORMED = 0, -1
 
@@ -21,7 +21,7 @@ ENTRIES_MAX = 4096
 """Log entries in one message; the rest follows with the next."""
 
 _CLAIM_LEASE_STEPS = 12
-"""A claim that has not been renewed for so many of the holder's steps is void."""
+"""A claim that has not been renewed for so many of the holder's steps counts no more."""
 
 _CLAIM_RENEWAL_STEPS = 6
 """Steps by which a neighbour's knowledge of a foreign claim may be stale before a robot forwards the claim."""
@@ -70,7 +70,7 @@ class ReplicaArrays(NamedTuple):
     own id. From HISTORY on: the log lengths at each of the last `ack_timeout_steps` steps. Numbers of entries are at
     most `length`; steps are at most the current one, or -1 - ack_timeout_steps for never."""
     claims: npt.NDArray[np.int64]
-    """(4, n): sample or NOBODY; since_ns, never negative; stamp; own step at which the stamp was received, at most
+    """(4, n): sample or NO_INDEX; since_ns, never negative; stamp; own step at which the stamp was received, at most
     the current one, 0 for the own claim. An origin without a stamp has no sample and 0 in the other rows. The own
     stamp is the step of the last claim. Without claims no other origin has a stamp."""
     lowered: npt.NDArray[np.int32]
@@ -314,7 +314,7 @@ def _find_least(
     """The least that any neighbour, or the target alone, is known to hold, for each column of `known`.
 
     A neighbour is an origin from which a message was received lately. The origin of a column does not count there:
-    it holds its own state. NOBODY where no other counts.
+    it holds its own state. NO_INDEX where no other counts.
     """
     origins = store.length.shape[0]
     least[:] = KNOWN_MAX + 1
@@ -322,13 +322,13 @@ def _find_least(
         received = store.sending[RECEIVED_STEP, other]
         fresh_until = received + config.ack_timeout_steps + FRESH_STEPS
         lately = received >= 0 and fresh_until >= store.counters[STEP]
-        if lately and other != config.me and target in (NOBODY, other):
+        if lately and other != config.me and target in (NO_INDEX, other):
             log, claim = least[other], least[origins + other]
             for i in range(least.shape[0]):  # row by row: so the processor takes many at once
                 least[i] = min(least[i], store.known[other, i])
             least[other], least[origins + other] = log, claim
     for i in range(least.shape[0]):
-        least[i] = NOBODY if least[i] > KNOWN_MAX else least[i]
+        least[i] = NO_INDEX if least[i] > KNOWN_MAX else least[i]
 
 
 @kernel
@@ -500,7 +500,7 @@ def claimed_by_others(claims: np.ndarray, counters: np.ndarray, me: int, out: np
 
 @kernel
 def claim(claims: np.ndarray, counters: np.ndarray, me: int, sample: int, now_ns: int) -> None:
-    """Claim a sample (or NOBODY) from now on, or renew the claim that is held."""
+    """Claim a sample (or NO_INDEX) from now on, or renew the claim that is held."""
     if claims[SAMPLE, me] != sample:
         claims[SAMPLE, me] = sample
         # A clock may run wrong; a message holds no time before 0.

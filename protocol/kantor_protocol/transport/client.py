@@ -73,7 +73,7 @@ class ParticipantSession:
             self._received.put(sample.payload.to_bytes())
 
     def _on_transport(self, event: zenoh.TransportEvent) -> None:
-        """Check admission after a reconnection: it may be to a world-sim with another member list."""
+        """Check membership after a reconnection: it may be to a world-sim with another member list."""
         assert isinstance(self._identity, Certificate)
         with contextlib.suppress(zenoh.ZError):  # it was closed meanwhile
             if event.kind == zenoh.SampleKind.PUT and (
@@ -152,7 +152,7 @@ def client(connect: str, identity: Identity, connect_timeout_s: float) -> zenoh.
 
 
 def _check_admitted(connect: str, session: zenoh.Session, identity: Certificate) -> None:
-    """Ask the router for admission: a certificate may be valid and yet not in the member list. Raises BusError."""
+    """Ask the router whether this identity is a member: a certificate may be valid and yet not in the member list. Raises BusError."""
     reason = _reason_of_refusal(session, identity)
     if reason is None:
         raise BusError(

@@ -19,7 +19,7 @@ from kantor_agent.coordination.assignment import (
 )
 from kantor_agent.mapping.cost_map import CostMap
 from kantor_agent.mapping.fused_map import FusedMap
-from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_agent.planners.map_base import Situation, Task, TeamMember
 from kantor_protocol.base.grid import NOWHERE, Frame
 from kantor_protocol.replication.occupancy_log import entries
 from kantor_protocol.replication.registers import Registers
@@ -76,14 +76,16 @@ class World:
         self.log.append(np.array([2 * cell for cell in cells]))
         self.fused_map.fold(self.log)
 
-    def decide(self, *group: Member, tick: int = 10) -> dict[int, Task]:
+    def decide(self, *group: TeamMember, tick: int = 10) -> dict[int, Task]:
         """New tasks."""
         return self.assignment.decide(group, (), tick)
 
 
-def robot(place: int, target: int = NOWHERE, since: int = 0, *, arrived: bool = False) -> Member:
+def robot(
+    place: int, target: int = NOWHERE, since: int = 0, *, arrived: bool = False
+) -> TeamMember:
     """A member that stands in the middle."""
-    return Member(place, 22, Task(target), since, arrived)
+    return TeamMember(place, 22, Task(target), since, arrived)
 
 
 @pytest.fixture
@@ -192,7 +194,7 @@ def test_a_register_holds_the_whole_member(
     """Register and back; a memo loses zeros at its end."""
     while memo and memo[-1] == 0:
         memo.pop()
-    me = Member(1, cell, Task(target, tuple(memo)), since, arrived)
+    me = TeamMember(1, cell, Task(target, tuple(memo)), since, arrived)
     register = np.zeros(20, dtype=np.int64)
     numbers = robot_register(me, resting=False)
     register[: len(numbers)] = numbers

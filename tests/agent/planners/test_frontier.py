@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from kantor_agent.coordination.assignment import Assignment
 from kantor_agent.planners.frontier import Frontier
-from kantor_agent.planners.map_base import Member, Situation
+from kantor_agent.planners.map_base import Situation, TeamMember
 from kantor_protocol.base.grid import NOWHERE
 from support.floors import Floor, crowded, drawn, robot
 from support.strategies import examples
@@ -112,6 +112,6 @@ def test_a_robot_visits_every_frontier_before_it_returns_to_one() -> None:
     for tick in range(10, 60, 10):
         task = assignment.decide([member], (), tick)[0]
         visits.append(task.target)
-        member = Member(0, task.target, task, tick, arrived=True)
+        member = TeamMember(0, task.target, task, tick, arrived=True)
 
     assert visits == [7, 11, 13, 17, 7]

@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from kantor_agent.mapping.cost_map import CostMap
 from kantor_agent.planners import kmeans
 from kantor_agent.planners.kmeans import NO_REGION, PARTS, ROUNDS, KMeans, Regions, blocked, choose
-from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_agent.planners.map_base import Situation, Task, TeamMember
 from kantor_fleet.execution.in_process_team import play, team
 from kantor_protocol.base.counter_rng import Purpose, uniform
 from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN
@@ -64,8 +64,8 @@ def scene(*rows: str, memos: tuple[tuple[int, ...], ...] = (), dead: int = NOWHE
 
 def member(
     robot: int, cell: int, target: int = NOWHERE, memo: tuple[int, ...] = (), since: int = 0
-) -> Member:
-    return Member(robot, cell, Task(target, memo), since, arrived=False)
+) -> TeamMember:
+    return TeamMember(robot, cell, Task(target, memo), since, arrived=False)
 
 
 def assign(situation: Situation, seed: int = 1) -> list[Task]:
@@ -441,7 +441,7 @@ class Plain:
         line = plain_line(self.at(one), self.at(other))
         return any(self.kinds[place] == OCCUPIED for place in line)
 
-    def travel(self, robot: Member, cell: int) -> float:
+    def travel(self, robot: TeamMember, cell: int) -> float:
         return float(self.situation.cost_map.travel(robot.cell)[cell])
 
     def points(self) -> list[int]:
@@ -450,7 +450,7 @@ class Plain:
         open_parts = {labels[n] for f in self.frontiers for n in self.beside(f)} - {0}
         return sorted({*self.frontiers, *np.flatnonzero(np.isin(labels, list(open_parts)))})
 
-    def start(self, robot: Member) -> tuple[int, int]:
+    def start(self, robot: TeamMember) -> tuple[int, int]:
         count, row, column = (*robot.task.memo, 0, 0, 0)[:3]
         edge = [PARTS * (side - 1) for side in self.shape]
         if count >= WARM:
@@ -458,7 +458,7 @@ class Plain:
         key = (self.seed, Purpose.CENTROIDS, robot.robot, max(count, 0))
         return round(uniform(*key, 0) * edge[0]), round(uniform(*key, 1) * edge[1])
 
-    def region_distance(self, robot: Member, k: int) -> tuple[float, int, bool]:
+    def region_distance(self, robot: TeamMember, k: int) -> tuple[float, int, bool]:
         """Eq. 1-3: how far, to which contour cell, and whether it is accessible."""
         own = [p for p in self.region if self.region[p] == k]
         hidden = [p for p in own if self.unknown(p)]
@@ -481,7 +481,7 @@ class Plain:
         ]
         return (*min(flights), False)
 
-    def spaced(self, robots: list[Member]) -> list[int]:
+    def spaced(self, robots: list[TeamMember]) -> list[int]:
         cheapest = {f: min(self.travel(m, f) for m in robots) for f in self.frontiers}
         far, kept = self.situation.cost_map.sensor_cells**2, []
         for f in sorted(self.frontiers, key=lambda f: (cheapest[f], f)):
@@ -529,7 +529,7 @@ class Plain:
             for m in members
         ]
 
-    def cost(self, robot: Member, f: int, cc: int | None, taken: list[int]) -> float:
+    def cost(self, robot: TeamMember, f: int, cc: int | None, taken: list[int]) -> float:
         """Eq. 6."""
         cost = self.travel(robot, f)
         if cc is not None:
@@ -541,7 +541,7 @@ class Plain:
         return cost
 
 
-def plain_group(situation: Situation) -> list[Member]:
+def plain_group(situation: Situation) -> list[TeamMember]:
     return sorted((*situation.members, *situation.others), key=lambda m: m.robot)
 
 
@@ -678,10 +678,10 @@ def test_four_robots_explore_all_observable_cells(layout: str, coordination: str
         f"coordination={coordination}",
         "sensor.range_m=8.0",
     )
-    site = WorldSetup.of(scenario, 3)
-    machines = team(scenario, 3, site)
-    assert play(scenario, 3, site, (), machines=machines) == "done"
+    setup = WorldSetup.of(scenario, 3)
+    machines = team(scenario, 3, setup)
+    assert play(scenario, 3, setup, (), machines=machines) == "done"
     ground, _ = ground_of(scenario)
-    seen = observable(ground, site.starts_m).ravel()
+    seen = observable(ground, setup.starts_m).ravel()
     known = machines["r1"]._fused_map.explored()
     assert known[seen].mean() > 0.99

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_agent.mapping.cost_map import CostMap
-from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_agent.planners.map_base import Situation, Task, TeamMember
 from kantor_agent.planners.market.costs import NO_ROBOT, Costs, price_of, separate
 from kantor_agent.planners.market.goals import (
     clear_disc,
@@ -68,13 +68,16 @@ CORRIDOR = "????............????"
 IDLE = Task()
 
 
-def member(robot: int, cell: int, task: Task = IDLE) -> Member:
+def member(robot: int, cell: int, task: Task = IDLE) -> TeamMember:
     """A robot under way."""
-    return Member(robot, cell, task, 0, arrived=False)
+    return TeamMember(robot, cell, task, 0, arrived=False)
 
 
 def situation(
-    cost_map: CostMap, members: Sequence[Member], others: Sequence[Member] = (), tick: int = 10
+    cost_map: CostMap,
+    members: Sequence[TeamMember],
+    others: Sequence[TeamMember] = (),
+    tick: int = 10,
 ) -> Situation:
     """What is known."""
     return Situation(
@@ -523,8 +526,8 @@ class Net:
         self.floors = [floor] * self.robots
         self.markets = [Market(scenario, 0, robot) for robot in range(self.robots)]
         self.members = [member(robot, cell) for robot, cell in enumerate(cells)]
-        self.received: list[dict[int, tuple[int, int, Member]]] = [{} for _ in cells]
-        self.under_way: list[tuple[int, int, int, Member]] = []
+        self.received: list[dict[int, tuple[int, int, TeamMember]]] = [{} for _ in cells]
+        self.under_way: list[tuple[int, int, int, TeamMember]] = []
         self.step = 0
 
     def play(self, steps: int, radio: Radio = perfect_radio) -> None:
@@ -551,7 +554,7 @@ class Net:
                 received[sender.robot] = (stamp, self.step, sender)
         self.under_way = [copy for copy in self.under_way if copy[0] > self.step]
 
-    def _asked(self, robot: int) -> Member:
+    def _asked(self, robot: int) -> TeamMember:
         me = self.members[robot]
         others = [
             sender
@@ -756,7 +759,7 @@ def test_silent_robot_out_of_contact_does_not_hold_up_an_offer() -> None:
     assert net.tour(0) == [W, E]
 
 
-def answer(seen: int, *tour: tuple[int, int]) -> Member:
+def answer(seen: int, *tour: tuple[int, int]) -> TeamMember:
     """r1 with what it has seen of r0."""
     return member(1, 311, Task(23, packed(Memo(9, NOWHERE, 0, 0, (seen, 0, 0), (0, 0, 0), tour))))
 
@@ -774,7 +777,7 @@ def answer(seen: int, *tour: tuple[int, int]) -> Member:
     ],
 )
 def test_seller_releases_only_what_the_successor_holds_without_a_successor(
-    what: str, successor: Member, after: list[int]
+    what: str, successor: TeamMember, after: list[int]
 ) -> None:
     """r0 has named r1 in its memo 60."""
     market = Market(mission(), 0, 0)

@@ -34,7 +34,7 @@ from kantor_protocol.wire.weights import Units, WeightsSubscriber
 from kantor_supervisor.density import DensitySupervisor
 from kantor_worldsim.record.records import Batch, Ending, Record
 from kantor_worldsim.world.world import WorldSetup
-from support.missions import on_map, site_of
+from support.missions import on_map, setup_of
 from support.strategies import (
     MINIMUM,
     VALIDATED_ROUNDS,
@@ -344,14 +344,14 @@ class Faulty:
         self,
         name: ParticipantId,
         scenario: Scenario,
-        site: WorldSetup,
+        setup: WorldSetup,
         *,
         deaths: tuple[int, ...] = (),
         silent: tuple[int, int] = (0, 0),
         skew_s: Callable[[int], float] = lambda _step: 0.0,
     ) -> None:
-        self._build = lambda body: participant(name, scenario, 1, site, body)
-        self.machine = self._build(Body(site.poses(scenario)[name]))
+        self._build = lambda body: participant(name, scenario, 1, setup, body)
+        self.machine = self._build(Body(setup.poses(scenario)[name]))
         self._deaths, self._silent, self._skew_s = deaths, silent, skew_s
         self._step, self._incarnation = 0, 0
 
@@ -384,9 +384,9 @@ def without_messages(outputs: Outputs) -> Outputs:
 
 def explore(scenario: Scenario, faulty: dict[ParticipantId, Faulty]) -> list[Record]:
     """A mission with some faulty participants; no step breaks a rule of world-sim."""
-    site, records = site_of(scenario), list[Record]()
-    machines = team(scenario, 1, site) | faulty
-    play(scenario, 1, site, [records.append], machines=machines)
+    setup, records = setup_of(scenario), list[Record]()
+    machines = team(scenario, 1, setup) | faulty
+    play(scenario, 1, setup, [records.append], machines=machines)
     for batch in records:
         for step_record in batch.step_records if isinstance(batch, Batch) else ():
             assert step_record.verdict is not None
@@ -401,10 +401,10 @@ def explore(scenario: Scenario, faulty: dict[ParticipantId, Faulty]) -> list[Rec
 def test_map_is_explored_whatever_incarnations_begin(planner: str, coordination: str) -> None:
     """Layers of earlier incarnations count on; a robot that comes back gets targets and rests at last."""
     scenario = on_map(f"planner.name={planner}", f"coordination={coordination}", "limit_s=300")
-    site = site_of(scenario)
-    faulty = {"r2": Faulty("r2", scenario, site, deaths=(5, 11))}
+    setup = setup_of(scenario)
+    faulty = {"r2": Faulty("r2", scenario, setup, deaths=(5, 11))}
     if scenario.centralized:
-        faulty[SUPERVISOR] = Faulty(SUPERVISOR, scenario, site, deaths=(8,), silent=(8, 25))
+        faulty[SUPERVISOR] = Faulty(SUPERVISOR, scenario, setup, deaths=(8,), silent=(8, 25))
     records = explore(scenario, faulty)
     robot = faulty["r2"].machine
 
@@ -428,14 +428,14 @@ def test_map_is_explored_by_a_clock_that_jumps_and_comes_back(
         "planner.replan_gap=3",
         "limit_s=300",
     )
-    site = site_of(scenario)
+    setup = setup_of(scenario)
 
     def skew_s(step: int) -> float:
         return ahead_s if 4 <= step < 12 else 0.0
 
     whose = (*scenario.robot_ids[:1], *([SUPERVISOR] if scenario.centralized else []))
     for who in whose:
-        records = explore(scenario, {who: Faulty(who, scenario, site, skew_s=skew_s)})
+        records = explore(scenario, {who: Faulty(who, scenario, setup, skew_s=skew_s)})
 
         assert isinstance(records[-1], Ending)
         assert records[-1].reason == "done"

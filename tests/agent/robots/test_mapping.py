@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kantor_agent.coordination import assignment
-from kantor_agent.planners.map_base import Member, Task
+from kantor_agent.planners.map_base import Task, TeamMember
 from kantor_agent.robots.mapping import MappingRobot
 from kantor_fleet.execution.in_process_team import play, team
 from kantor_protocol.base.grid import FREE, UNKNOWN
@@ -83,14 +83,14 @@ class Played:
             count=scenario.robots.count,
             seed=seed,
         )
-        site = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), starts_m, ground)
-        self.machines: dict[str, Any] = dict(team(scenario, seed, site))
+        setup = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), starts_m, ground)
+        self.machines: dict[str, Any] = dict(team(scenario, seed, setup))
         self.records: list[Record] = []
         machines: dict[str, StateMachine] = dict(self.machines)
         if disturb is not None:
             disturb(machines)
         observers = [self.records.append, self._validate]
-        self.reason = play(scenario, seed, site, observers, machines=machines)
+        self.reason = play(scenario, seed, setup, observers, machines=machines)
         self.ground = ground
         self.observable = observable(ground, starts_m).ravel()
 
@@ -148,7 +148,7 @@ def test_robots_that_know_the_same_come_to_the_same_assignment(
     decide = assignment.Assignment.decide
 
     def noted(
-        self: assignment.Assignment, group: list[Member], absent: list[int], tick: int
+        self: assignment.Assignment, group: list[TeamMember], absent: list[int], tick: int
     ) -> dict[int, Task]:
         tasks = decide(self, group, absent, tick)
         decided.setdefault(tick, []).append(tasks)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX, known_ids
 from kantor_protocol.replication.registers import Registers, read_register
 from kantor_protocol.replication.replica import Replica
-from kantor_protocol.replication.replica_kernels import NOBODY, spend
+from kantor_protocol.replication.replica_kernels import NO_INDEX, spend
 from kantor_protocol.wire.version_vector import covered_ids, read_version_vector
 from kantor_protocol.wire.weights import Units
 from support import replicas
@@ -60,7 +60,7 @@ def buy(held: Replica, sample: int, units: int) -> None:
         spend(held.store, held.config, sample, units)
 
 
-def tell(held: Replica, *others: Replica, target: int = NOBODY) -> None:
+def tell(held: Replica, *others: Replica, target: int = NO_INDEX) -> None:
     """One message to others, and the end of the step."""
     word = (*held.compose(target), held.registers.compose(target))
     held.end_step()

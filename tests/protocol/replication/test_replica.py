@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_protocol.replication.replica import Replica
-from kantor_protocol.replication.replica_kernels import KNOWN_MAX, NOBODY, spend
+from kantor_protocol.replication.replica_kernels import KNOWN_MAX, NO_INDEX, spend
 from kantor_protocol.wire.weights import Units
 from support import replicas
 from support.strategies import examples
@@ -650,7 +650,7 @@ def test_renewal_keeps_the_first_time() -> None:
     """A claim is dated by when the robot first headed there without a break."""
     a = replica(0, 2, ledger=True)
     since_ns = []
-    for sample, now_ns in ((3, 100), (3, 200), (4, 300), (3, 400), (NOBODY, 500)):
+    for sample, now_ns in ((3, 100), (3, 200), (4, 300), (3, 400), (NO_INDEX, 500)):
         a.claim(sample, now_ns)
         since_ns.append(int(a.store.claims[1, 0]))
         a.end_step()
@@ -664,7 +664,7 @@ def test_claimed_sample_is_left_by_who_has_none() -> None:
     b.claim(3, 100)
     a.merge(1, *b.compose())
     b.end_step()
-    b.claim(NOBODY, 200)
+    b.claim(NO_INDEX, 200)
     left = replicas.claimed_by_others(a)
     a.merge(1, *b.compose())
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from kantor_protocol.replication.replica import Replica
-from kantor_protocol.replication.replica_kernels import NOBODY, spend
+from kantor_protocol.replication.replica_kernels import NO_INDEX, spend
 from kantor_protocol.wire.weights import Units
 from support import replicas
 from support.strategies import examples
@@ -108,7 +108,7 @@ class Replicas(RuleBasedStateMachine):
         self.made[who] = self.born(self.made[who].config.me + len(self.made))
         self.seen[who] = [UNITS.sample] * N
 
-    @rule(who=st.integers(0, 3), sample=st.integers(NOBODY, N - 1))
+    @rule(who=st.integers(0, 3), sample=st.integers(NO_INDEX, N - 1))
     def head_for(self, who: int, sample: int) -> None:
         """A robot claims a sample, or gives its claim up."""
         held = self.made[who % len(self.made)]

@@ -432,14 +432,14 @@ def test_a_world_with_a_map_goes_on_from_its_record(coordination: str) -> None:
         "radio.range_m=6",
         "vehicle.speed_m_s=10",
     )
-    site = WorldSetup(
+    setup = WorldSetup(
         np.zeros((0, 2)), np.array([[9.5, 4.5]]), np.array([[1.5, 1.5], [2.5, 1.5]]), ROOMS
     )
     lost = Kill(who=("r1",), from_s=0.42, until_s=0.91, disk="lost")
 
     def explored(outage: Kill | Pause) -> list[Batch]:
         records: list[Record] = []
-        play(replace(scenario, faults=(lost, outage)), 1, site, [records.append])
+        play(replace(scenario, faults=(lost, outage)), 1, setup, [records.append])
         assert isinstance(records[-1], Ending)
         assert records[-1].reason == "done"
         assert [event.incarnation for event in process_events(records) if event.step] == [1]
@@ -460,10 +460,10 @@ CRASHES = (
 )
 
 
-def killable_team(scenario: Scenario, site: WorldSetup) -> dict[ParticipantId, KillableNode]:
+def killable_team(scenario: Scenario, setup: WorldSetup) -> dict[ParticipantId, KillableNode]:
     def killable_node(name: ParticipantId) -> KillableNode:
-        place = Simulation(scenario, 1, site, []).body(name).pose
-        build = functools.partial(participant, name, scenario, 1, site)
+        place = Simulation(scenario, 1, setup, []).body(name).pose
+        build = functools.partial(participant, name, scenario, 1, setup)
         return KillableNode(build, Body(place))
 
     return {name: killable_node(name) for name in scenario.roster}
@@ -473,19 +473,19 @@ def killable_team(scenario: Scenario, site: WorldSetup) -> dict[ParticipantId, K
 def test_a_mission_goes_on_from_any_record(pace: str) -> None:
     """Stopped at any record and resumed from the records, with the robots as they are: the same record."""
     scenario = troubled(*CRASHES, overrides=(*LOSSY, *PACES[pace], "limit_s=3"))
-    site = WorldSetup.of(scenario, 1)
+    setup = WorldSetup.of(scenario, 1)
     whole: list[Record] = []
-    play(scenario, 1, site, [whole.append])
+    play(scenario, 1, setup, [whole.append])
     for asks in range(1, 60, 2):
-        exchange = InProcessExchange(killable_team(scenario, site))
+        exchange = InProcessExchange(killable_team(scenario, setup))
         left = iter(range(asks))
         records: list[Record] = []
-        simulation = Simulation(scenario, 1, site, [records.append])
+        simulation = Simulation(scenario, 1, setup, [records.append])
         simulate(simulation, exchange, 1, lambda left=left: next(left, None) is None, exchange)  # type: ignore[misc]
         if records[-1] == whole[-1]:
             break
         records.pop()
-        again = Simulation.resumed(scenario, 1, site, tuple(records), [records.append])
+        again = Simulation.resumed(scenario, 1, setup, tuple(records), [records.append])
         simulate(again, exchange, 1, lambda: False, exchange)
 
         assert records == whole
@@ -494,7 +494,7 @@ def test_a_mission_goes_on_from_any_record(pace: str) -> None:
 def test_records_that_do_not_follow_are_refused() -> None:
     """A journal of another version, or one that was changed, is refused with the number of the record."""
     scenario = troubled(overrides=LOSSY)
-    site = WorldSetup.of(scenario, 1)
+    setup = WorldSetup.of(scenario, 1)
     records = run(overrides=LOSSY)
     number, batch = next(
         (i, record)
@@ -517,9 +517,9 @@ def test_records_that_do_not_follow_are_refused() -> None:
         replace(batch, out_of_range=99),
     ):
         with pytest.raises(ForeignRecordError, match=f"^record {number}: "):
-            Simulation.resumed(scenario, 1, site, [*records[:number], changed], [])
+            Simulation.resumed(scenario, 1, setup, [*records[:number], changed], [])
     with pytest.raises(ForeignRecordError, match=f"^record {len(records) - 1}: "):
-        Simulation.resumed(scenario, 1, site, records, [])
+        Simulation.resumed(scenario, 1, setup, records, [])
 
 
 def test_only_received_envelopes_are_removed_from_those_in_flight() -> None:

@@ -61,11 +61,11 @@ def run(
     prepare: Callable[[Simulation], None] = lambda simulation: None,
 ) -> list[Record]:
     """The records of a mission with another exchange, stop condition or simulation."""
-    site = WorldSetup.of(scenario, 1)
+    setup = WorldSetup.of(scenario, 1)
     records: list[Record] = []
-    simulation = Simulation(scenario, 1, site, [records.append])
+    simulation = Simulation(scenario, 1, setup, [records.append])
     prepare(simulation)
-    simulate(simulation, exchange(InProcessExchange(team(scenario, 1, site))), 1, stopped)
+    simulate(simulation, exchange(InProcessExchange(team(scenario, 1, setup))), 1, stopped)
     return records
 
 
@@ -76,9 +76,9 @@ def test_the_same_seed_gives_the_same_record() -> None:
     """Twice the same digest; another seed, another one."""
     scenario = mission("coordination=centralized", *LOSSY)
     first, second = (digest(tuple(run(scenario))) for _ in range(2))
-    site = WorldSetup.of(scenario, 2)
+    setup = WorldSetup.of(scenario, 2)
     others: list[Record] = []
-    play(scenario, 2, site, [others.append])
+    play(scenario, 2, setup, [others.append])
 
     assert first == second
     assert digest(tuple(others)) != first
@@ -97,9 +97,9 @@ from kantor_worldsim.world.world import WorldSetup
 text, *overrides = sys.argv[1:]
 for coordination in ("centralized", "decentralized"):
     scenario = parse(text, "-", [f"coordination={coordination}", *overrides])
-    site = WorldSetup.of(scenario, 1)
+    setup = WorldSetup.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process")
-    play(scenario, 1, site, [recording.observe])
+    play(scenario, 1, setup, [recording.observe])
     print(recording.finish().digest)
 """
 
@@ -127,10 +127,10 @@ def test_a_record_does_not_depend_on_the_hash_seed() -> None:
 
 def by_definition(scenario: Scenario, seed: int) -> list[Record]:
     """The definition of `simulate`: one moment after the other, without looking ahead."""
-    site = WorldSetup.of(scenario, seed)
+    setup = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    simulation = Simulation(scenario, seed, site, [records.append])
-    machines = team(scenario, seed, site)
+    simulation = Simulation(scenario, seed, setup, [records.append])
+    machines = team(scenario, seed, setup)
     owned = step_clocks(scenario, seed)
     steps = dict.fromkeys(owned, 1)
     while True:

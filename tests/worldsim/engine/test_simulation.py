@@ -41,11 +41,11 @@ class ScriptedMission:
 
     def __init__(self, *overrides: str) -> None:
         scenario = mission("sensor.range_m=5", *overrides)
-        site = WorldSetup(
+        setup = WorldSetup(
             np.zeros((12, 2)), np.array([[3.0, 0.0]]), np.array(list(STARTS.values()))
         )
         self.records: list[Record] = []
-        self.simulation = Simulation(scenario, 1, site, [self.records.append])
+        self.simulation = Simulation(scenario, 1, setup, [self.records.append])
         self.step = 0
 
     def play(self, **step_records: Outputs | None) -> Batch:
@@ -85,7 +85,7 @@ def test_the_opening_has_all_that_the_run_starts_from() -> None:
 
     assert isinstance(opening, Opening)
     assert opening.scenario == scripted.simulation.scenario
-    assert opening.site.starts_m.tolist() == [list(place) for place in STARTS.values()]
+    assert opening.setup.starts_m.tolist() == [list(place) for place in STARTS.values()]
     assert opening.first_look == {"r1": ((0, 3.0, 0.0),), "r2": (), "r3": ()}
     assert (opening.units.sample, opening.units.point) == (5, 2)
 
@@ -290,8 +290,8 @@ def explored(ground: Ground, *overrides: str) -> list[Record]:
     starts_m = np.array([[1.5, 1.5], [2.5, 1.5]])
     records: list[Record] = []
     stopped = iter(range(200))
-    site = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), starts_m, ground)
-    play(scenario, 1, site, [records.append], stopped=lambda: next(stopped, None) is None)
+    setup = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), starts_m, ground)
+    play(scenario, 1, setup, [records.append], stopped=lambda: next(stopped, None) is None)
     return records
 
 
@@ -320,7 +320,7 @@ def test_a_mission_on_a_map_is_the_same_from_its_opening(overrides: tuple[str, .
     records = explored(FLAT, *overrides)
     opening = records[0]
     assert isinstance(opening, Opening)
-    ground = opening.site.ground
+    ground = opening.setup.ground
     assert ground is not None
     again = explored(ground, *overrides)
 

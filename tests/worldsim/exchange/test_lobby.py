@@ -1,4 +1,4 @@
-"""The lobby: admission of processes, with a simulated bus."""
+"""The lobby: membership of processes, with a simulated bus."""
 
 from typing import cast
 

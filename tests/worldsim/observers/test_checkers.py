@@ -691,13 +691,13 @@ def _goal_is_used_up(records: Records) -> list[Record]:
         for sample, left in entries(step_record.outputs.lowered)
         if left == 0
     )
-    place = opening(records).site.samples_m[empty].tolist()
+    place = opening(records).setup.samples_m[empty].tolist()
     return put_act(records, mine[-2], outputs(goal=tuple(place)))
 
 
 @breaks("goal", run=MERGES["min"])
 def _goal_was_emptied_by_news(records: Records) -> list[Record]:
-    places_m = opening(records).site.samples_m.tolist()
+    places_m = opening(records).setup.samples_m.tolist()
     for step_record in step_records(records, "r1"):
         shipped = {sample for sample, _ in entries(step_record.outputs.spent)}
         for sample, left in entries(step_record.outputs.lowered):

@@ -45,10 +45,10 @@ class _Patient(Simulation):
 def rested(*overrides: str, seed: int = 1) -> list[Record]:
     """The records of a mission that goes on until news could be everywhere."""
     scenario: Scenario = mission(*SIZE, *overrides)
-    site = WorldSetup.of(scenario, seed)
+    setup = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    simulation = _Patient(scenario, seed, site, [records.append])
-    exchange = InProcessExchange(team(scenario, seed, site))
+    simulation = _Patient(scenario, seed, setup, [records.append])
+    exchange = InProcessExchange(team(scenario, seed, setup))
     simulate(simulation, exchange, seed, lambda: False, exchange)
     return records
 

@@ -32,7 +32,7 @@ from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.records import Batch, Opening, Record, StepRecord
 from kantor_worldsim.world.maps import Ground, parts
 from support.grounds import grounds
-from support.missions import ROOMS, explored, on_map, site_of
+from support.missions import ROOMS, explored, on_map, setup_of
 from support.replicas import read_logs
 from support.strategies import examples
 
@@ -69,7 +69,7 @@ class Witness:
 
     def __init__(self, records: Records) -> None:
         assert isinstance(records[0], Opening)
-        scenario, ground = records[0].scenario, records[0].site.ground
+        scenario, ground = records[0].scenario, records[0].setup.ground
         assert ground is not None
         self.frame, names = ground.frame, scenario.robot_ids
         self.first: dict[int, int] = {}
@@ -239,12 +239,12 @@ def test_metrics_keep_the_tracker_up_to_date() -> None:
 def test_lost_steps_are_no_violations(radio: tuple[str, ...]) -> None:
     """A robot whose output was lost is asked again; it is not accused of that."""
     scenario = on_map(*radio)
-    site = site_of(scenario)
+    setup = setup_of(scenario)
     records: list[Record] = []
-    simulation = Simulation(scenario, 1, site, [records.append])
-    build = functools.partial(participant, "r1", scenario, 1, site)
+    simulation = Simulation(scenario, 1, setup, [records.append])
+    build = functools.partial(participant, "r1", scenario, 1, setup)
     play_all = InProcessExchange(
-        team(scenario, 1, site) | {"r1": KillableNode(build, simulation.body("r1"))}
+        team(scenario, 1, setup) | {"r1": KillableNode(build, simulation.body("r1"))}
     )
     rounds = iter(range(10_000))
 
@@ -277,7 +277,7 @@ def test_any_small_map_is_explored_and_judged(ground: Ground, data: st.DataObjec
         f"sensor.range_m={4.0 * side_m}",
     )
     records: list[Record] = []
-    reason = play(scenario, 1, site_of(scenario, ground), [records.append])
+    reason = play(scenario, 1, setup_of(scenario, ground), [records.append])
     map_tracker, witness = surveyed(records), Witness(records)
 
     assert reason == "done"

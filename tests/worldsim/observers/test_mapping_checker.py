@@ -27,7 +27,7 @@ from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
 from support.checkers import listed, rules
 from support.grounds import drawn
-from support.missions import ROOMS, explored, on_map, site_of
+from support.missions import ROOMS, explored, on_map, setup_of
 from support.replicas import read_logs
 
 Records = Sequence[Record]
@@ -430,7 +430,7 @@ def test_mission_without_a_way_out_is_sound() -> None:
     ground = drawn("#####", "#.#.#", "#####")
     scenario = on_map("starts.poses_m=[[1.5, 1.5], [3.5, 1.5]]")
     records: list[Record] = []
-    play(scenario, 1, site_of(scenario, ground), [records.append])
+    play(scenario, 1, setup_of(scenario, ground), [records.append])
 
     assert rules(records) == set()
 

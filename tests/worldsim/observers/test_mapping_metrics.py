@@ -21,7 +21,7 @@ from kantor_worldsim.observers.recording import Recording, metrics_of
 from kantor_worldsim.radio.channel import DROPPED
 from kantor_worldsim.record.records import Batch, Ending, Opening, Record, StepRecord, opening_of
 from kantor_worldsim.world.world import StepVerdict
-from support.missions import ROOMS, explored, on_map, site_of
+from support.missions import ROOMS, explored, on_map, setup_of
 from support.strategies import mission
 
 PERIOD_NS = 100_000_000
@@ -255,7 +255,7 @@ class Errand:
         self.scenario = on_map("robots.count=1", "starts.poses_m=[[1.5, 8.5]]", "metrics.every=1")
         self.metrics = MapMetrics()
         self.pipeline = Pipeline(self.metrics)
-        self.pipeline.observe(opening_of(self.scenario, 1, site_of(self.scenario), {"r1": ()}))
+        self.pipeline.observe(opening_of(self.scenario, 1, setup_of(self.scenario), {"r1": ()}))
         self.tick = 0
         self.pose = Pose(1.5, 8.5)
 
@@ -363,7 +363,7 @@ def test_run_folder_has_rows_and_result(tmp_path: Path) -> None:
     """metrics.csv has a map's columns, result.json its part, and metrics and checker share one map tracker."""
     scenario = on_map()
     recording = Recording(scenario, 1, "in-process", tmp_path)
-    play(scenario, 1, site_of(scenario), [recording.observe])
+    play(scenario, 1, setup_of(scenario), [recording.observe])
     result = recording.finish()
     head, *lines = (tmp_path / "metrics.csv").read_text(encoding="utf-8").splitlines()
     stored = msgspec.json.decode((tmp_path / "result.json").read_bytes(), type=Result)

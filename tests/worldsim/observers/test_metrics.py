@@ -92,12 +92,12 @@ class Line:
 
     def __init__(self, *overrides: str) -> None:
         scenario = parse(LINE, "line", overrides)
-        site = WorldSetup(
+        setup = WorldSetup(
             np.array(SAMPLES_M), np.zeros((0, 2)), np.array([[0.0, 0.0], [40.0, 0.0]])
         )
         self.metrics = DensityMetrics()
         self.pipeline = Pipeline(self.metrics)
-        self.pipeline.observe(opening_of(scenario, 1, site, {"r1": (), "r2": ()}))
+        self.pipeline.observe(opening_of(scenario, 1, setup, {"r1": (), "r2": ()}))
         self.tick = 0
 
     def play(self, *step_records: StepRecord) -> None:
@@ -229,8 +229,8 @@ def test_cost_is_taken_where_the_sample_then_is() -> None:
 def _walking_run() -> Iterable[Record]:
     scenario = mission("samples.diffusion_m=3.0", "metrics.every=1")
     records: list[Record] = []
-    site = WorldSetup.of(scenario, 1)
-    play(scenario, 1, site, [records.append])
+    setup = WorldSetup.of(scenario, 1)
+    play(scenario, 1, setup, [records.append])
     return records
 
 
@@ -239,9 +239,9 @@ def _walking_run() -> Iterable[Record]:
 
 def plain_bound(opening: Opening) -> float:
     """Eq. 6, 11 and 12 at t = 0: all mass, over its distance to every robot, summed."""
-    site = opening.site
-    way_m = np.linalg.norm(site.starts_m[:, None] - site.samples_m[None], axis=2)
-    return float(way_m.sum() / site.samples_m.shape[0])
+    setup = opening.setup
+    way_m = np.linalg.norm(setup.starts_m[:, None] - setup.samples_m[None], axis=2)
+    return float(way_m.sum() / setup.samples_m.shape[0])
 
 
 @pytest.mark.parametrize("coordination", ["centralized", "decentralized"])
@@ -276,8 +276,8 @@ def test_views_follow_the_robots(coordination: str, merge: tuple[str, ...]) -> N
         "publish.weights_every=3",
         *merge,
     )
-    site = WorldSetup.of(scenario, 1)
-    machines = team(scenario, 1, site)
+    setup = WorldSetup.of(scenario, 1)
+    machines = team(scenario, 1, setup)
     subscribers = {name: WeightsSubscriber() for name in scenario.roster}
     pairs = Pairs()
     units = 3
@@ -298,7 +298,7 @@ def test_views_follow_the_robots(coordination: str, merge: tuple[str, ...]) -> N
                 assert published(subscribers[step_record.name]) == held.tolist()
             compared += 1
 
-    simulation = Simulation(scenario, 1, site, [compare])
+    simulation = Simulation(scenario, 1, setup, [compare])
     exchange = InProcessExchange(machines)
     simulate(simulation, exchange, 1, lambda: False, exchange)
 
@@ -328,9 +328,9 @@ def full_runs() -> Callable[[str], Result]:
     def run(name: str) -> Result:
         if name not in results:
             scenario = find(name)
-            site = WorldSetup.of(scenario, 0)
+            setup = WorldSetup.of(scenario, 0)
             recording = Recording(scenario, 0, "in-process")
-            play(scenario, 0, site, [recording.observe])
+            play(scenario, 0, setup, [recording.observe])
             results[name] = recording.finish()
         return results[name]
 
@@ -610,16 +610,16 @@ def test_period_of_rows_is_chosen_by_size() -> None:
 
 
 def _opening_alone(scenario: Scenario) -> list[Record]:
-    site = WorldSetup.of(scenario, 1)
-    return [opening_of(scenario, 1, site, dict.fromkeys(scenario.robot_ids, ()))]
+    setup = WorldSetup.of(scenario, 1)
+    return [opening_of(scenario, 1, setup, dict.fromkeys(scenario.robot_ids, ()))]
 
 
 def test_metrics_file_has_the_rows(tmp_path: Path) -> None:
     """metrics.csv is the rows, one line each, an empty cell where there is no value."""
     scenario = mission("merge=min", "claims=false", "metrics.every=1")
-    site = WorldSetup.of(scenario, 1)
+    setup = WorldSetup.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process", tmp_path)
-    play(scenario, 1, site, [recording.observe])
+    play(scenario, 1, setup, [recording.observe])
     recording.finish()
     head, *lines = (tmp_path / "metrics.csv").read_text(encoding="utf-8").splitlines()
     rows = recording.metrics.rows

@@ -46,7 +46,7 @@ from kantor_worldsim.record.records import (
     encode_record,
 )
 from kantor_worldsim.world.world import WorldSetup
-from support.missions import on_map, site_of
+from support.missions import on_map, setup_of
 from support.strategies import NEWS, SEEDS, examples, mission
 
 MS = 1_000_000
@@ -226,9 +226,9 @@ WORLDS: dict[str, Callable[[], Scenario]] = {
 
 def recorded(scenario: Scenario) -> list[Record]:
     """The records of a mission."""
-    site = site_of(scenario) if scenario.mapping else WorldSetup.of(scenario, 1)
+    setup = setup_of(scenario) if scenario.mapping else WorldSetup.of(scenario, 1)
     records: list[Record] = []
-    play(scenario, 1, site, [records.append])
+    play(scenario, 1, setup, [records.append])
     return records
 
 

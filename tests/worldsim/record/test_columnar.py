@@ -44,8 +44,8 @@ ROSTER = ("r1", "r2", "r3")
 def place(name: str, roster: tuple[str, ...]) -> int:
     """Index of a name, as in columnar batches."""
     if name == "":
-        return of.EVERYBODY_PLACE
-    return roster.index(name) if name in roster else of.STRANGER
+        return of.ALL_PLACES
+    return roster.index(name) if name in roster else of.UNKNOWN_PLACE
 
 
 def pairs(packed: bytes, samples: int) -> list[list[int]] | None:
@@ -100,7 +100,7 @@ def contents(columns: ColumnarBatch) -> list[Any]:
         return [[*head, columns.payload[at:end]] for *head, at, end in sent or ()]
 
     step_records: list[Any] = []
-    for row in range(int(columns.sizes[of.ACTS])):
+    for row in range(int(columns.sizes[of.STEP_RECORDS])):
         step_record = columns.step_records[row].tolist()
         heard = rows(columns.heard, step_record[of.HEARD], step_record[of.HEARD_COUNT])
         values: list[Any] = [step_record[of.PLACE], step_record[of.NOW_NS], heard]
@@ -115,7 +115,7 @@ def contents(columns: ColumnarBatch) -> list[Any]:
             ]
             values += [
                 step_record[of.VIOLATIONS],
-                bool(step_record[of.VOID]),
+                bool(step_record[of.UNSHIPPED]),
                 step_record[of.TOO_FAST],
             ]
             values += [step_record[of.WEIGHTS_BYTES]]
@@ -133,7 +133,7 @@ def contents(columns: ColumnarBatch) -> list[Any]:
             values += [rows(columns.pairs, step_record[of.LOWERED], step_record[of.LOWERED_COUNT])]
             values += [bodies(rows(columns.sent, step_record[of.SENT], step_record[of.SENT_COUNT]))]
         step_records.append(values)
-    decisions = rows(columns.decisions, 0, int(columns.sizes[of.VERDICTS]))
+    decisions = rows(columns.decisions, 0, int(columns.sizes[of.DECISIONS]))
     injected = rows(columns.injected, 0, int(columns.sizes[of.INJECTED]))
     return [step_records, decisions, bodies(injected)]
 
@@ -378,7 +378,7 @@ def test_fields_added_to_a_record_are_skipped(played: Play) -> None:
     payload = msgspec.msgpack.encode(tree)
     bits = tables[1].view(np.int64)
 
-    assert of._read_batch(payload, sizes, *tables, bits, 3, of.STRANGER, 60) > 0
+    assert of._read_batch(payload, sizes, *tables, bits, 3, of.UNKNOWN_PLACE, 60) > 0
     assert contents(ColumnarBatch(payload, sizes, *tables)) == values
 
 
@@ -396,6 +396,6 @@ def test_a_garbled_batch_stays_within_its_arrays(changes: list[tuple[int, int]])
     poses_m = np.zeros((rows, 4))
     sizes, bits = np.zeros(6, dtype=np.int64), poses_m.view(np.int64)
     tables = (sizes, step_records, poses_m, heard, sent, decisions, pairs, injected, bits)
-    of._read_batch(bytes(payload), *tables, 3, of.STRANGER, 60)
+    of._read_batch(bytes(payload), *tables, 3, of.UNKNOWN_PLACE, 60)
 
     assert all(bool((table[rows:] == 77).all()) for table in around)

@@ -88,9 +88,9 @@ def content(records: tuple[Record, ...], folder: Path) -> bytes:
 def run_in(folder: Path, *overrides: str) -> Result:
     """A mission recorded in a folder."""
     scenario = mission(*overrides)
-    site = WorldSetup.of(scenario, 1)
+    setup = WorldSetup.of(scenario, 1)
     recording = Recording(scenario, 1, "in-process", folder)
-    play(scenario, 1, site, [recording.observe])
+    play(scenario, 1, setup, [recording.observe])
     return recording.finish()
 
 

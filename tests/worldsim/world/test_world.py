@@ -32,7 +32,7 @@ SPENT = Pairs().encode(np.array([3, 4]), np.array([1, 1]), 2)
 """A whole point: two units."""
 
 
-def site(*targets: Place) -> WorldSetup:
+def setup(*targets: Place) -> WorldSetup:
     """Twelve samples, three robots, and these targets."""
     return WorldSetup(
         np.zeros((12, 2)),
@@ -43,7 +43,7 @@ def site(*targets: Place) -> WorldSetup:
 
 def world(*targets: Place, overrides: tuple[str, ...] = ()) -> World:
     """A world with r1 at the origin and these targets."""
-    return World(mission("sensor.range_m=5", *overrides), 1, site(*targets))
+    return World(mission("sensor.range_m=5", *overrides), 1, setup(*targets))
 
 
 def step_record(
@@ -289,7 +289,7 @@ def test_no_robot_gets_around_the_rules(
     """With any outputs, a robot keeps to its speed and its budget, and finds no target twice."""
     scenario = mission("energy.steps=3", "targets.diffusion_m=2.0", "sensor.range_m=9")
     targets = [(float(x), float(y)) for x in range(-30, 31, 12) for y in range(-30, 31, 12)]
-    there = World(scenario, seed, site(*targets))
+    there = World(scenario, seed, setup(*targets))
     found = [target for finds in there.first_look().values() for target, _, _ in finds]
     step, now_ns, pose, shipped = 0, 0, Pose(0.0, 0.0), 0
     for its_step, period, x_m, y_m, spent in moves:
@@ -514,15 +514,15 @@ def test_no_mass_can_be_shipped_on_a_map() -> None:
 def test_the_setup_of_a_map_has_starts_and_no_samples() -> None:
     """The layout, starts in its free cells, no samples; targets only from a file."""
     scenario = exploration("robots.count=4", "map.size_m=[20.0, 10.0]")
-    site_of_map = WorldSetup.of(scenario, 3)
-    ground = site_of_map.ground
+    setup_of_map = WorldSetup.of(scenario, 3)
+    ground = setup_of_map.ground
     assert ground is not None
-    cells = [ground.frame.cell_of(x_m, y_m) for x_m, y_m in site_of_map.starts_m]
+    cells = [ground.frame.cell_of(x_m, y_m) for x_m, y_m in setup_of_map.starts_m]
 
-    assert (ground.cells.shape, site_of_map.starts_m.shape) == ((10, 20), (4, 2))
-    assert (site_of_map.samples_m.shape, site_of_map.targets_m.shape) == ((0, 2), (0, 2))
+    assert (ground.cells.shape, setup_of_map.starts_m.shape) == ((10, 20), (4, 2))
+    assert (setup_of_map.samples_m.shape, setup_of_map.targets_m.shape) == ((0, 2), (0, 2))
     assert (ground.cells.flat[cells] == FREE).all()
-    World(scenario, 3, site_of_map)
+    World(scenario, 3, setup_of_map)
 
 
 def test_the_opening_holds_the_map() -> None:
@@ -531,15 +531,15 @@ def test_the_opening_holds_the_map() -> None:
     there = WorldSetup(np.zeros((0, 2)), np.zeros((0, 2)), np.array([[0.5, 0.5]]), ROOM)
     opening = decode_record(encode_record(opening_of(scenario, 1, there, {"r1": ()})))
     assert isinstance(opening, Opening)
-    ground = opening.site.ground
+    ground = opening.setup.ground
     assert ground is not None
 
     assert ground.frame == ROOM.frame
     assert (ground.cells == ROOM.cells).all()
     assert ground.cells.flags.writeable
     assert opening.units.whole == 0
-    plain = opening_of(mission(), 1, site(), {})
-    assert (plain.ground, plain.frame, plain.site.ground) == (None, None, None)
+    plain = opening_of(mission(), 1, setup(), {})
+    assert (plain.ground, plain.frame, plain.setup.ground) == (None, None, None)
 
 
 def test_a_map_that_does_not_fit_its_frame_is_refused() -> None:
@@ -549,4 +549,4 @@ def test_a_map_that_does_not_fit_its_frame_is_refused() -> None:
     frame = Frame(1.0, (0.0, 0.0), 8, 6)
 
     with pytest.raises(RefusedError):
-        _ = msgspec.structs.replace(opening, frame=frame).site
+        _ = msgspec.structs.replace(opening, frame=frame).setup

@@ -65,7 +65,7 @@ class Simulation:
     """A mission in progress. Steps and process events go in, records come out."""
 
     def __init__(
-        self, scenario: Scenario, seed: int, site: WorldSetup, observers: Iterable[Observer]
+        self, scenario: Scenario, seed: int, setup: WorldSetup, observers: Iterable[Observer]
     ) -> None:
         self.scenario = scenario
         self.seed = seed
@@ -81,11 +81,11 @@ class Simulation:
         """The last time at which a robot explored, or a fault was to end."""
         self._faults = LinkFaults.of(scenario, seed)
         self.channel = Channel(
-            scenario, seed, site.ground, self._faults.rule if self._faults else None
+            scenario, seed, setup.ground, self._faults.rule if self._faults else None
         )
         self._robots = frozenset(scenario.robot_ids)
-        self._site = site
-        self._world = World(scenario, seed, site)
+        self._setup = setup
+        self._world = World(scenario, seed, setup)
         self._observers = tuple(observers)
         self._resting: set[ParticipantId] = set()
         """Robots that have come to rest; each of them has stepped."""
@@ -102,14 +102,14 @@ class Simulation:
         reported by the exchange (`leave`, `come_back`). All in the roster."""
         for name in scenario.roster:
             self.channel.place(name, self._world.pose(name))
-        self._emit(opening_of(scenario, seed, site, self._world.first_look()))
+        self._emit(opening_of(scenario, seed, setup, self._world.first_look()))
 
     @classmethod
     def resumed(
         cls,
         scenario: Scenario,
         seed: int,
-        site: WorldSetup,
+        setup: WorldSetup,
         records: Iterable[Record],
         observers: Iterable[Observer],
     ) -> "Simulation":
@@ -118,7 +118,7 @@ class Simulation:
         Their steps are settled once more, and no observer is called. Raises ForeignRecordError.
         """
         emitted: list[Record] = []
-        simulation = cls(scenario, seed, site, [emitted.append])
+        simulation = cls(scenario, seed, setup, [emitted.append])
         for number, record in enumerate(records):
             try:
                 simulation._repeat(record)
@@ -135,7 +135,9 @@ class Simulation:
     def rebuilt(self) -> "Simulation":
         """The same simulation from its records; only where the scenario kills world-sim."""
         assert self._kept is not None
-        return Simulation.resumed(self.scenario, self.seed, self._site, self._kept, self._observers)
+        return Simulation.resumed(
+            self.scenario, self.seed, self._setup, self._kept, self._observers
+        )
 
     def forget(self) -> None:
         """Keep no records in memory: a process of its own is rebuilt from its journal."""

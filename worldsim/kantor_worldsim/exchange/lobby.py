@@ -1,4 +1,4 @@
-"""The lobby: admission of participants' processes to the bus, and the messages that they send.
+"""The lobby: membership of participants' processes to the bus, and the messages that they send.
 
 Every message of a participant passes through the lobby, which drops what is malformed or comes from a process that
 does not play the participant. The exchanges learn from it which participants are ready.
@@ -335,7 +335,9 @@ class Lobby:
 
     def _get_ready(self, name: ParticipantId, message: Ready) -> None:
         if not _continues(message, self._simulation.body(name)):
-            reason = "has another past than this run; delete its diary and start it again"
+            reason = (
+                "its write-ahead log is of another run; delete its .diary file and start it again"
+            )
             self._refuse(Joined(name, message.nonce), reason)
             return
         self._last_ready[name] = message

@@ -38,7 +38,7 @@ def run(
 
     show: receives the same progress as observers on the bus. past: records that recording has observed already; the
     mission resumes from there. controller: carries out the scenario's faults of processes.
-    say: receives one line of news for a person.
+    say: receives one line for a person to read.
     """
     scenario, seed = config.scenario, config.seed
     host.limit(rate_limits(step_clocks(scenario, seed), config.exchange, config.speed))

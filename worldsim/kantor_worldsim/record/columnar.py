@@ -23,13 +23,13 @@ from kantor_worldsim.record.records import Batch, Opening, Record, encode_record
 NOT_DECODED = -1
 """In place of a count: the packed pairs are malformed."""
 
-EVERYBODY_PLACE = -1
-STRANGER = -2
+ALL_PLACES = -1
+UNKNOWN_PLACE = -2
 """The index of a name that is not in the roster."""
 
 # Columns of ColumnarBatch.step_records. Ranges of other arrays are a first row and a count.
 PLACE, NOW_NS, PRESENT, STEP, ENERGY, STATE, REFUSED = 0, 1, 2, 3, 4, 5, 6
-FINDS, VIOLATIONS, VOID, WEIGHTS_BYTES, BODY_BYTES = 7, 8, 9, 10, 11
+FINDS, VIOLATIONS, UNSHIPPED, WEIGHTS_BYTES, BODY_BYTES = 7, 8, 9, 10, 11
 HEARD, HEARD_COUNT, SENT, SENT_COUNT = 12, 13, 14, 15
 SPENT, SPENT_COUNT, LOWERED, LOWERED_COUNT = 16, 17, 18, 19
 HEADS, WEIGHTS = 20, 21
@@ -38,7 +38,7 @@ _STEP_RECORD_COLUMNS = 25
 """PRESENT: the step record has outputs and a verdict; all columns from STEP on are valid only then, but for HEARD,
 OBSERVED and SKEW_NS. OBSERVED: the step in the observation that the participant received. TOO_FAST: 1 + index of the
 violation that is of speed, or 0.
-VOID: the world refused the step, its energy or its units, so that nothing was shipped. HEADS: the outputs have a
+UNSHIPPED: the world refused the step, its energy or its units, so that nothing was shipped. HEADS: the outputs have a
 goal. WEIGHTS: position in the payload at which the published weights begin."""
 
 # Columns of ColumnarBatch.heard, .sent, .injected and .decisions.
@@ -49,7 +49,7 @@ BODY, BODY_END = 3, 4
 SAMPLE, UNITS = 0, 1
 
 # Indices of ColumnarBatch.sizes: rows of step_records, decisions, heard, sent, pairs and injected.
-ACTS, VERDICTS, ALL_HEARD, ALL_SENT, PAIRS, INJECTED = 0, 1, 2, 3, 4, 5
+STEP_RECORDS, DECISIONS, ALL_HEARD, ALL_SENT, PAIRS, INJECTED = 0, 1, 2, 3, 4, 5
 
 
 class ColumnarBatch(NamedTuple):
@@ -195,7 +195,7 @@ class BatchColumns(NamedTuple):
     """The memory of poses_m as integers."""
     robots: int
     supervisor: int
-    """Its index in the roster, or STRANGER if there is none."""
+    """Its index in the roster, or UNKNOWN_PLACE if there is none."""
 
 
 @kernel
@@ -229,21 +229,21 @@ def _place(columns: BatchColumns, at: int) -> tuple[int, int]:
     payload = columns.payload
     kind, size, at = head_of(payload, at)
     if kind != TEXT or at < 0:
-        return STRANGER, _MALFORMED
+        return UNKNOWN_PLACE, _MALFORMED
     after = at + size
     if size == 0:
-        return EVERYBODY_PLACE, after
+        return ALL_PLACES, after
     if _equals(payload, at, size, _SUPERVISOR_TEXT):
         return columns.supervisor, after
     if payload[at] != 114 or size > 5:  # r1, r2, …
-        return STRANGER, after
+        return UNKNOWN_PLACE, after
     number = 0
     for i in range(at + 1, after):
         digit = int(payload[i]) - 48
         if not 0 <= digit <= 9 or (number == 0 and digit == 0):
-            return STRANGER, after
+            return UNKNOWN_PLACE, after
         number = 10 * number + digit
-    return (number - 1 if 1 <= number <= columns.robots else STRANGER), after
+    return (number - 1 if 1 <= number <= columns.robots else UNKNOWN_PLACE), after
 
 
 @kernel
@@ -359,13 +359,13 @@ def _read_verdict(columns: BatchColumns, step_record: np.ndarray, row: int, at: 
     step_record[FINDS], at = _array(columns.payload, at, _ANY)
     at = skip(columns.payload, at, step_record[FINDS])
     step_record[VIOLATIONS], at = _array(columns.payload, at, _ANY)
-    step_record[VOID] = step_record[TOO_FAST] = 0
+    step_record[UNSHIPPED] = step_record[TOO_FAST] = 0
     for item in range(step_record[VIOLATIONS]):
         kind, size, at = head_of(columns.payload, at)
         if kind != TEXT:
             return _MALFORMED
         for text in _REFUSALS:
-            step_record[VOID] |= _equals(columns.payload, at, size, text)
+            step_record[UNSHIPPED] |= _equals(columns.payload, at, size, text)
         if _equals(columns.payload, at, size, _SPEED):
             step_record[TOO_FAST] = item + 1
         at += size
@@ -409,8 +409,8 @@ def _read_batch(
     sizes[:] = 0
     parts, at = _array(payload, 0, _ANY)
     at = skip(payload, at, 2)  # tag, now_ns
-    sizes[ACTS], at = _array(payload, at, step_records.shape[0])
-    for i in range(sizes[ACTS]):
+    sizes[STEP_RECORDS], at = _array(payload, at, step_records.shape[0])
+    for i in range(sizes[STEP_RECORDS]):
         step_record = step_records[i]
         fields, at = _array(payload, at, _ANY)
         step_record[PLACE], at = _place(columns, at)
@@ -427,8 +427,8 @@ def _read_batch(
         at = skip(payload, at, fields - 7)
         if at < 0:
             return _MALFORMED
-    sizes[VERDICTS], at = _array(payload, at, decisions.shape[0])
-    for i in range(sizes[VERDICTS]):
+    sizes[DECISIONS], at = _array(payload, at, decisions.shape[0])
+    for i in range(sizes[DECISIONS]):
         fields, at = _array(payload, at, _ANY)
         decisions[i, SOURCE], at = _place(columns, at)
         decisions[i, SEQUENCE], at = _number(payload, at)
@@ -524,7 +524,7 @@ class ColumnarDecoder:
     """Decodes the records of one run in order."""
 
     def __init__(self) -> None:
-        self._bounds = (0, STRANGER, 0)
+        self._bounds = (0, UNKNOWN_PLACE, 0)
         """Number of robots, index of the supervisor, number of samples."""
         self._make_room(1 << 10)
 
@@ -540,7 +540,7 @@ class ColumnarDecoder:
                 self._make_room(2 * self._rows)
         elif isinstance(record, Opening):
             scenario = record.scenario
-            supervisor = scenario.robots.count if scenario.centralized else STRANGER
+            supervisor = scenario.robots.count if scenario.centralized else UNKNOWN_PLACE
             self._bounds = (scenario.robots.count, supervisor, record.samples_m.shape[0])
         return DecodedRecord(record, payload, (payload, *self._tables))
 

@@ -38,7 +38,7 @@ class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
     """Frame of the map: position of its cells in the world."""
 
     @property
-    def site(self) -> WorldSetup:
+    def setup(self) -> WorldSetup:
         """The arrays of the opening. Raises RefusedError."""
         return WorldSetup(
             self.samples_m.open("<f8", 2),
@@ -134,18 +134,18 @@ def decode_record(payload: bytes) -> Record:
 def opening_of(
     scenario: Scenario,
     seed: int,
-    site: WorldSetup,
+    setup: WorldSetup,
     first_look: dict[ParticipantId, tuple[Found, ...]],
 ) -> Opening:
     """The opening record of a run."""
-    ground = site.ground
+    ground = setup.ground
     return Opening(
         VERSION,
         scenario,
         seed,
-        Array.of(site.samples_m),
-        Array.of(site.targets_m),
-        Array.of(site.starts_m),
+        Array.of(setup.samples_m),
+        Array.of(setup.targets_m),
+        Array.of(setup.starts_m),
         first_look,
         ground and Array.of(ground.cells),
         ground and ground.frame,

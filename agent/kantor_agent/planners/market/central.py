@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from kantor_agent.mapping.cost_map import CostMap
-from kantor_agent.planners.map_base import Member, Situation, Task
+from kantor_agent.planners.map_base import Situation, Task, TeamMember
 from kantor_agent.planners.market.costs import Costs, DistanceField, price_of
 from kantor_agent.planners.market.rules import MarketRules, is_open, is_reachable
 from kantor_protocol.base.grid import NOWHERE
@@ -36,7 +36,7 @@ class CentralMarket:
         return [goal for tour in self.tours.values() for goal in tour]
 
     def _give_up(
-        self, cost_map: CostMap, team: Sequence[Member], fields: Sequence[DistanceField]
+        self, cost_map: CostMap, team: Sequence[TeamMember], fields: Sequence[DistanceField]
     ) -> None:
         """Drop goals that are known or that no way leads to."""
         for member, field in zip(team, fields, strict=True):
@@ -47,7 +47,7 @@ class CentralMarket:
             ]
 
     def _propose(
-        self, situation: Situation, team: Sequence[Member], fields: Sequence[DistanceField]
+        self, situation: Situation, team: Sequence[TeamMember], fields: Sequence[DistanceField]
     ) -> None:
         """Fill empty tours with new goals."""
         for member, field in zip(team, fields, strict=True):

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from kantor_agent.mapping.cost_map import CostMap
-from kantor_agent.planners.map_base import Member, Situation
+from kantor_agent.planners.map_base import Situation, TeamMember
 from kantor_agent.planners.market.costs import DistanceField, near
 from kantor_agent.planners.market.goals import greedy_goals, quadtree_goals, random_goals
 from kantor_agent.planners.market.memo import HEAD
@@ -49,7 +49,7 @@ class MarketRules:
                 goals.append(cell)
         return goals
 
-    def heading(self, situation: Situation, member: Member, goal: int) -> int:
+    def heading(self, situation: Situation, member: TeamMember, goal: int) -> int:
         """The target of a member with a goal: the reachable frontier on the best way to it.
 
         goal: NOWHERE for the nearest frontier. Of equal ones the lowest cell; NOWHERE if none can be reached.
@@ -74,7 +74,7 @@ def is_reachable(field: DistanceField, goal: int) -> bool:
     return bool(field[goal] < math.inf)
 
 
-def task_is_stale(situation: Situation, member: Member) -> bool:
+def task_is_stale(situation: Situation, member: TeamMember) -> bool:
     """Whether a member's target is a frontier no more."""
     frontiers = situation.frontiers
     at = int(np.searchsorted(frontiers, member.task.target))

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
-from kantor_agent.planners.map_base import Member, Situation, Task, past_or_long_ago
+from kantor_agent.planners.map_base import Situation, Task, TeamMember, past_or_long_ago
 from kantor_agent.planners.market.costs import NO_ROBOT, Costs, DistanceField, near, price_of
 from kantor_agent.planners.market.memo import Memo, packed, unpacked
 from kantor_agent.planners.market.rules import MarketRules, is_open, is_reachable, task_is_stale
@@ -82,7 +82,7 @@ class Trader:
 
     # What is known.
 
-    def _read_memos(self, others: Sequence[Member]) -> dict[int, Memo]:
+    def _read_memos(self, others: Sequence[TeamMember]) -> dict[int, Memo]:
         """The memos of robots in contact, by robot, rising."""
         cells = self._cost_map.frame.cells
         memos = {m.robot: unpacked(m.task.memo, self._robots, cells) for m in others}

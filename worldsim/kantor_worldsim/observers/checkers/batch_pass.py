@@ -32,7 +32,7 @@ from kantor_worldsim.observers.checkers.state import (
     missing_capacity,
     note_violation,
 )
-from kantor_worldsim.observers.checkers.violations import STRANGER
+from kantor_worldsim.observers.checkers.violations import NOT_IN_ROSTER
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch
 
@@ -122,16 +122,16 @@ def check_batch(
     if missing < 0:
         return missing
     counts[NOTED], counts[KEYFRAMES] = 0, 0
-    for row in range(sizes[of.ACTS]):
+    for row in range(sizes[of.STEP_RECORDS]):
         if step_records[row, of.PLACE] >= 0:
             check_inbox(state, limits, columns, row, now_ns)
             post(state, columns, row)
     post_forged(state, columns)
-    for row in range(sizes[of.VERDICTS]):
+    for row in range(sizes[of.DECISIONS]):
         check_decision(state, LinkTable(cut, range_m), columns, row)
-    for row in range(sizes[of.ACTS]):
+    for row in range(sizes[of.STEP_RECORDS]):
         if step_records[row, of.PLACE] < 0:
-            note_violation(state, STRANGER, row, 0, 0, 0, 0.0, 0.0)
+            note_violation(state, NOT_IN_ROSTER, row, 0, 0, 0, 0.0, 0.0)
         elif step_records[row, of.PRESENT]:
             check_step(state, limits, columns, row)
     return counts[NOTED] + counts[KEYFRAMES]

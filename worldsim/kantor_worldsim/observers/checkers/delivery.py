@@ -124,7 +124,7 @@ def find_posted(state: CheckerState, source: int, sequence: int) -> int:
 
 @kernel
 def target_of(state: CheckerState, source: int, sequence: int) -> int:
-    """The target of the envelope that a source, or a fault, has sent under a number; STRANGER without one."""
+    """The target of the envelope that a source, or a fault, has sent under a number; UNKNOWN_PLACE without one."""
     at = find_posted(state, source, sequence) if sequence < FORGED_FIRST else -1
     if at >= 0:
         return int(state.posted[source, at, 1])
@@ -132,7 +132,7 @@ def target_of(state: CheckerState, source: int, sequence: int) -> int:
         for i in range(state.counts[FORGED] - 1, -1, -1):
             if state.forged[0, i, 0] == source and state.forged[0, i, 1] == sequence:
                 return int(state.forged[0, i, 2])
-    return of.STRANGER
+    return of.UNKNOWN_PLACE
 
 
 @kernel
@@ -154,10 +154,10 @@ def check_decision(state: CheckerState, links: LinkTable, columns: ColumnarBatch
     source, sequence = decision[of.SOURCE], decision[of.SEQUENCE]
     receiver, due_ns = decision[of.TARGET], decision[of.DUE_NS]
     target = target_of(state, source, sequence)
-    if target == of.STRANGER or receiver < 0:
+    if target == of.UNKNOWN_PLACE or receiver < 0:
         note_violation(state, NEVER_SENT, row, 0, 0, 0, 0.0, 0.0)
         return
-    if target not in (of.EVERYBODY_PLACE, receiver):
+    if target not in (of.ALL_PLACES, receiver):
         note_violation(state, WRONG_TARGET, row, 0, 0, 0, 0.0, 0.0)
     if due_ns == DROPPED:
         return

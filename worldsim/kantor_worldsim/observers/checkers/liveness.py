@@ -116,7 +116,9 @@ class LivenessChecker:
         }
         self._poses = {
             name: Pose(x, y)
-            for name, (x, y) in zip(scenario.robot_ids, opening.site.starts_m.tolist(), strict=True)
+            for name, (x, y) in zip(
+                scenario.robot_ids, opening.setup.starts_m.tolist(), strict=True
+            )
         }
         self._changed_ns = 0
         self._late_ns: list[int] = []
@@ -277,7 +279,7 @@ class LivenessChecker:
         scenario = self._scenario
         links = Links(scenario, self._opening.seed)
         links.move_to(now_ns)
-        sight = Sight(scenario.radio, *(self._opening.site.ground or ()))
+        sight = Sight(scenario.radio, *(self._opening.setup.ground or ()))
         places = {name: place for place, name in enumerate(self._names)}
         poses_m = {SUPERVISOR: scenario.supervisor_m} | {
             name: (pose.x_m, pose.y_m) for name, pose in self._poses.items()

@@ -88,11 +88,11 @@ class CheckerState(NamedTuple):
     @classmethod
     def of(cls, opening: Opening) -> "CheckerState":
         """The state at the start of a run. Raises RefusedError."""
-        scenario, site = opening.scenario, opening.site
-        count, samples = len(scenario.roster), site.samples_m.shape[0]
+        scenario, setup = opening.scenario, opening.setup
+        count, samples = len(scenario.roster), setup.samples_m.shape[0]
         poses_m = np.zeros((count, 2))
         poses_m[-1] = scenario.supervisor_m
-        poses_m[: scenario.robots.count] = site.starts_m
+        poses_m[: scenario.robots.count] = setup.starts_m
         participants = np.zeros((count, _PARTICIPANT_COLUMNS), dtype=np.int64)
         participants[:, INCARNATION_ID] = np.arange(count)
         participants[:, STOPPED_NS] = NOT_STOPPED
@@ -111,8 +111,8 @@ class CheckerState(NamedTuple):
             violations=np.zeros((VIOLATIONS_MAX, 5), dtype=np.int64),
             lengths_m=np.zeros((VIOLATIONS_MAX, 2)),
             counts=np.zeros(3, dtype=np.int64),
-            samples_m=site.samples_m.copy(),
-            by_x=np.argsort(site.samples_m[:, 0]),
+            samples_m=setup.samples_m.copy(),
+            by_x=np.argsort(setup.samples_m[:, 0]),
         )
 
     def with_incarnations(self, more: int) -> "CheckerState":
@@ -199,14 +199,14 @@ def missing_capacity(state: CheckerState, columns: ColumnarBatch) -> int:
     """Which array has no room for this batch behind the rows it holds, or 0."""
     participants = state.participants
     participants[:, _COMING : KEYFRAME + 1] = 0
-    for row in range(columns.sizes[of.ACTS]):
+    for row in range(columns.sizes[of.STEP_RECORDS]):
         step_record = columns.step_records[row]
         if step_record[of.PLACE] >= 0 and step_record[of.PRESENT]:
             participants[step_record[of.PLACE], _COMING] += max(0, step_record[of.SPENT_COUNT])
     for row in range(columns.sizes[of.ALL_SENT]):
         if columns.sent[row, of.SOURCE] >= 0:
             participants[columns.sent[row, of.SOURCE], _COMING + 1] += 1
-    for row in range(columns.sizes[of.VERDICTS]):
+    for row in range(columns.sizes[of.DECISIONS]):
         if columns.decisions[row, of.TARGET] >= 0:
             participants[columns.decisions[row, of.TARGET], _COMING + 2] += 1
     if state.counts[FORGED] + columns.sizes[of.INJECTED] > state.forged.shape[1]:

@@ -14,7 +14,7 @@ VIOLATIONS_MAX = 100
 UNHEARD, NEVER_SENT, WRONG_TARGET, TOO_FAR = 0, 1, 2, 3
 STEP, SPEED, GARBLED_SPENT, POINT, BUDGET, MISCOUNT = 4, 5, 6, 7, 8, 9
 GARBLED_LOWERED, RISE, BELOW, UNREADABLE, LOG = 10, 11, 12, 13, 14
-STRANGER, REFUSED, NOT_REBUILT, NOT_ITS_OWN, NO_SAMPLE, NO_WEIGHT = 15, 16, 17, 18, 19, 20
+NOT_IN_ROSTER, REFUSED, NOT_REBUILT, NOT_ITS_OWN, NO_SAMPLE, NO_WEIGHT = 15, 16, 17, 18, 19, 20
 WITHHELD, OUT_OF_ORDER, NUMBER_REUSED, STOPPED, STALE, REFUSALS = 21, 22, 23, 24, 25, 26
 OTHER_INCARNATION, FOREIGN_LOG, FORGETS, NO_INCARNATION, SKEW, CUT = 27, 28, 29, 30, 31, 32
 
@@ -38,7 +38,7 @@ TEXTS = {
     BELOW: ("credit", "its view of sample {item} is below the truth"),
     UNREADABLE: ("ledger", "sends a message that does not decode{what}"),
     LOG: ("ledger", "its log from {a} on is not what it consumed"),
-    STRANGER: ("order", "not in the roster"),
+    NOT_IN_ROSTER: ("order", "not in the roster"),
     REFUSED: ("ruling", "world-sim refused its {what}"),
     NOT_REBUILT: ("weights", "publishes a vector that cannot be rebuilt"),
     NOT_ITS_OWN: ("weights", "publishes a vector that is not its own"),

@@ -92,24 +92,24 @@ class RunMetrics:
             self._row(last=True)
 
     def _open(self, opening: Opening) -> None:
-        scenario, site = opening.scenario, opening.site
+        scenario, setup = opening.scenario, opening.setup
         self._opening, self._scenario, self._units = opening, scenario, opening.units
         self._period_ns = scenario.period_ns
         self._walk = RandomWalk(
-            site.samples_m,
+            setup.samples_m,
             scenario.samples.diffusion_m,
             self._period_ns,
             opening.seed,
             Purpose.SAMPLE_WALK,
         )
-        names, samples, robots = scenario.roster, site.samples_m.shape[0], scenario.robots.count
-        self._targets = site.targets_m.shape[0]
+        names, samples, robots = scenario.roster, setup.samples_m.shape[0], scenario.robots.count
+        self._targets = setup.targets_m.shape[0]
         self._tally = RunTally(
             counts=np.zeros(11, dtype=np.int64),
             shipped=np.zeros(2),
             standing=np.zeros((len(names), 4), dtype=np.int64),
             shipped_by=np.zeros(robots),
-            xy_m=site.starts_m.copy(),
+            xy_m=setup.starts_m.copy(),
             views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
             least=np.full(samples, self._units.sample, dtype=np.int64),
             true_left=np.full(samples, self._units.sample, dtype=np.int64),

@@ -200,12 +200,12 @@ class DensityMetrics(RunMetrics):
 
     def _note_points(self, columns: of.ColumnarBatch) -> None:
         """Where a point was shipped, and how many units."""
-        for row in range(columns.sizes[of.ACTS]):
+        for row in range(columns.sizes[of.STEP_RECORDS]):
             step_record = columns.step_records[row]
             if (
                 step_record[of.PLACE] >= 0
                 and step_record[of.SPENT_COUNT] > 0
-                and not step_record[of.VOID]
+                and not step_record[of.UNSHIPPED]
             ):
                 shipped = columns.pairs[
                     step_record[of.SPENT] : step_record[of.SPENT] + step_record[of.SPENT_COUNT]

@@ -68,11 +68,11 @@ class MapTracker:
 
     def open(self, opening: Opening) -> None:
         """Begin with the first record. Raises RefusedError if it has no true map."""
-        scenario, site = opening.scenario, opening.site
-        if site.ground is None:
+        scenario, setup = opening.scenario, opening.setup
+        if setup.ground is None:
             raise RefusedError("a mission on a map, and no map in its opening")
-        self.ground, self.frame = site.ground, site.ground.frame
-        self.observable = observable(site.ground, site.starts_m)
+        self.ground, self.frame = setup.ground, setup.ground.frame
+        self.observable = observable(setup.ground, setup.starts_m)
         """(rows, columns)"""
         self.total = int(self.observable.sum())
         """The number of cells that can ever be seen."""
@@ -100,7 +100,7 @@ class MapTracker:
             scenario.sensor.noise_m == 0.0,
         )
         self._arguments = (*self.state, *self._ground)
-        self.poses_m: list[tuple[float, float]] = [(x, y) for x, y in site.starts_m.tolist()]
+        self.poses_m: list[tuple[float, float]] = [(x, y) for x, y in setup.starts_m.tolist()]
         """Where the robots are, world frame."""
         self.ways_m = [0.0] * robots
         """The distance that each has driven."""
@@ -200,7 +200,7 @@ class MapTracker:
         ]
         for row, place, step_record in stepped:
             self._take_scan(place, step_record.observation, row)
-        step_records = columns.step_records[: columns.sizes[of.ACTS]]
+        step_records = columns.step_records[: columns.sizes[of.STEP_RECORDS]]
         self._reserve(
             "as_sent", "written", AS_SENT, int(step_records[:, of.BODY_BYTES].max(initial=0))
         )

@@ -393,7 +393,7 @@ def follow(
     columns = ColumnarBatch(
         payload, sizes, step_records, poses_m, heard, sent, decisions, pairs, injected
     )
-    for row in range(sizes[of.ACTS]):
+    for row in range(sizes[of.STEP_RECORDS]):
         who = step_records[row, of.PLACE]
         if who >= 0 and step_records[row, of.PRESENT]:
             for item in range(step_records[row, of.SENT_COUNT]):

@@ -147,7 +147,7 @@ class MapMetrics(RunMetrics):
         """Sums of WTV and EPV."""
         self._samples = 0
         self._now = np.zeros((2, len(SHAPES)))
-        starts_m = opening.site.starts_m.tolist()
+        starts_m = opening.setup.starts_m.tolist()
         self._paces = {
             name: _Pace((x, y)) for name, (x, y) in zip(scenario.robot_ids, starts_m, strict=True)
         }

@@ -72,7 +72,7 @@ class MapResult(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FaultCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """The effects of one fault of the scenario; all 0 says that it never struck.
+    """The effects of one fault of the scenario; all 0: it never took effect.
 
     A fault of links counts copies of messages, one of processes its events.
     """

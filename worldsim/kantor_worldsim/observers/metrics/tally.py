@@ -125,9 +125,9 @@ def follow(
     """
     tally = RunTally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left)
     finds = 0
-    for row in range(sizes[of.VERDICTS]):
+    for row in range(sizes[of.DECISIONS]):
         counts[DROPS if decisions[row, of.DUE_NS] == DROPPED else DELIVERIES] += 1
-    for row in range(sizes[of.ACTS]):
+    for row in range(sizes[of.STEP_RECORDS]):
         step_record = step_records[row]
         place = step_record[of.PLACE]
         if place < 0 or not step_record[of.PRESENT]:
@@ -156,7 +156,7 @@ def follow(
             standing[place, 1] = 1
         if step_record[of.STATE] == State.FINISHED.value and standing[place, 2] == NEVER:
             standing[place, 2] = step_record[of.STEP]
-        if step_record[of.SPENT_COUNT] > 0 and not step_record[of.VOID]:
+        if step_record[of.SPENT_COUNT] > 0 and not step_record[of.UNSHIPPED]:
             counts[ENERGY] += 1
             for i in range(
                 step_record[of.SPENT], step_record[of.SPENT] + step_record[of.SPENT_COUNT]
