@@ -1,17 +1,12 @@
 """The tiers of the tests, the order in which groups start, and the `kantor` command as a fixture."""
 
-import os
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from hypothesis import settings
 
-from support.limits import EVENT_LIMIT_S
+from support.command import CommandServer, Kantor
 from support.tiers import LONGEST_FIRST, tier_of
 
 settings.register_profile("kantor", deadline=None, print_blob=True)
@@ -34,56 +29,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: LONGEST_FIRST.index(tiers[item]))
 
 
-class Finished(NamedTuple):
-    """How a command ended."""
-
-    code: int
-    out: str
-    err: str
-
-
-class Kantor:
-    """Runs the kantor command in a folder of its own."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._started: list[subprocess.Popen[str]] = []
-
-    def __call__(self, *arguments: object, **environment: str) -> Finished:
-        """Run to the end."""
-        process = self.start(*arguments, **environment)
-        out, err = process.communicate(timeout=EVENT_LIMIT_S)
-        return Finished(process.returncode, out, err)
-
-    def start(self, *arguments: object, **environment: str) -> subprocess.Popen[str]:
-        """Start and go on."""
-        process = subprocess.Popen(
-            [sys.executable, "-m", "kantor_fleet", *map(str, arguments)],
-            cwd=self.folder,
-            env=os.environ | {"NO_COLOR": "1", "COLUMNS": "120"} | environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        self._started.append(process)
-        return process
-
-    def runs(self) -> list[Path]:
-        """The run folders that commands left, oldest first."""
-        return sorted((self.folder / "runs").glob("*"))
-
-    def stop_all(self) -> None:
-        """End whatever is left, with all that it started."""
-        for process in self._started:
-            if process.poll() is None:
-                os.killpg(process.pid, signal.SIGKILL)
-            process.communicate(timeout=EVENT_LIMIT_S)
+@pytest.fixture(scope="session")
+def command_server() -> Iterator[CommandServer]:
+    """The process of which the commands of all tests are forks."""
+    server = CommandServer()
+    yield server
+    server.close()
 
 
 @pytest.fixture
-def kantor(tmp_path: Path) -> Iterator[Kantor]:
+def kantor(tmp_path: Path, command_server: CommandServer) -> Iterator[Kantor]:
     """The kantor command."""
-    command = Kantor(tmp_path)
+    command = Kantor(tmp_path, command_server)
     yield command
     command.stop_all()

@@ -22,7 +22,7 @@ from support.fleets import incidents_of, result_of
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from conftest import Kantor
+    from support.command import Kantor
 
 pytestmark = pytest.mark.xdist_group("containers")
 

@@ -27,7 +27,7 @@ from support.claims import number, runs_of
 from support.files import rows_of
 
 if TYPE_CHECKING:
-    from conftest import Kantor
+    from support.command import Kantor
 
 HERE, THERE = Setting("here"), Setting("there")
 

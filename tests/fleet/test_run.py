@@ -15,7 +15,7 @@ from support.fleets import result_of
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from conftest import Finished, Kantor
+    from support.command import Finished, Kantor
 
 RESULT_NAMES = [
     "scenario", "seed", "exchange", "clock", "planner", "merge", "robots", "ticks",

@@ -26,7 +26,7 @@ from support.strategies import mission
 from support.workers import DEADLY_SEED, die_of_a_seed, fail_of_a_seed
 
 if TYPE_CHECKING:
-    from conftest import Finished, Kantor
+    from support.command import Finished, Kantor
 
 SMALL = (
     "--set", "energy.points=400", "energy.steps=400", "samples.count=200", "targets.count=50",
@@ -317,7 +317,7 @@ group = pytest.mark.xdist_group("sweep")  # they share a fixture that is dear
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a whole sweep that one worker ran."""
-    from conftest import Kantor
+    from support.command import Kantor
 
     kantor = Kantor(tmp_path_factory.mktemp("reference"))
     finished = kantor("sweep", "fleet", *FULL, "--jobs", 1)

@@ -19,7 +19,7 @@ from support.intruders import plain_session
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from conftest import Kantor
+    from support.command import Kantor
 
 ROOT = "kantor/v1/kantor"
 

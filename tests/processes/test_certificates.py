@@ -29,7 +29,7 @@ from support.intruders import plain_session
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from conftest import Kantor
+    from support.command import Kantor
 
 FLEET, ROSTER = "demo", ("r1", "r2", "r3")
 NOW = datetime.now(UTC)

@@ -24,7 +24,7 @@ from support.limits import EVENT_LIMIT_S
 from support.strategies import mission
 
 if TYPE_CHECKING:
-    from conftest import Kantor
+    from support.command import Kantor, Process
 
 SMALL = ("energy.points=400", "energy.steps=400", "samples.count=200", "targets.count=50")
 VARY, SEEDS = "radio.range_m=50,100", "0:10"
@@ -98,7 +98,7 @@ def same(one: Path, other: Path) -> bool:
     return (one / "table.csv").read_bytes() == (other / "table.csv").read_bytes()
 
 
-def await_run(process: "subprocess.Popen[str]") -> None:
+def await_run(process: "Process") -> None:
     """Until the first run is done."""
     assert process.stdout is not None
     assert any(line.startswith("1/") for line in process.stdout)

@@ -7,7 +7,7 @@ import pytest
 from support.fleets import result_of
 
 if TYPE_CHECKING:
-    from conftest import Kantor
+    from support.command import Kantor
 
 STORM = """
 [[faults]]

@@ -19,7 +19,7 @@ from support.fleets import acts_of, await_act, await_line, children_named, recor
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from conftest import Kantor
+    from support.command import Kantor
 
 LOSSY = (
     "--set", "radio.drop=0.1", "radio.duplicate=0.1", "radio.delay_s=0.03", "radio.jitter_s=0.2",

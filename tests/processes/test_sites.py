@@ -5,7 +5,6 @@ certificates.
 import os
 import queue
 import signal
-import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -29,7 +28,7 @@ from support.intruders import plain_session
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from conftest import Kantor
+    from support.command import Kantor, Process
 
 ROOT = "kantor/v1/kantor"
 FORGED = b"forged"
@@ -49,11 +48,11 @@ class Place:
         made = kantor("keys", "kantor", "--robots", 3, "--site", "north=r1,r2")
         assert made.code == 0, made.err
 
-    def start(self, *arguments: object, at: str, user: str) -> "subprocess.Popen[str]":
+    def start(self, *arguments: object, at: str, user: str) -> "Process":
         """A process with the identity of a user."""
         return self.kantor.start(*arguments, "--connect", at, "--credentials", f"keys/{user}.toml")
 
-    def world_sim(self, *arguments: object) -> "subprocess.Popen[str]":
+    def world_sim(self, *arguments: object) -> "Process":
         """World-sim, up and waiting."""
         world = self.kantor.start(
             "worldsim", *arguments, "--listen", self.hub, "--credentials", "keys"
@@ -61,13 +60,13 @@ class Place:
         await_line(world, "t=")
         return world
 
-    def site(self) -> "subprocess.Popen[str]":
+    def site(self) -> "Process":
         """The site, connected."""
         site = self.start("site", "north", "--listen", self.north, at=self.hub, user="site-north")
         await_line(site, self.hub, "connected")
         return site
 
-    def robots(self) -> dict[str, "subprocess.Popen[str]"]:
+    def robots(self) -> dict[str, "Process"]:
         """r1 and r2 at the site, r3 at the hub."""
         places = {"r1": self.north, "r2": self.north, "r3": self.hub}
         return {

@@ -8,7 +8,7 @@ from support.fleets import await_line, incidents_of, result_of
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from conftest import Kantor
+    from support.command import Kantor
 
 
 def test_a_killed_world_sim_resumes_its_run_and_a_done_one_starts_another(kantor: "Kantor") -> None:

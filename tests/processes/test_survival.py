@@ -4,7 +4,6 @@ import os
 import shutil
 import signal
 from pathlib import Path
-from subprocess import Popen
 from typing import TYPE_CHECKING
 
 import psutil
@@ -26,7 +25,7 @@ from support.fleets import (
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from conftest import Kantor
+    from support.command import Kantor, Process
 
 EVERYTHING = """
 [[faults]]
@@ -260,10 +259,10 @@ class ByHand:
         (self.folder,) = kantor.runs()
         await_act(self.folder, "r2", 5)
 
-    def start_world(self, *arguments: object) -> "Popen[str]":
+    def start_world(self, *arguments: object) -> "Process":
         return self.kantor.start("worldsim", *arguments, "--listen", self.endpoint, "--speed", 2)
 
-    def start_robot(self, name: str) -> "Popen[str]":
+    def start_robot(self, name: str) -> "Process":
         return self.kantor.start("agent", name, "--connect", self.endpoint)
 
     def end(self) -> None:

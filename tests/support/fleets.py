@@ -11,7 +11,7 @@ from kantor_worldsim.record.records import Batch, ProcessEvent, Record, StepReco
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    import subprocess
+    from support.command import Process
 
 T = TypeVar("T")
 
@@ -23,7 +23,7 @@ def result_of(folder: Path) -> dict[str, object]:
     return tree
 
 
-def await_line(process: "subprocess.Popen[str]", start: str, part: str = "") -> str:
+def await_line(process: "Process", start: str, part: str = "") -> str:
     """The first line of output that starts so and has that part; fails when the output ends before."""
     assert process.stdout is not None
     for line in process.stdout:
@@ -32,7 +32,7 @@ def await_line(process: "subprocess.Popen[str]", start: str, part: str = "") -> 
     raise AssertionError(f"no line starts with {start!r} and has {part!r}")
 
 
-def children_named(process: "subprocess.Popen[str]", log: Path) -> int:
+def children_named(process: "Process", log: Path) -> int:
     """The process id of a participant, from its log."""
     return int(json.loads(log.read_text().splitlines()[0])["pid"])
 
