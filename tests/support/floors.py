@@ -24,7 +24,7 @@ map = { layout = "blank" }
 sensor = { range_m = 3.0 }
 planner = { name = "burgard", cost = "length" }
 """
-_KINDS = {" ": UNKNOWN, ".": FREE, "#": OCCUPIED}
+_KINDS = {" ": UNKNOWN, "?": UNKNOWN, ".": FREE, "#": OCCUPIED}
 
 
 class Floor:
@@ -76,13 +76,20 @@ class Floor:
 
 
 def drawn(plan: Sequence[str], *overrides: str) -> Floor:
-    """A floor as a picture: row 0 comes first; a wall is #, free is a dot, unknown is blank."""
+    """A floor as a picture, row 0 first: a wall is #, free is a dot, unknown is blank or a question mark."""
     return Floor(np.array([[_KINDS[c] for c in row] for row in plan], dtype=np.uint8), *overrides)
 
 
-def robot(place: int, cell: int, target: int = NOWHERE, *, arrived: bool = False) -> TeamMember:
-    """A member of the visible team."""
-    return TeamMember(place, cell, Task(target), 0, arrived)
+def member(
+    robot: int,
+    cell: int,
+    target: int = NOWHERE,
+    memo: tuple[int, ...] = (),
+    *,
+    arrived: bool = False,
+) -> TeamMember:
+    """A member of the visible team, with the task that it has had since the start."""
+    return TeamMember(robot, cell, Task(target, memo), 0, arrived)
 
 
 @st.composite
@@ -97,8 +104,8 @@ def crowded(draw: st.DrawFn, *overrides: str) -> tuple[Floor, Situation]:
     floor = Floor(kinds.astype(np.uint8), *overrides)
     cells = st.integers(0, rows * columns - 1)
     members = [
-        robot(i, cell) for i, cell in enumerate(draw(st.lists(cells, min_size=1, max_size=6)))
+        member(i, cell) for i, cell in enumerate(draw(st.lists(cells, min_size=1, max_size=6)))
     ]
     targets = draw(st.lists(st.integers(NOWHERE, rows * columns - 1), max_size=2))
-    others = [robot(6 + i, 0, target) for i, target in enumerate(targets)]
+    others = [member(6 + i, 0, target) for i, target in enumerate(targets)]
     return floor, floor.situation(members, others, draw(st.lists(cells, max_size=2)))

@@ -13,7 +13,7 @@ from kantor_agent.planners.burgard import Burgard, coverage, discount, in_sight
 from kantor_agent.planners.map_base import Situation, Task
 from kantor_protocol.base.grid import NOWHERE, OCCUPIED
 from kantor_protocol.replication.occupancy_log import RANGE_BINS
-from support.floors import Floor, crowded, drawn, robot
+from support.floors import Floor, crowded, drawn, member
 from support.strategies import examples
 
 CORRIDOR = ["  ........  "]
@@ -46,7 +46,7 @@ def targets(floor: Floor, situation: Situation) -> list[int]:
 def test_the_best_pair_comes_first_and_the_other_robot_turns_away() -> None:
     """U - V is 2/3 for robot 0 and cell 2. That leaves robot 1 cell 9: 1 - 4/3 is more than 0 - 1."""
     floor = drawn(CORRIDOR)
-    both = [robot(0, 3), robot(1, 5)]
+    both = [member(0, 3), member(1, 5)]
 
     assert targets(floor, floor.situation(both)) == [2, 9]
 
@@ -54,7 +54,7 @@ def test_the_best_pair_comes_first_and_the_other_robot_turns_away() -> None:
 def test_uncoordinated_robots_take_their_cheapest_frontier() -> None:
     """Robot 1 has 3 cells to go to 2, and 4 to 9."""
     floor = drawn(CORRIDOR, "planner.coordinated=false")
-    situation = floor.situation([robot(0, 3), robot(1, 5)], [robot(2, 3, 2)], [2])
+    situation = floor.situation([member(0, 3), member(1, 5)], [member(2, 3, 2)], [2])
 
     assert targets(floor, situation) == [2, 2]
 
@@ -63,25 +63,25 @@ def test_the_better_pair_wins_whatever_the_order_of_robots() -> None:
     """The robot that is nearer gets it, not the one with the lower place."""
     floor = drawn(CORRIDOR)
 
-    assert targets(floor, floor.situation([robot(0, 5), robot(1, 3)])) == [9, 2]
+    assert targets(floor, floor.situation([member(0, 5), member(1, 3)])) == [9, 2]
 
 
 def test_of_equal_pairs_it_is_the_shorter_way_then_the_robot_then_the_cell() -> None:
     """With a sensor of 4 cells, 0 - 1/4 equals 1 - 5/4: the way to 2 is shorter than that to 8."""
     floor = drawn(["  .......  "], "sensor.range_m=4.0")
-    others = [robot(2, 5, 2)]
-    assert targets(floor, floor.situation([robot(0, 3)], others)) == [2]
+    others = [member(2, 5, 2)]
+    assert targets(floor, floor.situation([member(0, 3)], others)) == [2]
 
-    assert targets(floor, floor.situation([robot(0, 3), robot(1, 3)])) == [2, 2]
-    assert targets(floor, floor.situation([robot(0, 4), robot(1, 4)])) == [2, 8]
-    assert targets(floor, floor.situation([robot(0, 5)])) == [2]
+    assert targets(floor, floor.situation([member(0, 3), member(1, 3)])) == [2, 2]
+    assert targets(floor, floor.situation([member(0, 4), member(1, 4)])) == [2, 8]
+    assert targets(floor, floor.situation([member(0, 5)])) == [2]
 
 
 def test_with_more_robots_than_frontiers_every_robot_gets_one() -> None:
     """A worth of 0 is still something to go for."""
     floor = drawn(CORRIDOR)
 
-    assert sorted(targets(floor, floor.situation([robot(i, 5 + i % 2) for i in range(5)]))) == [
+    assert sorted(targets(floor, floor.situation([member(i, 5 + i % 2) for i in range(5)]))) == [
         2,
         2,
         2,
@@ -93,14 +93,14 @@ def test_with_more_robots_than_frontiers_every_robot_gets_one() -> None:
 def test_a_robot_that_reaches_no_frontier_gets_no_target() -> None:
     """Behind a wall, in a wall, or when there is no frontier at all."""
     floor = drawn(["###.....", "#.#####."])
-    sealed, inside, free = robot(0, 9), robot(1, 0), robot(2, 7)
+    sealed, inside, free = member(0, 9), member(1, 0), member(2, 7)
     assert targets(floor, floor.situation([sealed, inside, free])) == [NOWHERE] * 3
 
     floor = drawn(["###.... ", "#.#####."])
-    assert targets(floor, floor.situation([sealed, inside, robot(2, 3)])) == [NOWHERE, NOWHERE, 6]
+    assert targets(floor, floor.situation([sealed, inside, member(2, 3)])) == [NOWHERE, NOWHERE, 6]
 
     uncoordinated = drawn(["###.... ", "#.#####."], "planner.coordinated=false")
-    found = targets(uncoordinated, uncoordinated.situation([sealed, inside, robot(2, 3)]))
+    found = targets(uncoordinated, uncoordinated.situation([sealed, inside, member(2, 3)]))
     assert found == [NOWHERE, NOWHERE, 6]
 
 
@@ -108,13 +108,13 @@ def test_a_robot_that_reaches_no_frontier_gets_no_target() -> None:
 def test_targets_of_others_reduce_utilities_before_the_first_choice(taken: str) -> None:
     """From 4 it is 2 cells to 2, but somebody is on the way there; who stands there stays all the same."""
     floor = drawn(["  ......  "])
-    others = [robot(1, 5, 2)] if taken == "others" else []
+    others = [member(1, 5, 2)] if taken == "others" else []
     absent = [2] if taken == "absent" else []
-    situation = floor.situation([robot(0, 4)], others, absent)
+    situation = floor.situation([member(0, 4)], others, absent)
 
     assert targets(floor, situation) == [7]
-    assert targets(floor, floor.situation([robot(0, 2)], others, absent)) == [2]
-    assert targets(floor, floor.situation([robot(0, 4)], [robot(1, 5)])) == [2]
+    assert targets(floor, floor.situation([member(0, 2)], others, absent)) == [2]
+    assert targets(floor, floor.situation([member(0, 4)], [member(1, 5)])) == [2]
 
 
 # The options.
@@ -177,7 +177,7 @@ def test_a_wall_in_between_keeps_the_utility_behind_it() -> None:
     """Cell 23 is 2 cells from a target at 1: worth 0 in the disc, unless sight counts."""
     options = ("planner.coverage=disc", "planner.beta=0.5")
     blind, seeing = drawn(ROOMS, *options), drawn(ROOMS, *options, "planner.sight=true")
-    below = robot(0, 25)
+    below = member(0, 25)
 
     assert targets(blind, blind.situation([below], absent=[1])) == [31]
     assert targets(seeing, seeing.situation([below], absent=[1])) == [23]
@@ -188,7 +188,7 @@ def test_beta_weighs_cost_against_worth(beta: str, chosen: list[int]) -> None:
     """A dear way makes robots take what is near even if it is worth nothing any more."""
     floor = drawn(CORRIDOR, f"planner.beta={beta}")
 
-    assert targets(floor, floor.situation([robot(0, 3), robot(1, 5)])) == chosen
+    assert targets(floor, floor.situation([member(0, 3), member(1, 5)])) == chosen
 
 
 # Against references.
@@ -245,9 +245,9 @@ def by_the_table(floor: Floor, situation: Situation) -> list[int]:
             p = share_of(floor, d, reach) if seen else 0.0
             worth[t] = worth[t] - p if planner.discount == "subtract" else worth[t] * (1.0 - p)
 
-    for member in situation.others:
-        if member.task != Task():
-            lessen(member.task.target)
+    for other in situation.others:
+        if other.task != Task():
+            lessen(other.task.target)
     for target in situation.absent:
         lessen(target)
     chosen = {}

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from kantor_agent.planners.hungarian import Hungarian, cheapest_pairs, spread_out
 from kantor_agent.planners.map_base import Situation
 from kantor_protocol.base.grid import NOWHERE
-from support.floors import Floor, crowded, drawn, robot
+from support.floors import Floor, crowded, drawn, member
 from support.strategies import SEEDS, examples
 
 CORRIDOR = ["  ........  "]
@@ -27,32 +27,32 @@ def test_the_total_cost_is_least() -> None:
     """Both are nearer to 2. Of 1 + 4 and 3 + 6 cells the first is less."""
     floor = drawn(CORRIDOR)
 
-    assert targets(floor, floor.situation([robot(0, 3), robot(1, 5)])) == [2, 9]
-    assert targets(floor, floor.situation([robot(0, 5), robot(1, 3)])) == [9, 2]
+    assert targets(floor, floor.situation([member(0, 3), member(1, 5)])) == [2, 9]
+    assert targets(floor, floor.situation([member(0, 5), member(1, 3)])) == [9, 2]
 
 
 @pytest.mark.parametrize("taken", ["others", "absent"])
 def test_no_robot_is_sent_where_others_head_for(taken: str) -> None:
     """Nor half a sensor range around, while there is something else."""
     floor = drawn(CORRIDOR)
-    others = [robot(1, 5, 3)] if taken == "others" else []
+    others = [member(1, 5, 3)] if taken == "others" else []
     absent = [3] if taken == "absent" else []
 
-    assert targets(floor, floor.situation([robot(0, 4)], others, absent)) == [9]
-    assert targets(floor, floor.situation([robot(0, 4)], others, [*absent, 9])) == [2]
+    assert targets(floor, floor.situation([member(0, 4)], others, absent)) == [9]
+    assert targets(floor, floor.situation([member(0, 4)], others, [*absent, 9])) == [2]
 
 
 def test_robots_without_a_frontier_of_their_own_take_thecheapest_pairs() -> None:
     """Three robots and two frontiers: the one in the middle is left over."""
     floor = drawn(CORRIDOR)
 
-    assert targets(floor, floor.situation([robot(0, 3), robot(1, 5), robot(2, 8)])) == [2, 2, 9]
+    assert targets(floor, floor.situation([member(0, 3), member(1, 5), member(2, 8)])) == [2, 2, 9]
 
 
 def test_frontiers_side_by_side_are_one_to_choose_from() -> None:
     """Cells 11 to 15 are an opening of five cells: two robots fit, 1.5 cells apart at least."""
     floor = drawn(["#######", "#.....#", "#.....#", "       "][::-1])
-    found = targets(floor, floor.situation([robot(0, 15), robot(1, 16), robot(2, 17)]))
+    found = targets(floor, floor.situation([member(0, 15), member(1, 16), member(2, 17)]))
 
     assert found[0] == 8
     assert min(abs(a - b) for a, b in itertools.combinations(found, 2)) >= 2
@@ -62,13 +62,13 @@ def test_a_robot_that_reaches_no_frontier_gets_no_target() -> None:
     """And takes nothing from those who do."""
     floor = drawn(["###.... ", "#.#####."])
 
-    assert targets(floor, floor.situation([robot(0, 9), robot(1, 0), robot(2, 3)])) == [
+    assert targets(floor, floor.situation([member(0, 9), member(1, 0), member(2, 3)])) == [
         NOWHERE,
         NOWHERE,
         6,
     ]
     sealed = drawn(["#.#"])
-    assert targets(sealed, sealed.situation([robot(0, 1), robot(1, 1)])) == [NOWHERE] * 2
+    assert targets(sealed, sealed.situation([member(0, 1), member(1, 1)])) == [NOWHERE] * 2
 
 
 @examples(200)
@@ -126,10 +126,10 @@ def test_spots_lie_apart(seed: int, columns: int, taken: int, apart: float) -> N
 def test_every_robot_that_can_reach_a_frontier_gets_one(data: st.DataObject) -> None:
     """Its cheapest frontier, or one that lies half a sensor range from all that is taken."""
     floor, situation = data.draw(crowded())
-    held = [member.task.target for member in situation.others if member.task.target != NOWHERE]
+    held = [other.task.target for other in situation.others if other.task.target != NOWHERE]
     taken = [*held, *situation.absent]
-    for member, target in zip(situation.members, targets(floor, situation), strict=True):
-        travel = floor.cost_map.travel(member.cell)[situation.frontiers]
+    for asked, target in zip(situation.members, targets(floor, situation), strict=True):
+        travel = floor.cost_map.travel(asked.cell)[situation.frontiers]
         if not np.isfinite(travel).any():
             assert target == NOWHERE
             continue
