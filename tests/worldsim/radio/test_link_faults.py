@@ -1,123 +1,44 @@
-"""Link faults: the effect of each on the radio's decisions, of several together, and whole missions under them."""
+"""Link faults: the effect of each on the decisions of the radio."""
 
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import Any
 
-import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_protocol.base.counter_rng import Purpose, uniform
-from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
-from kantor_protocol.scenario.dump import to_tree
+from kantor_protocol.base.machine import SUPERVISOR
 from kantor_protocol.scenario.faults.links import (
-    FORGED_SEQUENCE_MIN,
     Bandwidth,
     Burst,
     Clog,
     Delay,
     Drop,
     Duplicate,
-    Hostile,
     OneWay,
     Partition,
     Range,
     Reorder,
     Replay,
 )
-from kantor_protocol.scenario.faults.schedule import AnyFault, kind_of
-from kantor_protocol.scenario.load import from_tree
-from kantor_protocol.scenario.schema import Scenario
-from kantor_worldsim.observers.checkers.checker import check
-from kantor_worldsim.observers.metrics.result import FaultCounts, Result
-from kantor_worldsim.observers.pipeline import Pipeline
-from kantor_worldsim.observers.recording import metrics_of
-from kantor_worldsim.radio.channel import DROPPED, Channel, DeliveryDecision, Sent
+from kantor_protocol.scenario.faults.schedule import AnyFault
+from kantor_worldsim.radio.channel import DROPPED, Sent
 from kantor_worldsim.radio.fault_kernels import in_burst
-from kantor_worldsim.radio.link_faults import LinkFaults
-from kantor_worldsim.record.journal import Journal
-from kantor_worldsim.record.records import Batch, Ending, Opening, Record
-from kantor_worldsim.world.maps import Ground
+from support.faulty_radio import (
+    ALL_LINKS,
+    MS,
+    PLACES,
+    FaultyRadio,
+    S,
+    broadcasts,
+    dues,
+    reached,
+    sent_by,
+)
 from support.grounds import drawn, exploration
-from support.missions import explored
-from support.plain_faults import PASS, Fate, PlainFaults
 from support.strategies import SEEDS, examples, mission
-
-Play = Callable[..., tuple[Record, ...]]
-
-MS = 1_000_000
-S = 1_000 * MS
-
-
-# A radio with faults.
-
-
-class FaultyRadio:
-    """A channel under faults, with all participants in one place but for those in `at`."""
-
-    def __init__(
-        self,
-        *faults: AnyFault,
-        scenario: Scenario | None = None,
-        seed: int = 1,
-        at: dict[ParticipantId, tuple[float, float]] | None = None,
-        ground: Ground | None = None,
-    ) -> None:
-        self.scenario = msgspec.structs.replace(scenario or mission(), faults=faults)
-        self.faults = LinkFaults(self.scenario, seed)
-        self.channel = Channel(self.scenario, seed, ground, self.faults.rule)
-        for name in self.scenario.roster:
-            self.channel.place(name, Pose(*(at or {}).get(name, (0.0, 0.0))))
-
-    def transmit(self, *sent: Sent) -> list[DeliveryDecision]:
-        """Decisions on envelopes."""
-        return self.channel.transmit(sent)[0]
-
-    @property
-    def fault_stats(self) -> dict[int, dict[str, int]]:
-        """Effects of each fault, without counters that are zero."""
-        return {
-            stats.fault: {
-                k: n for k, n in msgspec.structs.asdict(stats).items() if n and k != "fault"
-            }
-            for stats in self.faults.pop_stats()
-        }
-
-
-def sent_by(
-    source: ParticipantId,
-    sequence: int,
-    now_ns: int = 0,
-    target: ParticipantId = EVERYBODY,
-    size: int = 0,
-) -> Sent:
-    """An envelope on the radio."""
-    return Sent(now_ns, Envelope(source, sequence, target, bytes(size)))
-
-
-def broadcasts(count: int, roster: Sequence[str] = ("r1", "r2", "r3"), size: int = 0) -> list[Sent]:
-    """`count` broadcasts of each participant, 100 ms apart."""
-    return [
-        sent_by(name, sequence, 100 * MS * sequence, size=size)
-        for sequence in range(1, count + 1)
-        for name in roster
-    ]
-
-
-def dues(decisions: Sequence[DeliveryDecision]) -> list[int]:
-    return [decision.due_ns for decision in decisions]
-
-
-def reached(decisions: Sequence[DeliveryDecision]) -> set[str]:
-    """Links over which a copy passed, as source>target."""
-    return {f"{v.source}>{v.target}" for v in decisions if v.due_ns != DROPPED}
-
-
-ALL = {f"{one}>{other}" for one, other in itertools.permutations(("r1", "r2", "r3"), 2)}
 
 
 def within_five_sigma(hits: int, trials: int, rate: float) -> bool:
@@ -184,10 +105,10 @@ def test_bursts_have_their_mean_length() -> None:
         radio.transmit(sent_by("r1", i, i * 50 * MS, "r2"))[0].due_ns == DROPPED
         for i in range(1, 40_001)
     ]
-    spells = [len(list(run)) for bad, run in itertools.groupby(lost) if bad]
+    bursts = [len(list(run)) for bad, run in itertools.groupby(lost) if bad]
 
     assert sum(lost) / len(lost) == pytest.approx(0.2, abs=0.02)
-    assert sum(spells) / len(spells) * 0.05 == pytest.approx(0.5, abs=0.05)
+    assert sum(bursts) / len(bursts) * 0.05 == pytest.approx(0.5, abs=0.05)
 
 
 def test_each_direction_has_bursts_of_its_own() -> None:
@@ -384,8 +305,8 @@ def test_a_dropped_message_may_still_be_replayed() -> None:
         (Partition(shape="halves"), {"r1>r2", "r2>r1"}),
         (Partition(shape="isolate", robots=("r2",)), {"r1>r3", "r3>r1"}),
         (Partition(shape="groups", groups=(("r1",), ("r2",))), set()),
-        (OneWay(senders=("r1",)), ALL - {"r1>r2", "r1>r3"}),
-        (OneWay(senders=("r1",), receivers=("r2",)), ALL - {"r1>r2"}),
+        (OneWay(senders=("r1",)), ALL_LINKS - {"r1>r2", "r1>r3"}),
+        (OneWay(senders=("r1",), receivers=("r2",)), ALL_LINKS - {"r1>r2"}),
     ],
 )
 def test_nothing_passes_a_cut(fault: AnyFault, links: set[str]) -> None:
@@ -420,11 +341,6 @@ def test_a_flapping_cut_opens_and_closes_in_slots() -> None:
     assert within_five_sigma(sum(slot == {(True, True)} for slot in slots), 1000, 0.25)
 
 
-# Range.
-
-PLACES = {"r2": (30.0, 0.0), "r3": (60.0, 0.0)}
-
-
 @pytest.mark.parametrize(
     ("faults", "links"),
     [
@@ -433,7 +349,7 @@ PLACES = {"r2": (30.0, 0.0), "r3": (60.0, 0.0)}
         ((Range(range_m=29.9),), set()),
         ((Range(factor=0.5), Range(range_m=10.0)), set()),
         ((Range(range_m=10.0, robots=("r1",)),), {"r2>r3", "r3>r2"}),
-        ((Range(range_m=10.0, from_s=1.0),), ALL),
+        ((Range(range_m=10.0, from_s=1.0),), ALL_LINKS),
     ],
 )
 def test_range_shrinks_on_the_links_of_a_fault(faults: tuple[Range, ...], links: set[str]) -> None:
@@ -444,7 +360,7 @@ def test_range_shrinks_on_the_links_of_a_fault(faults: tuple[Range, ...], links:
     now_ns = 100 * MS
     assert reached(decisions) == links
     assert len(links) + out_of_range == 6
-    for link in ALL:
+    for link in ALL_LINKS:
         one, other = link.split(">")
         apart_m = math.dist(PLACES.get(one, (0.0, 0.0)), PLACES.get(other, (0.0, 0.0)))
         assert (apart_m <= radio.faults.reach_m(now_ns, one, other)) == (link in links)
@@ -474,419 +390,3 @@ def test_walls_shorten_the_range_that_faults_leave() -> None:
     ]
 
     assert receivers == [1, 0]
-
-
-# Together.
-
-FATES = st.builds(Fate, st.booleans(), st.integers(0, 10**15), st.integers(0, 10**15))
-
-
-@examples(100)
-@given(FATES, FATES, FATES)
-def test_the_order_of_decisions_does_not_matter_and_a_drop_wins(a: Fate, b: Fate, c: Fate) -> None:
-    assert a.joined(b) == b.joined(a)
-    assert a.joined(b).joined(c) == a.joined(b.joined(c))
-    assert a.joined(PASS) == a
-    assert (a.joined(b).due_ns(5) == DROPPED) == (a.dropped or b.dropped)
-
-
-FIXED: st.SearchStrategy[AnyFault] = st.sampled_from(
-    [
-        Drop(probability=1.0, from_s=1.0, until_s=1.5, robots=("r1",)),
-        Delay(delay_s=0.2, from_s=0.5),
-        Delay(delay_s=0.1, until_s=2.0, robots=("r2",)),
-        OneWay(senders=("r1",), receivers=("r2",), until_s=3.0),
-        Partition(shape="halves", from_s=2.0, until_s=4.0),
-        Clog(from_s=3.5, until_s=5.0),
-        Clog(from_s=4.0, until_s=4.5, robots=("r3",)),
-        Bandwidth(bytes_per_s=150.0),
-        Bandwidth(bytes_per_s=100.0, queue_bytes=30, robots=("r2",)),
-        Range(range_m=40.0, from_s=0.3),
-        Range(factor=0.7, robots=("r3",)),
-    ]
-)
-
-
-@examples(60)
-@given(st.data())
-def test_the_order_of_faults_without_draws_does_not_matter(data: st.DataObject) -> None:
-    """Cuts, holds, fixed delays, queues and ranges, in any order of the list."""
-    schedule = data.draw(st.lists(FIXED, min_size=2, max_size=5))
-    shuffled = data.draw(st.permutations(schedule))
-    one, other = (
-        FaultyRadio(*faults, scenario=mission(*LOSSY), at=PLACES).transmit(*TALK)
-        for faults in (schedule, shuffled)
-    )
-
-    assert one == other
-
-
-NAMES = st.lists(st.sampled_from(["r1", "r2", "r3"]), unique=True, max_size=2).map(tuple)
-WINDOWS = st.tuples(st.floats(0.0, 2.0), st.floats(0.001, 2.0)).map(
-    lambda pair: {"from_s": pair[0], "until_s": sum(pair)}
-)
-SHARES = st.sampled_from([0.2, 0.5, 1.0])
-SPANS = st.sampled_from([0.05, 0.3, 1.0])
-PARTS: dict[type[AnyFault], dict[str, st.SearchStrategy[Any]]] = {
-    Drop: {"probability": SHARES, "robots": NAMES},
-    Burst: {"good_s": SPANS, "bad_s": SPANS, "robots": NAMES},
-    Delay: {"delay_s": SPANS, "jitter_s": st.sampled_from([0.0, 0.5]), "robots": NAMES},
-    Duplicate: {"probability": SHARES, "copies": st.integers(1, 8), "delay_s": SPANS},
-    Replay: {"probability": SHARES, "age_s": SPANS},
-    Reorder: {"probability": SHARES, "hold_s": SPANS, "robots": NAMES},
-    OneWay: {"senders": st.just(("r1",)), "receivers": st.just(("r2", "r3"))},
-    Partition: {
-        "shape": st.sampled_from(["halves", "bridge"]),
-        "flap_s": st.sampled_from([None, 0.5]),
-    },
-    Clog: {"robots": NAMES},
-    Bandwidth: {
-        "bytes_per_s": st.sampled_from([50.0, 1000.0]),
-        "queue_bytes": st.sampled_from([None, 0, 50]),
-        "robots": NAMES,
-    },
-    Range: {"range_m": st.sampled_from([5.0, 40.0]), "robots": NAMES},
-    Hostile: {"probability": SHARES, "robots": NAMES},
-}
-
-
-def faults_of(kinds: Sequence[type[AnyFault]]) -> st.SearchStrategy[AnyFault]:
-    """Faults of these kinds in windows of the first seconds."""
-    return st.sampled_from(kinds).flatmap(
-        lambda kind: WINDOWS.flatmap(
-            lambda window: st.fixed_dictionaries(PARTS[kind]).map(
-                lambda part: kind(**window, **part)
-            )
-        )
-    )
-
-
-FAULTS = faults_of(list(PARTS))
-UNFORGED = faults_of([kind for kind in PARTS if kind is not Hostile])
-SCHEDULES = st.lists(FAULTS, max_size=5).map(tuple)
-LOSSY = ("radio.range_m=50", "radio.drop=0.2", "radio.duplicate=0.3", "radio.jitter_s=0.3")
-TALK = broadcasts(60, size=20)
-
-
-@examples(60)
-@given(schedule=SCHEDULES, seed=SEEDS)
-def test_windows_that_are_over_change_nothing(schedule: tuple[AnyFault, ...], seed: int) -> None:
-    """Messages after the last of them have the decisions of a radio without faults."""
-    over_ns = max((fault.until_ns or 0 for fault in schedule), default=0)
-    scenario = mission(*LOSSY)
-    plain = FaultyRadio(scenario=scenario, seed=seed, at=PLACES).transmit(*TALK)
-    faulty = FaultyRadio(*schedule, scenario=scenario, seed=seed, at=PLACES)
-    faulty.transmit(*[sent for sent in TALK if sent.now_ns < over_ns])
-    after = [sent for sent in TALK if sent.now_ns >= over_ns]
-
-    assert faulty.transmit(*after) == [v for v in plain if v.sequence * 100 * MS >= over_ns]
-
-
-@examples(60)
-@given(schedule=SCHEDULES, fault=FAULTS, seed=SEEDS)
-def test_a_window_in_which_nothing_is_sent_changes_nothing(
-    schedule: tuple[AnyFault, ...], fault: AnyFault, seed: int
-) -> None:
-    """Nor does a fault that never begins: appended to others, it leaves their draws as they were."""
-    scenario = mission(*LOSSY)
-    idle = msgspec.structs.replace(fault, from_s=0.0, until_s=0.05)
-    later = msgspec.structs.replace(fault, from_s=1e5, until_s=1e6)
-    plain = FaultyRadio(*schedule, scenario=scenario, seed=seed, at=PLACES).transmit(*TALK)
-
-    assert (
-        FaultyRadio(*schedule, idle, later, scenario=scenario, seed=seed, at=PLACES).transmit(*TALK)
-        == plain
-    )
-
-
-@examples(60)
-@given(schedule=SCHEDULES, seed=SEEDS)
-def test_a_certain_drop_wins_over_all(schedule: tuple[AnyFault, ...], seed: int) -> None:
-    radio = FaultyRadio(
-        *schedule, Drop(probability=1.0), scenario=mission(*LOSSY), seed=seed, at=PLACES
-    )
-
-    assert set(dues(radio.transmit(*TALK))) <= {DROPPED}
-
-
-@examples(60)
-@given(schedule=SCHEDULES, fault=FAULTS, seed=SEEDS)
-def test_one_fault_more_delivers_no_lost_copy(
-    schedule: tuple[AnyFault, ...], fault: AnyFault, seed: int
-) -> None:
-    """A copy that was lost is still lost, and one that still arrives does so no sooner."""
-    scenario = mission(*LOSSY)
-    before = _arrivals(
-        FaultyRadio(*schedule, scenario=scenario, seed=seed, at=PLACES).transmit(*TALK)
-    )
-    after = _arrivals(
-        FaultyRadio(*schedule, fault, scenario=scenario, seed=seed, at=PLACES).transmit(*TALK)
-    )
-
-    if not isinstance(fault, Replay | Duplicate):
-        assert set(after) <= set(before)
-    for key in set(after) & set(before):
-        assert isinstance(fault, Replay | Duplicate) or after[key] >= before[key]
-
-
-def _arrivals(decisions: Sequence[DeliveryDecision]) -> dict[tuple[str, int, str], int]:
-    """Time of arrival of the first copy of each sent message at each receiver."""
-    arrivals: dict[tuple[str, int, str], int] = {}
-    for source, sequence, target, due_ns in map(msgspec.structs.astuple, decisions):
-        if due_ns != DROPPED and sequence < FORGED_SEQUENCE_MIN:
-            key = source, sequence, target
-            arrivals[key] = min(due_ns, arrivals.get(key, due_ns))
-    return arrivals
-
-
-@examples(100)
-@given(
-    schedule=st.lists(UNFORGED | FIXED, max_size=12).map(tuple),
-    seed=SEEDS,
-    overrides=st.sampled_from(
-        [(), LOSSY, (*LOSSY, "coordination=centralized", "supervisor.range_m=55")]
-    ),
-    spots=st.lists(st.tuples(st.floats(0.0, 60.0), st.floats(0.0, 60.0)), min_size=3, max_size=3),
-)
-def test_compiled_rules_agree_with_the_reference(
-    schedule: tuple[AnyFault, ...],
-    seed: int,
-    overrides: tuple[str, ...],
-    spots: list[tuple[float, float]],
-) -> None:
-    """Decision by decision, and counter by counter."""
-    at = dict(zip(("r1", "r2", "r3"), spots, strict=True))
-    scenario = mission(*overrides)
-    radio = FaultyRadio(*schedule, scenario=scenario, seed=seed, at=at)
-    plain = PlainFaults(radio.scenario, seed)
-    reference = Channel(radio.scenario, seed, None, plain.interfere)
-    for name in scenario.roster:
-        reference.place(name, Pose(*at.get(name, (0.0, 0.0))))
-    for i in range(1, 45):
-        now_ns = 100 * MS * i
-        sent = [sent_by(name, i, now_ns, size=20) for name in scenario.roster]
-        sent += [sent_by("r1", 100 + i, now_ns, "r2", size=5)]
-        assert radio.channel.transmit(sent) == reference.transmit(sent)
-        assert radio.fault_stats == plain.pop_stats()
-        for name in scenario.roster:
-            assert radio.channel.collect(name, now_ns) == reference.collect(name, now_ns)
-        for one, other in itertools.permutations(scenario.roster, 2):
-            assert radio.faults.cuts(now_ns, one, other) == plain.cuts(now_ns, one, other)
-            assert radio.faults.reach_m(now_ns, one, other) == plain.reach_m(now_ns, one, other)
-
-
-_DRAWN_ALONE = (Drop, Burst, Delay, Duplicate, Reorder, OneWay, Partition, Clog, Range)
-
-
-@examples(60)
-@given(st.data())
-def test_draws_depend_on_the_message_alone(data: st.DataObject) -> None:
-    """In any portions, with others in between or not: every decision is the same."""
-    schedule = data.draw(
-        SCHEDULES.filter(lambda faults: all(isinstance(f, _DRAWN_ALONE) for f in faults))
-    )
-    whole = FaultyRadio(*schedule, scenario=mission(*LOSSY), at=PLACES).transmit(*TALK)
-    some = [TALK[i] for i in sorted(data.draw(st.sets(st.integers(0, len(TALK) - 1))))]
-    cut = data.draw(st.integers(0, len(some)))
-    radio = FaultyRadio(*schedule, scenario=mission(*LOSSY), at=PLACES)
-    in_portions = [*radio.transmit(*some[:cut]), *radio.transmit(*some[cut:])]
-    spoken = {(sent.envelope.source, sent.envelope.sequence) for sent in some}
-
-    assert in_portions == [v for v in whole if (v.source, v.sequence) in spoken]
-
-
-def test_fault_stats_agree_with_the_decisions() -> None:
-    """Every copy that faults drop is counted, for each fault that drops it."""
-    faults = (Partition(shape="halves"), Drop(probability=0.5), Delay(delay_s=1.0))
-    radio = FaultyRadio(*faults)
-    decisions = radio.transmit(*broadcasts(50))
-    passed = [v.due_ns for v in decisions if v.due_ns != DROPPED]
-    fault_stats = radio.fault_stats
-
-    assert fault_stats[0] == {"dropped": 200}
-    assert fault_stats[1]["dropped"] > 100 - len(passed)
-    assert fault_stats[2] == {"delayed": len(passed)}
-
-
-# Missions.
-
-SCHEDULE: dict[str, AnyFault] = {
-    "drop": Drop(probability=0.4),
-    "burst": Burst(good_s=1.0, bad_s=0.6),
-    "delay": Delay(delay_s=0.2, jitter_s=0.3),
-    "duplicate": Duplicate(probability=0.5, copies=2, delay_s=0.5),
-    "replay": Replay(probability=0.5, age_s=1.5),
-    "reorder": Reorder(probability=0.5, hold_s=1.0),
-    "one-way": OneWay(senders=("r1",), from_s=0.5, until_s=3.0),
-    "halves": Partition(shape="halves", from_s=0.5, until_s=2.0),
-    "isolate": Partition(shape="isolate", robots=("r1",), until_s=2.5),
-    "flapping": Partition(shape="groups", groups=(("r2",),), flap_s=0.3),
-    "clog": Clog(from_s=0.5, until_s=2.0),
-    "bandwidth": Bandwidth(bytes_per_s=300.0),
-    "bandwidth-drops": Bandwidth(bytes_per_s=300.0, queue_bytes=40),
-    "range": Range(range_m=7.0, until_s=3.0),
-    "hostile": Hostile(probability=0.3),
-}
-
-
-def under(*faults: AnyFault) -> str:
-    """Faults as an override."""
-
-    def literal(value: Any) -> str:
-        if isinstance(value, dict):
-            return "{" + ", ".join(f"{k} = {literal(v)}" for k, v in value.items()) + "}"
-        if isinstance(value, list):
-            return "[" + ", ".join(map(literal, value)) + "]"
-        return repr(value)
-
-    trees = to_tree(msgspec.structs.replace(mission(), faults=faults))["faults"]
-    return f"faults={literal(trees)}"
-
-
-def result_of(records: Sequence[Record]) -> Result:
-    """result.json of a record."""
-    first = records[0]
-    assert isinstance(first, Opening)
-    metrics = metrics_of(first.scenario)
-    journal = Journal()
-    pipeline = Pipeline(journal, metrics)
-    for record in records:
-        pipeline.observe(record)
-    return metrics.result(
-        exchange="in-process",
-        digest=journal.digest.hex,
-        wall_s=0.0,
-        record="whole",
-        complaints=tuple(check(records).violations),
-    )
-
-
-def went_well(records: Sequence[Record], *faults: AnyFault) -> Result:
-    """The result of a mission that ended, in which no rule was broken and every fault has had effects."""
-    result = result_of(records)
-
-    assert result.complaints == ()
-    assert result.ended == "done"
-    assert list(result.faults) == [f"{i} {kind_of(fault)}" for i, fault in enumerate(faults)]
-    assert all(counts != FaultCounts() for counts in result.faults.values())
-    return result
-
-
-@pytest.mark.parametrize("name", SCHEDULE)
-@pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
-def test_a_mission_on_a_density_completes_under_every_fault(
-    played: Play, coordination: str, name: str
-) -> None:
-    """Only time is lost: all mass is shipped, and no robot has shipped more than it knows of."""
-    narrow = ("supervisor.range_m=60",) if coordination == "centralized" else ()
-    fault = SCHEDULE[name]
-    if isinstance(fault, Range):
-        fault = msgspec.structs.replace(fault, range_m=30.0)
-    overrides = (f"coordination={coordination}", *narrow, "energy.steps=90")
-    result = went_well(played(*overrides, under(fault)), fault)
-
-    assert result.mass_left == 0.0
-    assert result.finished_tick is not None
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize("name", SCHEDULE)
-@pytest.mark.parametrize("coordination", ["decentralized", "centralized"])
-def test_a_mission_on_a_map_completes_under_every_fault(coordination: str, name: str) -> None:
-    """The map is explored as far as it can be."""
-    fault = SCHEDULE[name]
-    place = ("supervisor.pose_m=[1.5, 1.5]",) if isinstance(fault, Range) else ()
-    if isinstance(fault, Partition) and fault.shape == "halves" and coordination == "centralized":
-        fault = Partition(shape="isolate", robots=("r1",), from_s=0.5, until_s=2.0)
-    overrides = (f"coordination={coordination}", "radio.range_m=30", *place)
-    result = went_well(explored(*overrides, under(fault)), fault)
-
-    assert result.map is not None
-    assert result.map.explored == 1.0
-
-
-STORM = (
-    *(SCHEDULE[name] for name in ("drop", "burst", "delay", "duplicate", "replay", "reorder")),
-    *(SCHEDULE[name] for name in ("flapping", "clog", "bandwidth", "bandwidth-drops")),
-    OneWay(senders=("r1",), receivers=("r2",), until_s=1.5),
-    Range(factor=0.9, until_s=3.0),
-    Partition(shape="bridge", until_s=1.0),
-)
-
-
-def test_a_mission_completes_under_all_faults_together(played: Play) -> None:
-    overrides = ("radio.range_m=95", "energy.steps=200", "energy.points=200", under(*STORM))
-    result = went_well(played(*overrides), *STORM)
-
-    assert result.mass_left == 0.0
-
-
-@examples(30)
-@given(
-    schedule=SCHEDULES,
-    coordination=st.sampled_from(["decentralized", "centralized"]),
-    merge=st.sampled_from([("merge=ledger",), ("merge=min", "claims=false")]),
-    order=st.sampled_from(["turn", "concurrent"]),
-    delay_s=st.sampled_from([0.0, 0.15]),
-    seed=SEEDS,
-)
-def test_under_no_schedule_does_a_sound_robot_break_a_rule(
-    played: Play,
-    schedule: tuple[AnyFault, ...],
-    coordination: str,
-    merge: tuple[str, ...],
-    order: str,
-    delay_s: float,
-    seed: int,
-) -> None:
-    """And when the faults are over, the mission comes to its end."""
-    overrides = (
-        f"coordination={coordination}",
-        f"clock.order={order}",
-        f"radio.delay_s={delay_s}",
-        "energy.steps=90",
-    )
-    result = result_of(played(*merge, *overrides, under(*schedule), seed=seed))
-
-    assert result.complaints == ()
-    assert result.ended == "done"
-
-
-def test_the_same_seed_gives_the_same_record_under_faults() -> None:
-    first, second, other = (
-        result_of(explored.__wrapped__(under(*STORM[:8]), seed=seed)).digest for seed in (1, 1, 2)
-    )
-
-    assert first == second != other
-
-
-def without_scenario(records: Sequence[Record]) -> list[Record]:
-    """The records with no faults in the opening."""
-    first = records[0]
-    assert isinstance(first, Opening)
-    plain = msgspec.structs.replace(first.scenario, faults=())
-    return [msgspec.structs.replace(first, scenario=plain), *records[1:]]
-
-
-@pytest.mark.parametrize("name", SCHEDULE)
-def test_a_fault_after_the_end_changes_nothing(played: Play, name: str) -> None:
-    """Record by record, but for the scenario itself."""
-    plain = played()
-    assert isinstance(plain[-1], Ending)
-    end_s = plain[-1].now_ns * 1e-9
-    fault = msgspec.structs.replace(SCHEDULE[name], from_s=end_s + 0.01, until_s=end_s + 1.0)
-
-    assert without_scenario(played(under(fault))) == list(plain)
-
-
-def test_batches_have_the_effects_of_faults(played: Play) -> None:
-    """In the window, and not outside."""
-    records = played(under(SCHEDULE["halves"]))
-    times_ns = [r.now_ns for r in records if isinstance(r, Batch) and r.fault_stats]
-
-    assert (min(times_ns), max(times_ns)) == (500 * MS, 1900 * MS)
-
-
-def test_a_scenario_without_link_faults_has_no_interference() -> None:
-    assert LinkFaults.of(mission(), 1) is None
-    assert LinkFaults.of(from_tree(to_tree(mission(under(SCHEDULE["drop"]))), "t"), 1) is not None
