@@ -24,8 +24,11 @@ from fuzz.mutations import (
     pick,
     text_spans,
 )
+from kantor_fleet.execution.experiment import Outcome
 from kantor_fleet.execution.in_process_team import play
 from kantor_fleet.security import authority
+from kantor_fleet.sweep.journal import RunsJournal
+from kantor_fleet.sweep.plan import RunKey
 from kantor_protocol.base.machine import Body, Inputs, Outputs, Pose
 from kantor_protocol.node.wal import WalFile
 from kantor_protocol.scenario.schema import Scenario
@@ -72,19 +75,19 @@ class Played:
         self.setup = setup or WorldSetup.of(scenario, 1)
         self.records: list[Record] = []
         play(scenario, 1, self.setup, [self.records.append])
-        mailbag = EnvelopeIndex()
+        index = EnvelopeIndex()
         self.inputs: list[Inputs] = []
         self.outputs: list[Outputs] = []
-        self.acted: list[str] = []
+        self.names: list[str] = []
         for record in self.records:
             if isinstance(record, Batch):
-                mailbag.add(record)
+                index.add(record)
         for record in self.records:
             for step_record in record.step_records if isinstance(record, Batch) else ():
                 if step_record.outputs is not None:
-                    self.inputs.append(mailbag.inputs(step_record))
+                    self.inputs.append(index.inputs(step_record))
                     self.outputs.append(step_record.outputs)
-                    self.acted.append(step_record.name)
+                    self.names.append(step_record.name)
 
     @property
     def opening(self) -> Opening:
@@ -104,7 +107,7 @@ DENSITY: dict[str, tuple[str, ...]] = {
     "ledger": (),
     "min": ("merge=min", "claims=false"),
     "centralized": ("coordination=centralized",),
-    "reborn": ('faults=[{kind="kill", who=["r1"], from_s=0.8, until_s=1.2, disk="lost"}]',),
+    "restarted": ('faults=[{kind="kill", who=["r1"], from_s=0.8, until_s=1.2, disk="lost"}]',),
     "hostile": ('faults=[{kind="hostile", probability=0.5}]',),
     "spectral": ("planner=spectral", "planner.modes=3"),
 }
@@ -154,24 +157,35 @@ def files(
     return Mutations(Grammar(goods, MSGPACK_TOKENS))
 
 
-def news(*names: str) -> Mutations:
+def gossip(*names: str) -> Mutations:
     """Bodies of envelopes, of these missions or of all."""
     return messages(body for each in _every(names or _ALL) for body in each.bodies())
 
 
-def news_fields(name: str) -> Framed:
-    """The sender's place, and what it tells: have, logs, claims, registers."""
-    told = [decode_gossip(body) for body in pick(played(name).bodies(), GOODS, 2000)]
+def gossip_fields(name: str) -> Framed:
+    """The sender's place, and the fields that it sends: version vector, logs, claims, registers."""
+    received = [decode_gossip(body) for body in pick(played(name).bodies(), GOODS, 2000)]
     goods = [
         (bytes((i % 3 + 1,)), n.version_vector, n.logs, n.claims, n.registers)
-        for i, n in enumerate(told)
+        for i, n in enumerate(received)
     ]
-    # Whoever knows of reborn participants has twice as many numbers.
-    reborn = [
-        (slot, version_vector + bytes(len(number_spans(version_vector))), *rest)
-        for slot, version_vector, *rest in goods[::4]
+    # A sender that knows of second incarnations has twice as many numbers.
+    longer = [
+        (place, version_vector + bytes(len(number_spans(version_vector))), *rest)
+        for place, version_vector, *rest in goods[::4]
     ]
-    return Framed([*goods, *reborn], LEB_TOKENS)
+    return Framed([*goods, *longer], LEB_TOKENS)
+
+
+def register_fields() -> Framed:
+    """The sender's place, and the registers that it sends."""
+    received = [
+        decode_gossip(body)
+        for name in ("spectral", "market")
+        for body in pick(played(name).bodies(), GOODS, 1500)
+    ]
+    goods = [(bytes((i % 3,)), message.registers) for i, message in enumerate(received)]
+    return Framed(goods, LEB_TOKENS)
 
 
 def packed() -> Framed:
@@ -193,18 +207,18 @@ def from_participants() -> Mutations:
 
 
 def to_participants() -> Mutations:
-    """Missions, turns, and the rest."""
-    told = [
+    """Missions, step requests, and the rest."""
+    missions = [
         encode(Mission(VERSION, "ab", each.scenario, 1, Array.of(each.setup.starts_m),
                        Array.of(each.setup.samples_m), "wall", each.opening.frame, "run",
                        Body(Pose(1.0, 2.0), 3, 4, 1)))
         for each in _every()
     ]  # fmt: skip
-    turns = [encode(StepRequest(VERSION, given)) for each in _every() for given in each.inputs]
+    requests = [encode(StepRequest(VERSION, given)) for each in _every() for given in each.inputs]
     observation = played("ledger").inputs[0].observation
     other = [StartClock(VERSION, "ab", 5, 2.0, observation, 3), Stop(VERSION, "over")]
     small = [*map(encode, other), encode(Refusal(VERSION, "ab", "no such robot"))]
-    return messages([*told, *pick(turns, GOODS - 12, 1200), *small], longest=3000)
+    return messages([*missions, *pick(requests, GOODS - 12, 1200), *small], longest=3000)
 
 
 def progress() -> Mutations:
@@ -217,10 +231,10 @@ def progress() -> Mutations:
 
 def records() -> Mutations:
     """Of every kind."""
-    incident = ProcessEvent(7, "r1", "start", 2, 3, 1)
+    event = ProcessEvent(7, "r1", "start", 2, 3, 1)
     found = [encode_record(record) for each in _every() for record in each.records]
     openings = [encode_record(each.opening) for each in _every()]
-    return messages([*pick(found, GOODS - 8, 2500), *openings, encode_record(incident)], 64, 4000)
+    return messages([*pick(found, GOODS - 8, 2500), *openings, encode_record(event)], 64, 4000)
 
 
 def batches() -> Mutations:
@@ -254,7 +268,7 @@ def scans() -> Framed:
 
 # Texts.
 
-STORM = (
+FAULT_TABLES = (
     *('[[faults]]\nkind = "drop"\nprobability = 0.2\nfrom_s = 1\nuntil_s = 2.5\n',),
     *('[[faults]]\nkind = "partition"\nshape = "groups"\ngroups = [["r1"], ["r2"]]\n',),
     *('[[faults]]\nkind = "kill"\nwho = ["r1"]\nfrom_s = 1.0\nuntil_s = 2.0\ndisk = "torn"\n',),
@@ -273,18 +287,18 @@ TOML_TOKENS = tuple(
         *("\x00", "\u202e", "\ud7ff", '"\\ud800"', "a.b.c", "[" * 50, "[" * 5000, "{a=" * 50),
         *('"dubins"', '"min"', '"spectral"', '"centralized"', '"a.csv"', "4611686018427387904"),
         *("1e-9", "1e9", "3", "2000", "from_s = -1\n", "until_s = 0.5\n", 'who = ["r1"]\n'),
-        *("[faults]\n", "[[faults]]\n", "[radio]\n", "drop = 0.5\n", *STORM),
+        *("[faults]\n", "[[faults]]\n", "[radio]\n", "drop = 0.5\n", *FAULT_TABLES),
     )
 )
 
 
 def texts_of_scenarios() -> Iterator[str]:
     yield SMALL
-    yield SMALL + STORM[0]
-    yield SMALL + STORM[2] + STORM[1]
-    yield SMALL + STORM[3]
+    yield SMALL + FAULT_TABLES[0]
+    yield SMALL + FAULT_TABLES[2] + FAULT_TABLES[1]
+    yield SMALL + FAULT_TABLES[3]
     yield SMALL.replace('"decentralized"', '"centralized"') + '[planner]\nname = "spectral"\n'
-    yield ROOMS_MISSION + STORM[3]
+    yield ROOMS_MISSION + FAULT_TABLES[3]
 
 
 def scenarios() -> Mutations:
@@ -292,9 +306,11 @@ def scenarios() -> Mutations:
     return texts((text.encode() for text in texts_of_scenarios()), TOML_TOKENS)
 
 
-def storms() -> Mutations:
+def chaos_files() -> Mutations:
     """TOML of faults alone."""
-    return texts((("".join(STORM[i : i + 2])).encode() for i in range(len(STORM))), TOML_TOKENS)
+    return texts(
+        (("".join(FAULT_TABLES[i : i + 2])).encode() for i in range(len(FAULT_TABLES))), TOML_TOKENS
+    )
 
 
 def overrides() -> Mutations:
@@ -343,11 +359,11 @@ def wal_files() -> Mutations:
     given = played("ledger").inputs
     with tempfile.TemporaryDirectory() as folder:
         contents = []
-        for pages in (0, 1, 3):
-            path = Path(folder) / str(pages)
+        for entries in (0, 1, 3):
+            path = Path(folder) / str(entries)
             wal = WalFile(path, "run")
             wal.reset(Body(Pose(1.0, 2.0)))
-            for inputs in given[:pages]:
+            for inputs in given[:entries]:
                 wal.append(encode(inputs))
             wal.close()
             contents.append(path.read_bytes())
@@ -357,16 +373,20 @@ def wal_files() -> Mutations:
 def wals() -> Framed:
     """The frames of a write-ahead log: its header, an entry, another one, and a torn end."""
     header = encode(("run", Body(Pose(1.0, 2.0))))
-    pages = [bytes(8) + encode(inputs) for inputs in played("ledger").inputs[:GOODS]]
-    goods = [(header, *pair, b"") for pair in pairwise(pages)]
+    entries = [bytes(8) + encode(inputs) for inputs in played("ledger").inputs[:GOODS]]
+    goods = [(header, *pair, b"") for pair in pairwise(entries)]
     return Framed(goods, MSGPACK_TOKENS, msgpack_spans)
 
 
 def logs_of_runs() -> Mutations:
-    """runs.jsonl of a sweep: its header, and runs."""
-    from fuzz.targets import runs_of_sweeps
-
-    return texts(runs_of_sweeps(), TOML_TOKENS)
+    """runs.jsonl of a sweep: its header, and runs; whole or torn."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "runs.jsonl"
+        with RunsJournal(path) as journal:
+            for seed in range(2):
+                journal.add(RunKey("ab", "cd", seed, False), Outcome(failed="nothing", wall_s=0.5))
+        content = path.read_bytes()
+    return texts((content, content[:-9]), TOML_TOKENS)
 
 
 # Maps and points.

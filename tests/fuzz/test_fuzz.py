@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from fuzz import fuzz
+from fuzz.decoding import Corpus, Decode, Target
 from fuzz.mutations import LEB_TOKENS, MSGPACK_TOKENS, leb, msgpack_spans, number_spans
-from fuzz.targets import TARGETS, Corpus, Decode, Target
+from fuzz.targets import TARGETS
 from kantor_protocol.wire.messages import encode
 
 BATCH = 500
