@@ -82,7 +82,7 @@ def test_a_realtime_run_finds_what_virtual_time_finds(kantor: "Kantor") -> None:
     clocks = ("clock.spread=0.1", "clock.drift_ppm=1000", "clock.jitter_s=0.01")
     overrides = ("merge='ledger'", "claims=true", *clocks)
     virtual = statistics.median(detection(find(name, overrides), seed) for seed in range(7))
-    wall = kantor("run", name, "--exchange", "wall", "--speed", 8, "--set", *overrides)
+    wall = kantor("run", name, "--exchange", "wall", "--speed", 16, "--set", *overrides)
     assert wall.code == 0, wall.out + wall.err
 
     (folder,) = kantor.runs()
@@ -95,7 +95,7 @@ def test_a_realtime_run_finds_what_virtual_time_finds(kantor: "Kantor") -> None:
 @pytest.mark.parametrize("exchange", ["lockstep", "wall"])
 def test_a_killed_robot_does_not_stop_the_others(kantor: "Kantor", exchange: str) -> None:
     """SIGKILL to r3 in the middle: the others finish, the record says who was missing, exit code 3."""
-    process = kantor.start("run", "fleet", "--exchange", exchange, "--speed", 8)
+    process = kantor.start("run", "fleet", "--exchange", exchange, "--speed", 16)
     await_line(process, "t=", "energy")
     (folder,) = kantor.runs()
     os.kill(children_named(process, folder / "logs" / "r3.log"), signal.SIGKILL)
