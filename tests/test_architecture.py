@@ -3,6 +3,7 @@
 import ast
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -58,13 +59,48 @@ def test_every_room_is_in_a_contract() -> None:
         assert rooms - {"__init__"} == named
 
 
-def test_paths_on_the_page_exist() -> None:
-    """Every file in the two journeys is in its room."""
-    paths = set(re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py)`", PAGE))
-    found = {name for name in paths for path in PACKAGES.values() if (path / name).exists()}
+def files_at(place: str) -> list[Path]:
+    """The files that a path of the page may mean: below the root, or below a package."""
+    return [path / place for path in (ROOT, *PACKAGES.values()) if (path / place).exists()]
 
-    assert len(paths) >= 15
-    assert paths - found == set()
+
+def test_paths_on_the_page_exist() -> None:
+    """Every file that the page names is in its room, and in one package only."""
+    places = set(re.findall(r"`((?:[a-z_]+/)+[a-z_]+\.py)`", PAGE))
+
+    assert len(places) >= 15
+    assert [place for place in places if len(files_at(place)) != 1] == []
+
+
+PLACES = re.findall(r"`([a-z_/]+\.py)`: `([A-Za-z_.]+)`", PAGE)
+"""A file and the class, method, function or constant that the page names in it."""
+
+
+@pytest.mark.parametrize(("file", "name"), PLACES)
+def test_what_the_page_names_in_a_file_is_defined_there(file: str, name: str) -> None:
+    """`Class.method`, or a name at the top of the file."""
+    paths = [
+        path for path in (ROOT / file, *(p / file for p in PACKAGES.values())) if path.exists()
+    ]
+    (tree,) = [ast.parse(path.read_text(encoding="utf-8")) for path in paths]
+
+    assert name in set(_defined_in(tree.body))
+
+
+def test_the_page_names_places_to_look_at() -> None:
+    """At least one for each question of a newcomer."""
+    assert len(PLACES) >= 8
+
+
+def _defined_in(body: list[ast.stmt], prefix: str = "") -> Iterator[str]:
+    for node in body:
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            yield prefix + node.name
+            if isinstance(node, ast.ClassDef):
+                yield from _defined_in(node.body, f"{prefix}{node.name}.")
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield from (prefix + target.id for target in targets if isinstance(target, ast.Name))
 
 
 @pytest.mark.parametrize(

@@ -125,7 +125,7 @@ class Recording:
             self._table.add(row)
 
     def finish(self) -> Result:
-        """Close the files and sum up."""
+        """Close the files, sum up, and write `result.json`."""
         self.journal.close()
         if self._table is not None:
             self._table.close()
