@@ -63,7 +63,7 @@ def run(fleet: Fleet, folder: Path, *command: object) -> "subprocess.CompletedPr
     )  # fmt: skip
 
 
-def test_strangers_on_the_network_are_refused(fleet_of: MakeFleet, tmp_path: Path) -> None:
+def test_intruders_on_the_network_are_refused(fleet_of: MakeFleet, tmp_path: Path) -> None:
     """No certificate, a foreign authority's, another robot's: refused, with a line on both sides, or heard by no process."""
     fleet = fleet_of(ComposeConfig(2), set="starts.random=true radio.range_m=800")
     fleet.compose("up", "--detach")

@@ -207,7 +207,7 @@ def test_a_revoked_robot_with_plain_zenoh_neither_sends_nor_receives(folder: Pat
     ]
 
 
-def test_a_robot_that_is_revoked_during_a_run_is_told_why(folder: Path) -> None:
+def test_a_robot_that_is_revoked_during_a_run_gets_the_reason(folder: Path) -> None:
     """World-sim is started again with the newer register: r3 learns why it is out, r1 just goes on."""
     endpoint, said = free_endpoint("tls"), []
     with ExitStack() as robots:

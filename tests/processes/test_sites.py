@@ -148,7 +148,7 @@ def test_a_mission_through_a_site_is_the_one_in_process(place: Place) -> None:
     assert site.wait(timeout=EVENT_LIMIT_S) == 143
 
 
-def test_a_site_speaks_for_its_own_robots_only(place: Place) -> None:
+def test_a_site_relays_its_own_robots_only(place: Place) -> None:
     """A site that was taken over, with a router without rules, speaks for its own robots only."""
     kantor = place.kantor
     world = place.world_sim(*MISSION, "--exchange", "lockstep")

@@ -35,7 +35,7 @@ assert compiled(3)(np.arange(4.0)) == 18.0
 
 
 @pytest.mark.processes
-def test_what_a_file_holds_is_release_file_pages_and_comes_back() -> None:
+def test_file_pages_are_released_and_come_back_when_used() -> None:
     """Tens of megabytes are not resident any more; what is compiled runs, and the next compiles."""
     done = subprocess.run(
         [sys.executable, "-c", _SCRIPT], capture_output=True, text=True, check=False

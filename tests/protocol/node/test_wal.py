@@ -139,7 +139,7 @@ def test_a_log_of_another_run_or_of_none_is_discarded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("step", "left"), [(9, 5), (8, 4), (4, 0), (3, 0), (12, 6)])
-def test_torn_it_lacks_a_step_and_ends_in_the_middle_of_a_page(
+def test_torn_it_lacks_a_step_and_ends_in_the_middle_of_an_entry(
     tmp_path: Path, step: int, left: int
 ) -> None:
     path = tmp_path / "r1.diary"
@@ -174,7 +174,7 @@ def room_for(size: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("spare", [0, 1, 9, 30])
-def test_a_full_disk_takes_no_page_and_no_half_of_one(tmp_path: Path, spare: int) -> None:
+def test_a_full_disk_takes_no_entry_and_no_half_of_one(tmp_path: Path, spare: int) -> None:
     """The entry is refused with an error, and fits when there is room again."""
     path = tmp_path / "r1.diary"
     wal = WalFile(path, "run")

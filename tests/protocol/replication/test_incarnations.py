@@ -231,7 +231,7 @@ def test_old_words_of_the_dead_are_data() -> None:
     assert reader.weights[2] == 0
 
 
-def test_a_new_incarnation_learns_what_it_once_said() -> None:
+def test_a_new_incarnation_merges_what_its_predecessor_sent() -> None:
     """Its predecessor's log comes back from peers, and is never told twice."""
     dead, reader = replica(1), replica(0)
     buy(dead, 2, 3)
@@ -264,7 +264,7 @@ def test_claim_of_the_dead_expires() -> None:
     assert not any(any(pair) for pair in taken[30:])
 
 
-def test_claim_before_time_began_is_told_as_of_its_beginning() -> None:
+def test_claim_before_time_0_is_sent_as_of_time_0() -> None:
     """A clock may run behind; a message holds no negative time."""
     one, two = replica(0), replica(1)
     one.claim(3, -(10**13))

@@ -182,7 +182,7 @@ def test_no_cell_is_ever_certain() -> None:
 @pytest.mark.parametrize(
     ("hits", "passes", "evidence"), [(1, 1, HIT), (1, 2, HIT), (1, 3, PASS), (8, 17, PASS)]
 )
-def test_scan_says_what_its_beams_say_in_sum(hits: int, passes: int, evidence: int) -> None:
+def test_scan_is_the_sum_of_its_beams(hits: int, passes: int, evidence: int) -> None:
     """Some beams end at a cell, others pass it: a hit outweighs two passes, in either order, each scan anew."""
     ground = drawn("........")
     beams = hits * [round(3 / 8 * CODES)] + passes * [NO_RETURN]
@@ -235,7 +235,7 @@ def test_entries_are_the_changes_of_kind(place: Place, data: st.DataObject) -> N
     assert ((evidence.odds < 0) <= (evidence.kinds == FREE)).all()
 
 
-def test_ranges_are_told_after_a_move_only() -> None:
+def test_ranges_are_reported_after_a_move_only() -> None:
     """A few of each scan, in bins; what found nothing is in the last bin."""
     ground = drawn("..#")
     sensor = sensor_of(ground, 4.0, 16, 1.0)
@@ -250,7 +250,7 @@ def test_ranges_are_told_after_a_move_only() -> None:
 
 
 @pytest.mark.parametrize("scan", [b"", b"\0", 719 * b"\0", 722 * b"\0"])
-def test_scan_of_another_size_is_void(scan: bytes) -> None:
+def test_scan_of_another_size_changes_nothing(scan: bytes) -> None:
     """It changes nothing."""
     ground = drawn("...")
     evidence = OccupancyLog(ground.frame, sensor_of(ground, 4.0), ranges=True)

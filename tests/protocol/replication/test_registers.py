@@ -192,7 +192,7 @@ def test_among_robots_that_all_hear_each_other_nothing_is_forwarded() -> None:
         assert spoken == ([{i} for i in range(4)] if step else [set()] * 4)
 
 
-def test_one_participant_is_told_what_it_lacks() -> None:
+def test_a_message_to_one_participant_has_what_it_lacks() -> None:
     """To a supervisor: what others lack is no reason."""
     one, two, three = team(3)
     add(one, 1, 0, 0)
@@ -224,7 +224,7 @@ def test_what_does_not_fit_follows_with_the_next_message() -> None:
     assert seen == set(range(1, origins))
 
 
-def test_without_registers_nothing_is_said_and_nothing_heard() -> None:
+def test_without_registers_none_is_sent_and_none_merged() -> None:
     """Width 0: a mission whose planner shares none."""
     held = Registers(0, 3, 0)
 

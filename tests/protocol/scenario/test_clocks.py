@@ -95,7 +95,7 @@ def test_in_turn_phases_are_spread_over_the_period() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
-def test_in_turn_the_supervisor_speaks_between_any_two_robots(count: int) -> None:
+def test_in_turn_the_supervisor_steps_between_any_two_robots(count: int) -> None:
     """In turn, the supervisor has merged before the next robot plans, for a thousand periods."""
     scenario = mission(
         "coordination=centralized",

@@ -313,7 +313,7 @@ def test_name_that_no_file_can_have_is_refused(tmp_path: Path, name: str) -> Non
 @pytest.mark.parametrize(
     ("name", "image"), [("a.png", True), ("a.JPEG", True), ("a.csv", False), ("png", False)]
 )
-def test_image_is_told_by_its_suffix(*, name: str, image: bool) -> None:
+def test_image_is_recognized_by_its_suffix(*, name: str, image: bool) -> None:
     """A grey-scale density, or a table of points."""
     assert is_image(name) == image
 

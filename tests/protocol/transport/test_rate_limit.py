@@ -33,7 +33,7 @@ density = [{ mean_m = [50, 50], variance_m2 = [100, 100] }]
 
 @examples(200)
 @given(st.floats(0.0, 500.0), st.lists(st.tuples(PAUSES_S, SIZES, st.booleans()), max_size=400))
-def test_whatever_is_said_no_more_is_taken_than_was_asked_for_and_earned(
+def test_no_more_is_accepted_than_was_requested_and_earned(
     steps_per_s: float, said: list[tuple[float, int, bool]]
 ) -> None:
     """Messages and bytes are within the quota at any time, and what is not taken is counted."""

@@ -142,7 +142,7 @@ GOLDEN_REPORT_BYTES = bytes.fromhex(
 
 @examples(60)
 @given(news=NEWS)
-def test_news_comes_back_as_it_was(news: GossipMessage) -> None:
+def test_gossip_message_decodes_to_what_was_encoded(news: GossipMessage) -> None:
     """What one participant tells another survives the radio."""
     assert decode_gossip(encode_gossip(news)) == news
     assert decode_gossip(encode(news)) == news
@@ -181,7 +181,7 @@ def test_inputs_come_back_as_they_were(inputs: Inputs) -> None:
 
 @examples(60)
 @given(news=NEWS)
-def test_independent_decoder_reads_news(news: GossipMessage) -> None:
+def test_independent_decoder_reads_gossip_messages(news: GossipMessage) -> None:
     """A record is a msgpack array: tag, version, fields in order. `msgpack` knows nothing more."""
     fields = [news.step, news.x_m, news.y_m, news.version_vector, news.logs, news.claims]
     further = [news.registers, news.incarnation]
@@ -220,7 +220,7 @@ def test_no_two_messages_share_a_tag() -> None:
     assert len({kind.__struct_config__.tag for kind in kinds}) == len(kinds)
 
 
-def test_news_has_not_drifted() -> None:
+def test_bytes_of_a_gossip_message_have_not_changed() -> None:
     """The golden bytes of a News, both ways."""
     assert encode_gossip(GOLDEN_NEWS) == GOLDEN_NEWS_BYTES
     assert decode_gossip(GOLDEN_NEWS_BYTES) == GOLDEN_NEWS
@@ -263,7 +263,7 @@ def test_another_version_is_refused(version: int) -> None:
 
 @examples(60)
 @given(news=NEWS, more=st.lists(st.none() | COUNTS | st.text(max_size=5), min_size=1, max_size=3))
-def test_further_fields_of_news_are_ignored(
+def test_further_fields_of_a_gossip_message_are_ignored(
     news: GossipMessage, more: list[int | str | None]
 ) -> None:
     """Add-only: a newer sender may append fields that this reader does not know."""
@@ -313,13 +313,13 @@ def test_outputs_with_a_number_that_is_none_are_refused(number: float, slot: int
 
 @examples(20)
 @given(number=UNUSABLE, axis=st.sampled_from(["x_m", "y_m"]))
-def test_news_from_nowhere_is_refused(number: float, axis: str) -> None:
+def test_gossip_message_without_a_position_is_refused(number: float, axis: str) -> None:
     """The place of a speaker is finite."""
     with pytest.raises(RefusedError, match="finite"):
         decode_gossip(encode(msgspec.structs.replace(GOLDEN_NEWS, **{axis: number})))
 
 
-def test_news_from_before_the_start_is_refused() -> None:
+def test_gossip_message_from_before_the_start_is_refused() -> None:
     """Steps count upwards from 0."""
     with pytest.raises(RefusedError):
         decode_gossip(encode(msgspec.structs.replace(GOLDEN_NEWS, step=-1)))

@@ -31,6 +31,7 @@ from kantor_worldsim.record.records import (
 from kantor_worldsim.world.world import WorldSetup
 from support.grounds import exploration
 from support.missions import ROOMS
+from support.records import batches, process_events
 from support.strategies import SMALL, examples
 
 MS = 1_000_000
@@ -66,15 +67,7 @@ def undisturbed(overrides: tuple[str, ...]) -> list[Record]:
     return run(overrides=overrides)
 
 
-def batches(records: list[Record]) -> list[Batch]:
-    return [record for record in records if isinstance(record, Batch)]
-
-
-def process_events(records: list[Record]) -> list[ProcessEvent]:
-    return [record for record in records if isinstance(record, ProcessEvent)]
-
-
-def step_records(records: list[Record], name: ParticipantId) -> list[StepRecord]:
+def answered_steps(records: list[Record], name: ParticipantId) -> list[StepRecord]:
     """A participant's answered steps."""
     recorded = (step_record for batch in batches(records) for step_record in batch.step_records)
     return [
@@ -152,7 +145,9 @@ def test_a_message_that_reaches_a_dead_robot_is_lost() -> None:
     """Messages that arrive while it is dead are lost, and only they; it receives the others when it goes on."""
     records = run(kill("r2", 1.05, 2.05), overrides=("radio.delay_s=0.08",))
     heard = {
-        reference for step_record in step_records(records, "r2") for reference in step_record.heard
+        reference
+        for step_record in answered_steps(records, "r2")
+        for reference in step_record.heard
     }
     arrived = {
         (decision.source, decision.sequence): decision.due_ns
@@ -166,7 +161,7 @@ def test_a_message_that_reaches_a_dead_robot_is_lost() -> None:
         reference for reference, due_ns in arrived.items() if 1050 * MS <= due_ns < 2050 * MS
     }
     assert len(missed) > 10
-    assert [step_record.now_ns // MS for step_record in step_records(records, "r2")][9:12] == [
+    assert [step_record.now_ns // MS for step_record in answered_steps(records, "r2")][9:12] == [
         1000,
         2100,
         2200,
@@ -183,11 +178,11 @@ def test_a_step_between_its_log_entry_and_its_answer_is_neither_lost_nor_made_tw
     overrides = (*LOSSY, *PACES[pace])
     records = run(kill("r2", 1.22, until_s, "mid_step = true"), overrides=overrides)
     start = next(event for event in process_events(records) if event.kind == "start")
-    plain = step_records(undisturbed(overrides), "r2")
+    plain = answered_steps(undisturbed(overrides), "r2")
     silent = [batch for batch in batches(records) if batch.absent]
     answer = next(
         step_record
-        for step_record in step_records(records, "r2")
+        for step_record in answered_steps(records, "r2")
         if outputs(step_record).step == start.step
     )
     back = next(batch for batch in batches(records) if answer in batch.step_records)
@@ -220,7 +215,7 @@ def test_a_robot_without_its_state_comes_back_as_a_new_incarnation(
     kills = [kill("r1", 1.02, 1.42, *more), kill("r1", 2.02, 2.42, *more)]
     records = run(*kills, overrides=(*LOSSY, *PACES[pace]))
     starts = [event for event in process_events(records) if event.kind == "start"]
-    made = step_records(records, "r1")
+    made = answered_steps(records, "r1")
     incarnations = {
         outputs(step_record).step: decode_gossip(envelope.body).incarnation
         for step_record in made
@@ -255,7 +250,7 @@ def test_a_robot_that_never_stepped_keeps_its_incarnation(disk: str) -> None:
 def test_a_late_joiner_takes_part() -> None:
     """The robot neither steps nor receives before it joins; then its first step has number 1."""
     records = run('kind = "late"; who = ["r3"]; until_s = 1.55')
-    first = step_records(records, "r3")[0]
+    first = answered_steps(records, "r3")[0]
     sent_ns = {
         (decision.source, decision.sequence): decision.due_ns
         for batch in batches(records)
@@ -265,7 +260,9 @@ def test_a_late_joiner_takes_part() -> None:
     assert process_events(records) == [ProcessEvent(1550 * MS, "r3", "start", 0)]
     assert (first.now_ns, outputs(first).step) == (1600 * MS, 1)
     heard = [
-        reference for step_record in step_records(records, "r3") for reference in step_record.heard
+        reference
+        for step_record in answered_steps(records, "r3")
+        for reference in step_record.heard
     ]
     assert min(sent_ns[reference] for reference in heard) >= 1550 * MS
     assert is_sound(records)
@@ -281,7 +278,7 @@ def test_a_late_joiner_takes_part() -> None:
 def test_messages_to_an_idle_robot_wait(fault: str, kinds: tuple[str, str]) -> None:
     """The robot takes no step and sends nothing; then it receives all that arrived, in order of arrival."""
     records = run(fault)
-    r2 = step_records(records, "r2")
+    r2 = answered_steps(records, "r2")
     back = next(step_record for step_record in r2 if step_record.now_ns == 1500 * MS)
     waiting = sorted(
         (decision.due_ns, decision.source, decision.sequence)
@@ -300,7 +297,7 @@ def test_messages_to_an_idle_robot_wait(fault: str, kinds: tuple[str, str]) -> N
 def test_a_slow_robot_makes_some_of_its_steps() -> None:
     """One in four while it is slow, and no step number is left out."""
     records = run('kind = "slow"; who = ["r2"]; from_s = 1.0; until_s = 2.5; every = 4')
-    times_ms = [step_record.now_ns // MS for step_record in step_records(records, "r2")]
+    times_ms = [step_record.now_ns // MS for step_record in answered_steps(records, "r2")]
 
     assert times_ms[8:15] == [900, 1200, 1600, 2000, 2400, 2500, 2600]
     assert [event.kind for event in process_events(records)] == ["slow", "quicken"]
@@ -315,11 +312,11 @@ def test_a_wrong_clock_is_on_record_and_breaks_no_rule(pace: str, offset_s: floa
     records = run(clock, overrides=(*LOSSY, *PACES[pace]))
     wrong = [
         step_record
-        for step_record in step_records(records, "r2")
+        for step_record in answered_steps(records, "r2")
         if 1000 * MS <= step_record.now_ns < 2000 * MS
     ]
     step_record = next(
-        step_record for step_record in step_records(records, "r2") if step_record.skew_ns
+        step_record for step_record in answered_steps(records, "r2") if step_record.skew_ns
     )
     index = EnvelopeIndex()
     for batch in batches(records):
@@ -330,7 +327,7 @@ def test_a_wrong_clock_is_on_record_and_breaks_no_rule(pace: str, offset_s: floa
         step_record.skew_ns == max(round(offset_s * 1e9), -step_record.now_ns)
         for step_record in wrong
     )
-    assert {step_record.skew_ns for step_record in step_records(records, "r1")} == {0}
+    assert {step_record.skew_ns for step_record in answered_steps(records, "r1")} == {0}
     assert index.inputs(step_record).now_ns == step_record.now_ns + step_record.skew_ns >= 0
     assert is_sound(records)
 

@@ -20,8 +20,9 @@ from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.radio.channel import DROPPED
 from kantor_worldsim.record.journal import Journal
-from kantor_worldsim.record.records import Batch, Ending, Record
+from kantor_worldsim.record.records import Ending, Record
 from kantor_worldsim.world.world import WorldSetup
+from support.records import batches
 from support.strategies import SEEDS, examples, mission
 
 Play = Callable[..., tuple[Record, ...]]
@@ -47,10 +48,6 @@ def digest(records: tuple[Record, ...]) -> str:
     for record in records:
         journal.append(record)
     return journal.digest.hex
-
-
-def batches(records: tuple[Record, ...] | list[Record]) -> list[Batch]:
-    return [record for record in records if isinstance(record, Batch)]
 
 
 def run(

@@ -134,7 +134,7 @@ def test_stamps_and_holdings_are_those_of_the_record(run: str) -> None:
         assert map_tracker.own_cells[i] == sum(counts[cell] for cell in witness.own[name])
 
 
-def test_robots_know_what_their_own_charts_show() -> None:
+def test_robots_know_what_their_own_maps_show() -> None:
     """What a robot holds is what it makes a map of, void frontiers and all."""
     records = explored("radio.range_m=100")
     map_tracker = surveyed(records)

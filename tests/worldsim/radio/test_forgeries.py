@@ -155,7 +155,7 @@ def test_forgeries_depend_on_the_message_alone(data: st.DataObject) -> None:
 # The catalogue.
 
 
-def test_no_participant_has_the_name_of_a_stranger() -> None:
+def test_no_participant_has_a_name_that_forgeries_use() -> None:
     for scenario in (mission(), mission("coordination=centralized")):
         assert not set(strangers(scenario.roster)) & set(scenario.roster)
         assert EVERYBODY in strangers(scenario.roster)

@@ -11,7 +11,7 @@ import pytest
 from kantor_fleet.execution.in_process_team import play
 from kantor_protocol.base.grid import FREE, OCCUPIED
 from kantor_protocol.base.machine import Envelope, Pose, State
-from kantor_protocol.base.varint import put_int, put_uint
+from kantor_protocol.base.varint import put_int
 from kantor_protocol.replication.occupancy_log import dead_frontier
 from kantor_protocol.wire.messages import (
     Array,
@@ -28,9 +28,9 @@ from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record,
 from support.checkers import listed, rules
 from support.grounds import drawn
 from support.missions import ROOMS, explored, on_map, setup_of
+from support.records import Records, batches, gossip_of, step_records, uints
 from support.replicas import read_logs
 
-Records = Sequence[Record]
 Change = Callable[[StepRecord], StepRecord]
 
 ALONE = ("radio.range_m=0.01", "radio.beacon=state")
@@ -50,29 +50,15 @@ PLANNERS = ("frontier", "burgard", "market", "kmeans", "hungarian")
 # Ways to change a record.
 
 
-def batches(records: Records) -> list[Batch]:
-    return [record for record in records if isinstance(record, Batch)]
-
-
-def acts_of(records: Records, name: str) -> list[StepRecord]:
-    """What a robot did, in order."""
-    return [
-        step_record
-        for batch in batches(records)
-        for step_record in batch.step_records
-        if step_record.name == name
-    ]
-
-
 def put(records: Records, old: StepRecord, change: Change) -> list[Record]:
-    """The records with one act changed."""
+    """The records with one step record changed."""
 
     def changed(batch: Batch) -> Batch:
-        step_records = tuple(
+        replaced = tuple(
             change(step_record) if step_record is old else step_record
             for step_record in batch.step_records
         )
-        return msgspec.structs.replace(batch, step_records=step_records)
+        return msgspec.structs.replace(batch, step_records=replaced)
 
     return [changed(record) if isinstance(record, Batch) else record for record in records]
 
@@ -90,13 +76,8 @@ def goes(x_m: float, y_m: float) -> Change:
 
 
 def hurried(records: Records, step_record: StepRecord, change: Change) -> list[Record]:
-    """The records with one act changed, in a world without a speed limit."""
+    """The records with one step record changed, in a world without a speed limit."""
     return put(opened(records, scenario=on_map("vehicle.speed_m_s=1000")), step_record, change)
-
-
-def news_of(step_record: StepRecord) -> GossipMessage:
-    assert step_record.outputs is not None
-    return decode_gossip(step_record.outputs.outbox[0].body)
 
 
 def says(change: Callable[[GossipMessage], GossipMessage]) -> Change:
@@ -114,15 +95,8 @@ def says(change: Callable[[GossipMessage], GossipMessage]) -> Change:
     return changed
 
 
-def uints(*numbers: int) -> bytes:
-    out, at = np.zeros(10 * len(numbers), dtype=np.uint8), 0
-    for number in numbers:
-        at = put_uint(out, at, number)
-    return out[:at].tobytes()
-
-
 def suffix(origin: int, start: int, entries: Sequence[int]) -> bytes:
-    """A part of a log, see News."""
+    """A part of a log, see GossipMessage."""
     out, at, before = np.zeros(10 * len(entries), dtype=np.uint8), 0, 0
     for entry in entries:
         at = put_int(out, at, entry - before)
@@ -130,17 +104,17 @@ def suffix(origin: int, start: int, entries: Sequence[int]) -> bytes:
     return uints(origin, start, len(entries), len(entries)) + out[:at].tobytes()
 
 
-def having(news: GossipMessage, **lengths: int) -> GossipMessage:
-    """The news with other lengths in its version vector; r1, r2: by how much they differ."""
-    version_vector = read_version_vector(news.version_vector, 2)
+def having(gossip: GossipMessage, **lengths: int) -> GossipMessage:
+    """The message with other lengths in its version vector; r1, r2: by how much they differ."""
+    version_vector = read_version_vector(gossip.version_vector, 2)
     assert version_vector is not None
     told = [length + lengths.get(f"r{i}", 0) for i, length in enumerate(version_vector, 1)]
-    return msgspec.structs.replace(news, version_vector=uints(*told))
+    return msgspec.structs.replace(gossip, version_vector=uints(*told))
 
 
 def own_log(step_record: StepRecord, origin: int = 0) -> list[int]:
     """What a robot sends of its own log."""
-    rows = read_logs(news_of(step_record).logs, valued=False)
+    rows = read_logs(gossip_of(step_record).logs, valued=False)
     assert rows is not None
     return [int(entry) for who, _, entry, _ in rows if who == origin]
 
@@ -149,32 +123,32 @@ def logging(
     log: Sequence[int], origin: int = 0, start: int = 0
 ) -> Callable[[GossipMessage], GossipMessage]:
     """A change of the logs that are sent: one suffix instead."""
-    return lambda news: msgspec.structs.replace(news, logs=suffix(origin, start, log))
+    return lambda gossip: msgspec.structs.replace(gossip, logs=suffix(origin, start, log))
 
 
 # Records that break a rule.
 
 
 def _stands_in_wall(records: Records) -> list[Record]:
-    return hurried(records, acts_of(records, "r1")[-1], goes(0.5, 0.5))
+    return hurried(records, step_records(records, "r1")[-1], goes(0.5, 0.5))
 
 
 def _leaves_map(records: Records) -> list[Record]:
-    return hurried(records, acts_of(records, "r1")[-1], goes(-3.0, 1.5))
+    return hurried(records, step_records(records, "r1")[-1], goes(-3.0, 1.5))
 
 
 def _is_nowhere(records: Records) -> list[Record]:
-    return hurried(records, acts_of(records, "r1")[-1], goes(math.nan, math.inf))
+    return hurried(records, step_records(records, "r1")[-1], goes(math.nan, math.inf))
 
 
 def _goes_through_wall(records: Records) -> list[Record]:
     """From the lower left room straight into the lower right one, where no door is."""
     step_record = next(
         step_record
-        for step_record in acts_of(records, "r1")
+        for step_record in step_records(records, "r1")
         if step_record.verdict and step_record.verdict.pose.x_m < 6.0
     )
-    last = acts_of(records, "r1").index(step_record)
+    last = step_records(records, "r1").index(step_record)
     assert step_record.verdict is not None
     short = [record for record in records[: 2 + last] if not isinstance(record, Opening)]
     return hurried(
@@ -183,51 +157,55 @@ def _goes_through_wall(records: Records) -> list[Record]:
 
 
 def _tells_another_kind(records: Records) -> list[Record]:
-    step_record = acts_of(records, "r1")[5]
+    step_record = step_records(records, "r1")[5]
     log = own_log(step_record)
     return put(records, step_record, says(logging([*log[:-1], log[-1] ^ 1])))
 
 
 def _leaves_one_out(records: Records) -> list[Record]:
-    step_record = acts_of(records, "r1")[5]
+    step_record = step_records(records, "r1")[5]
     log = own_log(step_record)
     return put(records, step_record, says(logging([*log[:3], *log[4:]])))
 
 
 def _tells_too_much(records: Records) -> list[Record]:
-    step_record = acts_of(records, "r1")[5]
+    step_record = step_records(records, "r1")[5]
     return put(records, step_record, says(logging([*own_log(step_record), 2 * 17])))
 
 
 def _calls_far_frontier_none(records: Records) -> list[Record]:
-    step_record = acts_of(records, "r1")[5]
+    step_record = step_records(records, "r1")[5]
     far = dead_frontier(ROOMS.frame, ROOMS.frame.cell_of(14.5, 1.5))
-    change = says(lambda news: having(logging([*own_log(step_record), far])(news), r1=1))
+    change = says(lambda gossip: having(logging([*own_log(step_record), far])(gossip), r1=1))
     return put(records, step_record, change)
 
 
 def _calls_near_frontier_none(records: Records) -> list[Record]:
-    step_record = acts_of(records, "r1")[-1]
+    step_record = step_records(records, "r1")[-1]
     near = dead_frontier(ROOMS.frame, ROOMS.frame.cell_of(2.5, 2.5))
-    change = says(lambda news: having(logging([*own_log(step_record), near])(news), r1=1))
+    change = says(lambda gossip: having(logging([*own_log(step_record), near])(gossip), r1=1))
     return put(records, step_record, change)
 
 
 def _starts_late(records: Records) -> list[Record]:
-    step_record = acts_of(records, "r1")[5]
+    step_record = step_records(records, "r1")[5]
     return put(records, step_record, says(logging(own_log(step_record), start=10_000)))
 
 
 def _sends_rubbish(records: Records) -> list[Record]:
-    step_record = acts_of(records, "r1")[5]
-    return put(records, step_record, says(lambda news: msgspec.structs.replace(news, logs=b"\xff")))
+    step_record = step_records(records, "r1")[5]
+    return put(
+        records, step_record, says(lambda gossip: msgspec.structs.replace(gossip, logs=b"\xff"))
+    )
 
 
 def _sends_weights(records: Records) -> list[Record]:
     """A suffix of entries with a value each, as on a density."""
-    step_record = acts_of(records, "r1")[5]
+    step_record = step_records(records, "r1")[5]
     valued = uints(0, 0, 1, 1) + uints(4, 1)
-    return put(records, step_record, says(lambda news: msgspec.structs.replace(news, logs=valued)))
+    return put(
+        records, step_record, says(lambda gossip: msgspec.structs.replace(gossip, logs=valued))
+    )
 
 
 def _hides_a_scan(records: Records) -> list[Record]:
@@ -235,20 +213,20 @@ def _hides_a_scan(records: Records) -> list[Record]:
     before, step_record = next(
         (before, step_record)
         for before, step_record in zip(
-            acts_of(records, "r1"), acts_of(records, "r1")[1:], strict=False
+            step_records(records, "r1"), step_records(records, "r1")[1:], strict=False
         )
-        if news_of(before).version_vector[0:2] != news_of(step_record).version_vector[0:2]
+        if gossip_of(before).version_vector[0:2] != gossip_of(step_record).version_vector[0:2]
     )
-    version_vector = news_of(before).version_vector
+    version_vector = gossip_of(before).version_vector
     return put(
         records,
         step_record,
-        says(lambda news: msgspec.structs.replace(news, version_vector=version_vector)),
+        says(lambda gossip: msgspec.structs.replace(gossip, version_vector=version_vector)),
     )
 
 
 def _forgets(records: Records) -> list[Record]:
-    return put(records, acts_of(records, "r1")[-1], says(lambda news: having(news, r2=-1)))
+    return put(records, step_records(records, "r1")[-1], says(lambda gossip: having(gossip, r2=-1)))
 
 
 def _sees_what_is_not_there(records: Records) -> list[Record]:
@@ -280,21 +258,21 @@ def _redrawn(records: Records, x_m: float, y_m: float, old: int, new: int) -> li
 
 
 def _holds_more_than_there_is(records: Records) -> list[Record]:
-    return put(records, acts_of(records, "r1")[-1], says(lambda news: having(news, r2=1)))
+    return put(records, step_records(records, "r1")[-1], says(lambda gossip: having(gossip, r2=1)))
 
 
 def _forwards_something_else(records: Records) -> list[Record]:
-    step_record = acts_of(records, "r1")[-1]
+    step_record = step_records(records, "r1")[-1]
     return put(records, step_record, says(logging([2 * 17], origin=1)))
 
 
 def _forwards_too_much(records: Records) -> list[Record]:
-    step_record = acts_of(records, "r1")[-1]
+    step_record = step_records(records, "r1")[-1]
     return put(records, step_record, says(logging([2 * 17], origin=1, start=10_000)))
 
 
 def _gives_up(records: Records) -> list[Record]:
-    step_record = acts_of(records, "r1")[3]
+    step_record = step_records(records, "r1")[3]
 
     def change(step_record: StepRecord) -> StepRecord:
         assert step_record.outputs is not None
@@ -340,7 +318,7 @@ BROKEN: dict[str, tuple[tuple[str, ...], Callable[[Records], list[Record]]]] = {
 
 @pytest.mark.parametrize("radio", list(RADIOS))
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_good_record_brings_no_complaint(planner: str, radio: str) -> None:
+def test_sound_record_breaks_no_rule(planner: str, radio: str) -> None:
     """Robots that keep the rules are not accused."""
     checker = check(explored(f"planner={planner}", *RADIOS[radio]))
 
@@ -355,7 +333,7 @@ def test_noise_is_no_lie() -> None:
 
 @pytest.mark.parametrize("name", list(BROKEN))
 def test_broken_rule_is_named(name: str) -> None:
-    """A record that breaks a rule brings complaints that name this rule, and no other."""
+    """A record that breaks a rule is judged by violations of this rule, and of no other."""
     run, broken = BROKEN[name]
     records = explored(*run)
 
@@ -378,19 +356,17 @@ def test_frontier_may_be_declared_dead_after_heading_for_it_in_vain() -> None:
     """A robot that has had the same goal for `planner.patience` steps may give it up from afar."""
     slow = (*ALONE, "vehicle.speed_m_s=4")
     records = explored(*slow)
-    step_records = acts_of(records, "r1")
+    steps = step_records(records, "r1")
     first = next(
-        i
-        for i, step_record in enumerate(step_records)
-        if step_record.outputs and step_record.outputs.goal
+        i for i, step_record in enumerate(steps) if step_record.outputs and step_record.outputs.goal
     )
-    step_record = step_records[first + 1]
+    step_record = steps[first + 1]
     assert step_record.outputs is not None
     assert step_record.outputs.goal is not None
-    assert step_record.outputs.goal == step_records[first].outputs.goal  # type: ignore[union-attr]
+    assert step_record.outputs.goal == steps[first].outputs.goal  # type: ignore[union-attr]
     cell = ROOMS.frame.cell_of(*step_record.outputs.goal)
     tells = logging([*own_log(step_record), dead_frontier(ROOMS.frame, cell)])
-    given_up = put(records, step_record, says(lambda news: having(tells(news), r1=1)))
+    given_up = put(records, step_record, says(lambda gossip: having(tells(gossip), r1=1)))
 
     def accused(records: Records) -> bool:
         return any("declares a frontier dead" in line for line in check(records).violations)
@@ -402,7 +378,7 @@ def test_frontier_may_be_declared_dead_after_heading_for_it_in_vain() -> None:
 def test_rules_of_every_run_hold_on_maps() -> None:
     """A jump is against the speed limit, whatever is explored."""
     records = explored(*ALONE)
-    jumps = put(records, acts_of(records, "r1")[-1], goes(5.5, 10.5))
+    jumps = put(records, step_records(records, "r1")[-1], goes(5.5, 10.5))
 
     assert "speed" in rules(jumps)
 
@@ -452,8 +428,8 @@ def test_checker_survives_messages_that_do_not_decode() -> None:
         if isinstance(record, Batch):
             step_records = tuple(
                 says(
-                    lambda news: msgspec.structs.replace(
-                        news,
+                    lambda gossip: msgspec.structs.replace(
+                        gossip,
                         version_vector=rng.bytes(int(rng.integers(0, 9))),
                         logs=rng.bytes(int(rng.integers(0, 30))),
                     )
@@ -466,7 +442,7 @@ def test_checker_survives_messages_that_do_not_decode() -> None:
     assert checker.count > 0
 
 
-STRUCK = {
+PROCESS_FAULTS = {
     "robot forgets": "{kind='kill', who=['r2'], from_s=0.75, until_s=1.5, disk='lost'}",
     "robots forget twice": (
         "{kind='kill', who=['r2'], from_s=0.75, until_s=1.5, disk='lost'},"
@@ -479,11 +455,11 @@ STRUCK = {
 }
 
 
-@pytest.mark.parametrize("struck", STRUCK)
+@pytest.mark.parametrize("faults", PROCESS_FAULTS)
 @pytest.mark.parametrize("planner", ["frontier", "kmeans"])
-def test_no_complaint_about_maps_whatever_befalls_processes(struck: str, planner: str) -> None:
-    """A new incarnation begins with an empty chart and a log of its own."""
-    records = explored(f"faults=[{STRUCK[struck]}]", f"planner.name={planner}")
+def test_process_faults_on_maps_break_no_rule(faults: str, planner: str) -> None:
+    """A new incarnation begins with an empty map and a log of its own."""
+    records = explored(f"faults=[{PROCESS_FAULTS[faults]}]", f"planner.name={planner}")
 
     assert check(records).violations == []
 
@@ -501,7 +477,7 @@ def test_robot_that_goes_on_with_its_old_log_is_named() -> None:
     fault = "{kind='kill', who=['r2'], from_s=0.75, until_s=1.5}"
     records = explored(f"faults=[{fault}]")
     start = next(r for r in records if isinstance(r, ProcessEvent) and r.kind == "start")
-    reborn = msgspec.structs.replace(start, incarnation=1)
-    told = [reborn if record is start else record for record in records]
+    renumbered = msgspec.structs.replace(start, incarnation=1)
+    told = [renumbered if record is start else record for record in records]
 
     assert {"map", "epoch"} <= {each.partition(":")[0] for each in check(told).violations}

@@ -19,6 +19,7 @@ from kantor_worldsim.observers.checkers.liveness import LivenessChecker, settlin
 from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.records import Batch, Ending, Record, StepRecord
 from kantor_worldsim.world.world import WorldSetup
+from support.records import step_records
 from support.strategies import mission
 
 SIZE = ("samples.count=60", "energy.points=90", "energy.steps=60", "limit_s=300")
@@ -103,16 +104,6 @@ def test_nothing_is_judged_before_it_can_be_known() -> None:
 
     assert lasting.violations == []
     assert lasting.judged == {"L2"}
-
-
-def step_records(records: Sequence[Record], name: str) -> list[StepRecord]:
-    return [
-        step_record
-        for r in records
-        if isinstance(r, Batch)
-        for step_record in r.step_records
-        if step_record.name == name
-    ]
 
 
 def altered(records: Sequence[Record], change: Callable[[StepRecord], StepRecord]) -> list[Record]:
@@ -215,7 +206,7 @@ def test_lost_entries_are_named() -> None:
     assert rules(told) == {"I8"}
 
 
-def test_what_a_fault_has_held_up_is_news_when_it_arrives() -> None:
+def test_what_a_fault_has_held_up_still_merges_when_it_arrives() -> None:
     """Messages under way put off the judgement until they have arrived and had time to spread."""
     records = rested(CUT)
     sent = next(i for i, r in enumerate(records) if isinstance(r, Batch) and r.decisions)
