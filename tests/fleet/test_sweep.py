@@ -26,7 +26,7 @@ from support.strategies import mission
 from support.workers import DEADLY_SEED, die_of_a_seed, fail_of_a_seed
 
 if TYPE_CHECKING:
-    from support.command import Finished, Kantor
+    from support.command import CommandServer, Finished, Kantor
 
 SMALL = (
     "--set", "energy.points=400", "energy.steps=400", "samples.count=200", "targets.count=50",
@@ -315,11 +315,11 @@ group = pytest.mark.xdist_group("sweep")  # they share a fixture that is dear
 
 
 @pytest.fixture(scope="module")
-def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def reference(tmp_path_factory: pytest.TempPathFactory, command_server: "CommandServer") -> Path:
     """The folder of a whole sweep that one worker ran."""
     from support.command import Kantor
 
-    kantor = Kantor(tmp_path_factory.mktemp("reference"))
+    kantor = Kantor(tmp_path_factory.mktemp("reference"), command_server)
     finished = kantor("sweep", "fleet", *FULL, "--jobs", 1)
     assert finished.code == 0, finished.err
     assert "detection_rate" in finished.out

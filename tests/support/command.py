@@ -72,6 +72,14 @@ class Process:
         if self.poll() is None:
             os.kill(self.pid, number)
 
+    def terminate(self) -> None:
+        """Send SIGTERM."""
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """Send SIGKILL."""
+        self.send_signal(signal.SIGKILL)
+
     def _ended(self, timeout: float | None) -> bool:
         return bool(select.select([self._status], [], [], timeout)[0])
 

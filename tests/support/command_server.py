@@ -3,8 +3,12 @@
 Run as a script, with the number of an open Unix socket. Each request is one message: the arguments, the folder and
 the environment of a command, with the file descriptors of its stdout, its stderr and of a pipe for its status. The
 pipe carries the process id of the command, and when it has ended its wait status, 4 bytes each.
+
+The fork server of a command is a fork, too; that of a command that starts afresh is started as for users.
 """
 
+import contextlib
+import functools
 import gc
 import importlib
 import os
@@ -15,10 +19,14 @@ import signal
 import socket
 import struct
 import sys
+from collections.abc import Callable
+from multiprocessing import util
 from typing import NamedTuple
 
 STATUS = struct.Struct("<i")
 REQUEST_MAX = 1 << 20
+_DESCRIPTORS = 256
+"""More than a command has open when it starts processes."""
 
 
 class Request(NamedTuple):
@@ -41,13 +49,12 @@ def main() -> None:
 
 def _load() -> None:
     import kantor_fleet.cli
-    from kantor_fleet.execution.preload import warm_up
+    import kantor_fleet.execution.preloaded
 
     for module in pkgutil.iter_modules(kantor_fleet.cli.__path__, "kantor_fleet.cli."):
         importlib.import_module(module.name)
     for name in ("report.report", "processes.local", "processes.mission", "execution.verify"):
         importlib.import_module(f"kantor_fleet.{name}")
-    warm_up()
     gc.freeze()
 
 
@@ -96,7 +103,32 @@ def _run(request: Request) -> None:
     os.environ.update(request.environment)
     sys.path[0] = request.folder
     sys.argv = ["kantor", *request.arguments]
+    util.spawnv_passfds = functools.partial(_fork_server, util.spawnv_passfds)
     runpy.run_module("kantor_fleet", run_name="__main__", alter_sys=True)
+
+
+def _fork_server(
+    execute: Callable[[bytes, list[str], list[int]], int],
+    path: bytes,
+    arguments: list[str],
+    descriptors: list[int],
+) -> int:
+    """Start what multiprocessing needs: its fork server as a fork of this process, all else as it would."""
+    script = arguments[-1]
+    if "multiprocessing.forkserver" not in script:
+        return execute(path, arguments, descriptors)
+    process = os.fork()
+    if process == 0:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)
+        for descriptor in {*range(3, _DESCRIPTORS)} - {*descriptors}:
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+        try:
+            exec(script, {})
+        finally:
+            os._exit(0)
+    return process
 
 
 if __name__ == "__main__":
