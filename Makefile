@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 KANTOR := $(BIN)/kantor
-PYTEST := $(BIN)/python -m pytest -n 2 --dist loadgroup
+PYTEST := $(BIN)/python -m pytest --dist loadgroup
 
 .PHONY: help demo test test-fast check lint types contracts format paper bench campaign mutants fuzz clean
 
@@ -23,11 +23,12 @@ help:
 demo: $(VENV)/.installed $(VENV)/.kernels
 	$(KANTOR) run fleet --exchange realtime --speed 4
 
+# Three workers for two cores: tests of processes wait for one another.
 test: $(VENV)/.developing $(VENV)/.kernels
-	$(PYTEST)
+	$(PYTEST) -n 3
 
 test-fast: $(VENV)/.developing $(VENV)/.kernels
-	$(PYTEST) -m unit --hypothesis-profile fast
+	$(PYTEST) -n 2 -m unit --hypothesis-profile fast
 
 check: lint types contracts
 

@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-import tyro
 import yaml
 
-from kantor_fleet.__main__ import main
+from kantor_fleet.__main__ import VERBS, main
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -110,25 +109,22 @@ class Ended(NamedTuple):
 def kantor(*arguments: str, act: bool = True) -> Ended:
     """The `kantor` command in this process. act: run the verb; otherwise only parse the command line."""
     reached: list[tuple[str, dict[str, Any]]] = []
-    real = tyro.extras.subcommand_cli_from_dict
 
-    def stubbed(verbs: dict[str, Callable[..., int]], **options: Any) -> Any:
-        def stub(name: str, verb: Callable[..., int]) -> Callable[..., int]:
-            @functools.wraps(verb)
-            def reach(*places: Any, **named: Any) -> int:
-                reached.append((name, dict(enumerate(places)) | named))  # type: ignore[arg-type]
-                return 0
+    def stub(name: str, verb: Callable[..., int]) -> Callable[..., int]:
+        @functools.wraps(verb)
+        def reach(*places: Any, **named: Any) -> int:
+            reached.append((name, dict(enumerate(places)) | named))  # type: ignore[arg-type]
+            return 0
 
-            return reach
-
-        return real({name: stub(name, verb) for name, verb in verbs.items()}, **options)
+        return reach
 
     out, err = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["kantor", *arguments])
         patch.setenv("COLUMNS", "200")
         if not act:
-            patch.setattr(tyro.extras, "subcommand_cli_from_dict", stubbed)
+            stubs = {name: stub(name, verb) for name, verb in VERBS.items()}
+            patch.setattr("kantor_fleet.__main__.VERBS", stubs)
         with (
             contextlib.redirect_stdout(out),
             contextlib.redirect_stderr(err),

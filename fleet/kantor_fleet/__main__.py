@@ -46,12 +46,7 @@ def main() -> None:
     from kantor_protocol.transport.session import BusError  # noqa: PLC0415
 
     try:
-        code: int = tyro.extras.subcommand_cli_from_dict(
-            VERBS,
-            prog="kantor",
-            description="Fleets of robot processes on the Zenoh bus that explore together.",
-            args=_spread_repeated(sys.argv[1:]),
-        )
+        code = _run(_spread_repeated(sys.argv[1:]))
     except (ScenarioError, CredentialsError) as error:
         fail(Exit.USAGE, str(error))
     except BusError as error:
@@ -64,6 +59,22 @@ def main() -> None:
     except KeyboardInterrupt:
         code = Exit.INTERRUPTED
     sys.exit(code)
+
+
+def _run(arguments: list[str]) -> int:
+    """Parse the command line and run its verb; the exit code."""
+    code: int
+    name = arguments[0] if arguments else ""
+    if name in VERBS:  # the parsers of all verbs together take longer than a short command
+        code = tyro.cli(VERBS[name], prog=f"kantor {name}", args=arguments[1:])
+    else:
+        code = tyro.extras.subcommand_cli_from_dict(
+            VERBS,
+            prog="kantor",
+            description="Fleets of robot processes on the Zenoh bus that explore together.",
+            args=arguments,
+        )
+    return code
 
 
 _REPEATED = ("--set", "--vary")

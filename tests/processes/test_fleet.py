@@ -77,10 +77,11 @@ def test_a_realtime_run_finds_what_virtual_time_finds(kantor: "Kantor") -> None:
     points of virtual time (median of seven seeds), every rule held, and each robot replays from its
     recorded inbox.
     """
-    # With a budget of energy both end after the same number of steps, whichever robots met.
+    # With a budget of energy both end after the same number of steps, whichever robots met; on a slow machine
+    # robots take fewer steps a second, and no limit cuts them short.
     name = "paper-centralized-concurrent"
     clocks = ("clock.spread=0.1", "clock.drift_ppm=1000", "clock.jitter_s=0.01")
-    overrides = ("merge='ledger'", "claims=true", *clocks)
+    overrides = ("merge='ledger'", "claims=true", "limit_s=100000", *clocks)
     virtual = statistics.median(detection(find(name, overrides), seed) for seed in range(7))
     wall = kantor("run", name, "--exchange", "wall", "--speed", 16, "--set", *overrides)
     assert wall.code == 0, wall.out + wall.err
@@ -95,7 +96,9 @@ def test_a_realtime_run_finds_what_virtual_time_finds(kantor: "Kantor") -> None:
 @pytest.mark.parametrize("exchange", ["lockstep", "wall"])
 def test_a_killed_robot_does_not_stop_the_others(kantor: "Kantor", exchange: str) -> None:
     """SIGKILL to r3 in the middle: the others finish, the record says who was missing, exit code 3."""
-    process = kantor.start("run", "fleet", "--exchange", exchange, "--speed", 16)
+    process = kantor.start(
+        "run", "fleet", "--exchange", exchange, "--speed", 16, "--set", "limit_s=100000"
+    )
     await_line(process, "t=", "energy")
     (folder,) = kantor.runs()
     os.kill(children_named(process, folder / "logs" / "r3.log"), signal.SIGKILL)
