@@ -7,7 +7,7 @@ import pytest
 from hypothesis import settings
 
 from support.command import CommandServer, Kantor
-from support.tiers import LONGEST_FIRST, tier_of
+from support.tiers import LONGEST_FIRST, tier_of, tier_of_place
 
 settings.register_profile("kantor", deadline=None, print_blob=True)
 settings.register_profile("fast", settings.get_profile("kantor"), max_examples=10)
@@ -17,6 +17,13 @@ settings.load_profile("kantor")
 def pytest_addoption(parser: pytest.Parser) -> None:
     """`--rewrite` brings the transcripts up to date."""
     parser.addoption("--rewrite", action="store_true", help="rewrite transcripts of robots")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out, for `-m unit`, the files without unit tests: importing them takes as long as many tests."""
+    if config.option.markexpr != "unit" or not collection_path.name.startswith("test_"):
+        return None
+    return True if tier_of_place(collection_path) not in {"unit", None} else None
 
 
 @pytest.hookimpl(tryfirst=True)

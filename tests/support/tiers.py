@@ -30,11 +30,22 @@ def tier_of(item: pytest.Item) -> str:
     own = [mark.name for mark in item.iter_markers() if mark.name in TIERS]
     if len(own) > 1:
         raise pytest.UsageError(f"{item.nodeid}: several tiers: {', '.join(own)}; keep one")
+    tier = tier_of_place(item.path)
+    if tier is None:
+        path = item.path.relative_to(TESTS)
+        raise pytest.UsageError(f"{item.nodeid}: no tier; add {path} to tests/support/tiers.py")
+    if own == ["unit"] != [tier]:
+        raise pytest.UsageError(f"{item.nodeid}: a unit test among others; move it to a unit file")
     if own:
         return own[0]
-    path = item.path.relative_to(TESTS)
-    places = [place.as_posix() for place in (path, *path.parents)]
-    tier = next((TIER_OF_PLACE[place] for place in places if place in TIER_OF_PLACE), None)
-    if tier is None:
-        raise pytest.UsageError(f"{item.nodeid}: no tier; add {path} to tests/support/tiers.py")
     return "processes" if tier == "unit" and "kantor" in item.fixturenames else tier
+
+
+def tier_of_place(path: Path) -> str | None:
+    """The tier of the tests in a file that have no mark of their own; None if no place covers it.
+
+    Tests of the tier `unit` are in its places only: others need not be imported to run it.
+    """
+    relative = path.relative_to(TESTS)
+    places = [place.as_posix() for place in (relative, *relative.parents)]
+    return next((TIER_OF_PLACE[place] for place in places if place in TIER_OF_PLACE), None)
