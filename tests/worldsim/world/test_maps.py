@@ -357,6 +357,7 @@ def test_yaml_that_is_no_map_is_refused(
 @pytest.mark.parametrize(
     "text",
     ["", "- 1\n", "map", "a: [", "a: b: c", "\x00", "1: 2", "[" * 5000, "&a [*a]", b"\xff\xfe\xff"],
+    ids=lambda text: repr(text[:20]),
 )
 def test_yaml_that_is_no_mapping_is_refused(folder: Path, text: str | bytes) -> None:
     """Every other content is refused in one line."""
