@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from support.command import CommandServer, Kantor
+from support.processes.command import CommandServer, Kantor
 from support.tiers import LONGEST_FIRST, tier_of, tier_of_place
 
 settings.register_profile("kantor", deadline=None, print_blob=True)

@@ -16,7 +16,7 @@ import pytest
 from kantor_fleet.__main__ import main
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 BASELINE = Path(__file__).parent / "baseline"
 

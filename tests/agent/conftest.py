@@ -9,8 +9,8 @@ from kantor_agent.robots.density import DensityRobot
 from kantor_agent.robots.mapping import MappingRobot
 from kantor_supervisor.density import DensitySupervisor
 from kantor_supervisor.mapping import MappingSupervisor
-from support.floors import Floor
 from support.strategies import all_validated
+from support.teams.floors import Floor
 
 
 @pytest.fixture(autouse=True)

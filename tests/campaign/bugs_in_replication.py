@@ -27,7 +27,7 @@ from kantor_protocol.replication.replica import Replica
 from kantor_protocol.scenario.faults.links import Hostile
 from kantor_protocol.scenario.faults.processes import Kill
 from kantor_protocol.wire import version_vector as reader
-from support.replicas import read_logs
+from support.replication.replicas import read_logs
 
 
 def _merging(

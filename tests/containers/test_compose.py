@@ -9,7 +9,7 @@ import yaml
 from kantor_fleet.processes.compose import ComposeConfig, text
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 ROOT = Path(__file__).parents[2]
 

@@ -18,11 +18,11 @@ from kantor_fleet.processes.compose import ComposeConfig
 from kantor_fleet.scenarios.catalog import find
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.world.world import WorldSetup
-from support.fleets import incidents_of, result_of
 from support.limits import EVENT_LIMIT_S
+from support.processes.fleets import incidents_of, result_of
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 pytestmark = pytest.mark.xdist_group("containers")
 

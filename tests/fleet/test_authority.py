@@ -20,7 +20,7 @@ from kantor_protocol.transport.credentials import Certificate, CredentialsError
 from support.strategies import examples
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 NOW = datetime(2026, 11, 23, 12, tzinfo=UTC)
 

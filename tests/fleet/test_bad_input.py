@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 
 def refused(kantor: "Kantor", *arguments: object) -> tuple[int, str]:

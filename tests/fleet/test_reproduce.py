@@ -27,7 +27,7 @@ from support.claims import number, runs_of
 from support.files import rows_of
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 HERE, THERE = Setting("here"), Setting("there")
 

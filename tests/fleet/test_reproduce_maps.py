@@ -53,7 +53,7 @@ from support.limits import EVENT_LIMIT_S
 from support.strategies import examples
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 HERE, THERE, FAR = Setting("here"), Setting("there"), Setting("far")
 POSITIVE = st.floats(min_value=1e-3, max_value=1e6)

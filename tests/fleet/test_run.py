@@ -11,11 +11,11 @@ import psutil
 import pytest
 
 from support.files import rows_of, wait_until
-from support.fleets import result_of
 from support.limits import EVENT_LIMIT_S
+from support.processes.fleets import result_of
 
 if TYPE_CHECKING:
-    from support.command import Finished, Kantor
+    from support.processes.command import Finished, Kantor
 
 RESULT_NAMES = [
     "scenario", "seed", "exchange", "clock", "planner", "merge", "robots", "ticks",

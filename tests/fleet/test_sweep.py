@@ -22,11 +22,11 @@ from kantor_fleet.sweep.run import SweepConfig, sweep
 from kantor_fleet.sweep.summary import Distribution
 from support.files import rows_of, wait_until
 from support.limits import EVENT_LIMIT_S
+from support.processes.workers import DEADLY_SEED, die_of_a_seed, fail_of_a_seed
 from support.strategies import mission
-from support.workers import DEADLY_SEED, die_of_a_seed, fail_of_a_seed
 
 if TYPE_CHECKING:
-    from support.command import CommandServer, Finished, Kantor
+    from support.processes.command import CommandServer, Finished, Kantor
 
 SMALL = (
     "--set", "energy.points=400", "energy.steps=400", "samples.count=200", "targets.count=50",
@@ -317,7 +317,7 @@ group = pytest.mark.xdist_group("sweep")  # they share a fixture that is dear
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory, command_server: "CommandServer") -> Path:
     """The folder of a whole sweep that one worker ran."""
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
     kantor = Kantor(tmp_path_factory.mktemp("reference"), command_server)
     finished = kantor("sweep", "fleet", *FULL, "--jobs", 1)

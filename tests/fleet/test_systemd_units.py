@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 UNITS = Path(__file__).parents[2] / "docker" / "systemd"
 SETTINGS = {

@@ -15,11 +15,11 @@ from kantor_fleet.security.authority import Wanted, issue
 from kantor_protocol.transport import credentials, zenoh_config
 from kantor_protocol.transport.credentials import Certificate, Password
 from kantor_protocol.transport.endpoint import free_endpoint
-from support.intruders import plain_session
 from support.limits import EVENT_LIMIT_S
+from support.processes.intruders import plain_session
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 ROOT = "kantor/v1/kantor"
 

@@ -23,7 +23,7 @@ from kantor_worldsim.world.world import WorldSetup
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 EVERYTHING = 260
 """A seed whose short storm has every class of faults of processes."""

@@ -25,12 +25,12 @@ from kantor_protocol.transport.events import Joined, Left, Received
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import BusError
 from kantor_protocol.wire import keys
-from support.fleets import await_line
-from support.intruders import plain_session
 from support.limits import EVENT_LIMIT_S
+from support.processes.fleets import await_line
+from support.processes.intruders import plain_session
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 FLEET, ROSTER = "demo", ("r1", "r2", "r3")
 NOW = datetime.now(UTC)

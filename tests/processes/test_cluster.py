@@ -19,17 +19,17 @@ from kantor_fleet.execution.experiment import Case
 from kantor_fleet.exits import Exit
 from kantor_fleet.sweep.plan import SweepPlan, plan
 from kantor_fleet.sweep.run import SweepConfig, sweep
-from support import workers
 from support.limits import EVENT_LIMIT_S
+from support.processes import workers
 from support.strategies import mission
 
 if TYPE_CHECKING:
-    from support.command import Kantor, Process
+    from support.processes.command import Kantor, Process
 
 SMALL = ("energy.points=400", "energy.steps=400", "samples.count=200", "targets.count=50")
 VARY, SEEDS = "radio.range_m=50,100", "0:10"
 RUNS = 20
-ENVIRONMENT = {"PYTHONPATH": str(Path(workers.__file__).parents[1])}
+ENVIRONMENT = {"PYTHONPATH": str(Path(workers.__file__).parents[2])}
 """Of a cluster: its workers find the tests' work."""
 
 

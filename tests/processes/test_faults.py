@@ -4,10 +4,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from support.fleets import result_of
+from support.processes.fleets import result_of
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 STORM = """
 [[faults]]

@@ -15,11 +15,18 @@ from kantor_protocol.transport.endpoint import free_endpoint
 from kantor_worldsim.observers.metrics.density import DensityMetrics
 from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.world.world import WorldSetup
-from support.fleets import acts_of, await_act, await_line, children_named, records_of, result_of
 from support.limits import EVENT_LIMIT_S
+from support.processes.fleets import (
+    acts_of,
+    await_act,
+    await_line,
+    children_named,
+    records_of,
+    result_of,
+)
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 LOSSY = (
     "--set", "radio.drop=0.1", "radio.duplicate=0.1", "radio.delay_s=0.03", "radio.jitter_s=0.2",

@@ -27,7 +27,7 @@ from kantor_protocol.wire import keys
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 FLEET, ROSTER = "kantor", ("r1", "r2")
 MESSAGES, LARGE_MESSAGES = 5000, 40

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from support.fleets import await_line, children_named, result_of
 from support.limits import EVENT_LIMIT_S
+from support.processes.fleets import await_line, children_named, result_of
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 SMALL = ("--set", "map.size_m=[18.0,14.0]", "sensor.range_m=4", "sensor.beams=128")
 BAD_RADIO = ("radio.drop=0.1", "radio.duplicate=0.1", "radio.delay_s=0.03", "radio.jitter_s=0.3")

@@ -15,7 +15,8 @@ import zenoh
 from kantor_protocol.transport import zenoh_config
 from kantor_protocol.transport.credentials import Certificate, read
 from kantor_protocol.transport.endpoint import free_endpoint
-from support.fleets import (
+from support.limits import EVENT_LIMIT_S
+from support.processes.fleets import (
     acts_of,
     await_act,
     await_incident,
@@ -24,11 +25,10 @@ from support.fleets import (
     records_of,
     result_of,
 )
-from support.intruders import plain_session
-from support.limits import EVENT_LIMIT_S
+from support.processes.intruders import plain_session
 
 if TYPE_CHECKING:
-    from support.command import Kantor, Process
+    from support.processes.command import Kantor, Process
 
 ROOT = "kantor/v1/kantor"
 FORGED = b"forged"

@@ -4,11 +4,11 @@ import signal
 from typing import TYPE_CHECKING
 
 from kantor_protocol.transport.endpoint import free_endpoint
-from support.fleets import await_line, incidents_of, result_of
 from support.limits import EVENT_LIMIT_S
+from support.processes.fleets import await_line, incidents_of, result_of
 
 if TYPE_CHECKING:
-    from support.command import Kantor
+    from support.processes.command import Kantor
 
 
 def test_a_killed_world_sim_resumes_its_run_and_a_done_one_starts_another(kantor: "Kantor") -> None:

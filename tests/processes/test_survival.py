@@ -11,7 +11,8 @@ import pytest
 
 from kantor_protocol.transport.endpoint import free_endpoint
 from kantor_worldsim.record.records import Batch, ProcessEvent
-from support.fleets import (
+from support.limits import EVENT_LIMIT_S
+from support.processes.fleets import (
     acts_of,
     await_act,
     await_incident,
@@ -22,10 +23,9 @@ from support.fleets import (
     records_of,
     result_of,
 )
-from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from support.command import Kantor, Process
+    from support.processes.command import Kantor, Process
 
 EVERYTHING = """
 [[faults]]

@@ -1,4 +1,4 @@
-"""What tests share: drawn maps, missions, records, fleets of processes, strategies and plain references.
+"""What tests share: drawn maps, missions, records, processes, faults, teams, strategies and plain references.
 
-A plain reference says the same as a compiled kernel in a few obvious lines. Start with `missions.py`.
+Start with `missions.py`. A fixture that only one folder uses is in the `conftest.py` of that folder.
 """

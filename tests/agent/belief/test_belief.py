@@ -14,7 +14,7 @@ from kantor_protocol.base.random_walk import RandomWalk
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.wire.weights import Units
-from support.replicas import entries
+from support.replication.replicas import entries
 from support.strategies import Points, crowds, examples, scattered
 
 Plan = list[tuple[int, int]]

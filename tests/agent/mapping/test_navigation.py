@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from kantor_agent.mapping.navigation import Navigator
 from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN
 from kantor_protocol.base.machine import Pose
-from support.floors import Floor, crowded, drawn
 from support.strategies import examples
+from support.teams.floors import Floor, crowded, drawn
 
 
 def drive(floor: Floor, start: int, target: int, stride_m: float) -> list[tuple[Pose, float]]:

@@ -13,8 +13,8 @@ from kantor_agent.planners.burgard import Burgard, coverage, discount, in_sight
 from kantor_agent.planners.map_base import Situation, Task
 from kantor_protocol.base.grid import NOWHERE, OCCUPIED
 from kantor_protocol.replication.occupancy_log import RANGE_BINS
-from support.floors import Floor, crowded, drawn, member
 from support.strategies import examples
+from support.teams.floors import Floor, crowded, drawn, member
 
 CORRIDOR = ["  ........  "]
 """Frontiers are 2 and 9, and the sensor reaches 3 cells."""

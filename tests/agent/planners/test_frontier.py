@@ -9,8 +9,8 @@ from kantor_agent.coordination.assignment import Assignment
 from kantor_agent.planners.frontier import Frontier
 from kantor_agent.planners.map_base import Situation, TeamMember
 from kantor_protocol.base.grid import NOWHERE
-from support.floors import Floor, crowded, drawn, member
 from support.strategies import examples
+from support.teams.floors import Floor, crowded, drawn, member
 
 CORRIDOR = [" ....... "]
 """Frontiers are 1 and 7."""

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from kantor_agent.planners.hungarian import Hungarian, cheapest_pairs, spread_out
 from kantor_agent.planners.map_base import Situation
 from kantor_protocol.base.grid import NOWHERE
-from support.floors import Floor, crowded, drawn, member
 from support.strategies import SEEDS, examples
+from support.teams.floors import Floor, crowded, drawn, member
 
 CORRIDOR = ["  ........  "]
 """Frontiers are 2 and 9, and the sensor reaches 3 cells."""

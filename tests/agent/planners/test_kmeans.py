@@ -16,8 +16,8 @@ from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.world.starts import observable
 from kantor_worldsim.world.world import WorldSetup, ground_of
-from support.floors import drawn, member
-from support.plain_kmeans import SETTLED
+from support.references.plain_kmeans import SETTLED
+from support.teams.floors import drawn, member
 
 MISSION = """
 name = "regions"

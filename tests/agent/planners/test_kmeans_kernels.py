@@ -11,10 +11,10 @@ from kantor_agent.planners import kmeans
 from kantor_agent.planners.kmeans import NO_REGION, PARTS, KMeans, Regions, blocked
 from kantor_agent.planners.map_base import Situation
 from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN
-from support.floors import Floor, member
 from support.grounds import exploration
-from support.plain_kmeans import PlainKMeans, plain_cluster, plain_line, visible_team
+from support.references.plain_kmeans import PlainKMeans, plain_cluster, plain_line, visible_team
 from support.strategies import examples
+from support.teams.floors import Floor, member
 
 SCENARIO = exploration("planner.name=kmeans")
 MEMOS = st.one_of(

@@ -26,7 +26,7 @@ from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import GossipMessage, decode_gossip
 from kantor_protocol.wire.version_vector import read_version_vector
-from support.replicas import read_logs
+from support.replication.replicas import read_logs
 
 FOLDER = Path(__file__).parent / "transcripts"
 BASE = """

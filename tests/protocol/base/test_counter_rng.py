@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 
 from kantor_protocol.base.counter_rng import Purpose, generator, philox, to_unit, uniform
-from support.plain_philox import philox_plain
+from support.references.plain_philox import philox_plain
 from support.strategies import SEEDS, WORDS, examples
 
 Words = tuple[int, int, int, int]

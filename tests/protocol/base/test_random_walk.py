@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from kantor_protocol.base.counter_rng import Purpose
 from kantor_protocol.base.random_walk import RandomWalk
-from support.plain_philox import philox_plain
+from support.references.plain_philox import philox_plain
 from support.strategies import SEEDS, examples, scattered
 
 PERIOD_NS = 100_000_000

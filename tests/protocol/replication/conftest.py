@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from kantor_protocol.replication.registers import Registers
-from support import replicas
+from support.replication import replicas
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_protocol.replication.replica import Replica
-from support.replicas import entries, read_logs
+from support.replication.replicas import entries, read_logs
 from support.strategies import examples
 
 BOUND = 50

@@ -3,8 +3,8 @@
 import pytest
 
 from kantor_protocol.replication.replica_kernels import NO_INDEX
-from support import replicas
-from support.small_replicas import LosslessRadio, replica
+from support.replication import replicas
+from support.replication.small_replicas import LosslessRadio, replica
 
 
 def competing_claims(first_ns: int, second_ns: int) -> tuple[list[int], list[int]]:

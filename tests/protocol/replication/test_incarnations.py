@@ -17,7 +17,7 @@ from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import NO_INDEX, spend
 from kantor_protocol.wire.version_vector import covered_ids, read_version_vector
 from kantor_protocol.wire.weights import Units
-from support import replicas
+from support.replication import replicas
 from support.strategies import examples
 
 N = 6

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from kantor_protocol.replication.replica_kernels import spend
 from kantor_protocol.wire.weights import Units
-from support import replicas
-from support.plain_gossip import claim, full_message, suffix, version_vector
-from support.small_replicas import (
+from support.references.plain_gossip import claim, full_message, suffix, version_vector
+from support.replication import replicas
+from support.replication.small_replicas import (
     MODES,
     SPENDINGS,
     TEAM_SPENDINGS,

@@ -5,8 +5,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_protocol.replication.replica import Replica
-from support.plain_gossip import Message, claim, suffix, version_vector
-from support.small_replicas import MODES, UNITS, N, replica, snapshot, spend_each, weights_of
+from support.references.plain_gossip import Message, claim, suffix, version_vector
+from support.replication.small_replicas import (
+    MODES,
+    UNITS,
+    N,
+    replica,
+    snapshot,
+    spend_each,
+    weights_of,
+)
 from support.strategies import examples
 
 

@@ -8,9 +8,9 @@ from hypothesis import given
 
 from kantor_protocol.replication.replica_kernels import KNOWN_MAX
 from kantor_protocol.wire.weights import Units
-from support import replicas
-from support.plain_gossip import leb128, suffix, version_vector
-from support.small_replicas import (
+from support.references.plain_gossip import leb128, suffix, version_vector
+from support.replication import replicas
+from support.replication.small_replicas import (
     MODES,
     TEAM_SPENDINGS,
     UNITS,

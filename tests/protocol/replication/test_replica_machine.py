@@ -16,7 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import NO_INDEX, spend
 from kantor_protocol.wire.weights import Units
-from support import replicas
+from support.replication import replicas
 from support.strategies import examples
 
 N = 6

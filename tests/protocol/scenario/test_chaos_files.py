@@ -8,7 +8,7 @@ from kantor_protocol.scenario.dump import to_toml
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.load import parse, with_chaos
 from kantor_protocol.scenario.schema import Scenario
-from support.fault_tables import EVERY_KIND, fault
+from support.faults.fault_tables import EVERY_KIND, fault
 from support.strategies import SMALL, mission
 
 

@@ -9,7 +9,7 @@ from kantor_protocol.scenario.dump import to_toml, to_tree
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.faults.schedule import KINDS
 from kantor_protocol.scenario.load import from_tree, parse
-from support.fault_tables import EVERY_KIND, fault
+from support.faults.fault_tables import EVERY_KIND, fault
 from support.strategies import SMALL, TOML_KEYS, TOML_VALUES, examples, mission, paths_of, planted
 
 

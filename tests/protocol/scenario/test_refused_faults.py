@@ -5,7 +5,7 @@ import pytest
 from kantor_protocol.scenario.dump import to_tree
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.load import from_tree, parse
-from support.fault_tables import EVERY_KIND, fault
+from support.faults.fault_tables import EVERY_KIND, fault
 from support.grounds import exploration
 from support.strategies import SMALL, mission
 

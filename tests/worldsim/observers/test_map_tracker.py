@@ -33,7 +33,7 @@ from kantor_worldsim.record.records import Batch, Opening, Record, StepRecord
 from kantor_worldsim.world.maps import Ground, parts
 from support.grounds import grounds
 from support.missions import ROOMS, explored, on_map, setup_of
-from support.replicas import read_logs
+from support.replication.replicas import read_logs
 from support.strategies import examples
 
 Records = Sequence[Record]

@@ -23,14 +23,14 @@ from kantor_protocol.scenario.faults.links import (
 )
 from kantor_protocol.scenario.faults.schedule import AnyFault
 from kantor_worldsim.radio.channel import DROPPED, Channel, DeliveryDecision
-from support.faulty_radio import MS, PLACES, FaultyRadio, broadcasts, dues, sent_by
-from support.link_fault_strategies import (
+from support.faults.faulty_radio import MS, PLACES, FaultyRadio, broadcasts, dues, sent_by
+from support.faults.link_fault_strategies import (
     FAULTS,
     FAULTS_WITHOUT_DRAWS,
     FAULTS_WITHOUT_FORGERIES,
     SCHEDULES,
 )
-from support.plain_faults import PASS, Fate, PlainFaults
+from support.references.plain_faults import PASS, Fate, PlainFaults
 from support.strategies import SEEDS, examples, mission
 
 LOSSY = ("radio.range_m=50", "radio.drop=0.2", "radio.duplicate=0.3", "radio.jitter_s=0.3")

@@ -26,7 +26,7 @@ from kantor_protocol.scenario.faults.links import (
 from kantor_protocol.scenario.faults.schedule import AnyFault
 from kantor_worldsim.radio.channel import DROPPED, Sent
 from kantor_worldsim.radio.fault_kernels import in_burst
-from support.faulty_radio import (
+from support.faults.faulty_radio import (
     ALL_LINKS,
     MS,
     PLACES,

@@ -32,8 +32,8 @@ from kantor_worldsim.observers.recording import metrics_of
 from kantor_worldsim.radio.link_faults import LinkFaults
 from kantor_worldsim.record.journal import Journal
 from kantor_worldsim.record.records import Batch, Ending, Opening, Record
-from support.faulty_radio import MS
-from support.link_fault_strategies import SCHEDULES
+from support.faults.faulty_radio import MS
+from support.faults.link_fault_strategies import SCHEDULES
 from support.missions import explored
 from support.strategies import SEEDS, examples, mission
 

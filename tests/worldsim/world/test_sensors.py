@@ -16,7 +16,7 @@ from kantor_protocol.scenario.schema import SensorOptions
 from kantor_worldsim.world.maps import Cells, Ground
 from kantor_worldsim.world.sensors import RangeFinder, walls_between, way_to_wall
 from support.grounds import HEADINGS, Place, drawn, grounds, places
-from support.plain_philox import philox_plain
+from support.references.plain_philox import philox_plain
 from support.strategies import SEEDS, examples
 
 Codes = npt.NDArray[np.uint16]

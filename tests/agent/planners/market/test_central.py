@@ -11,8 +11,9 @@ from kantor_agent.planners.market.costs import Costs
 from kantor_agent.planners.market.goals import quadtree_goals
 from kantor_agent.planners.market.planner import Market
 from kantor_protocol.base.grid import FREE
-from support.floors import member
-from support.markets import (
+from support.strategies import examples
+from support.teams.floors import member
+from support.teams.markets import (
     CORRIDOR,
     TOURS,
     cost_map_of,
@@ -21,7 +22,6 @@ from support.markets import (
     situation,
     tour_length,
 )
-from support.strategies import examples
 
 
 def central_market(*overrides: str, **tours: list[int]) -> Market:

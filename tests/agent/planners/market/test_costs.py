@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from kantor_agent.planners.market.costs import Costs, price_of, separate
 from kantor_protocol.base.grid import FREE, OCCUPIED
 from kantor_protocol.replication.registers import NUMBER_MAX
-from support.markets import TOURS, cost_map_of, scattered_walls, tour_length
 from support.strategies import examples
+from support.teams.markets import TOURS, cost_map_of, scattered_walls, tour_length
 
 
 @given(st.integers(0, 30), TOURS, st.integers(0, 399))

@@ -13,8 +13,8 @@ from kantor_agent.planners.market.goals import (
     random_goals,
 )
 from kantor_protocol.base.counter_rng import Purpose, uniform
-from support.markets import cost_map_of
 from support.strategies import examples
+from support.teams.markets import cost_map_of
 
 
 def test_quadtree_splits_until_leaves_are_two_ranges_long() -> None:

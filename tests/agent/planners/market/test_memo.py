@@ -9,9 +9,9 @@ from kantor_agent.planners.market.memo import Memo, packed, unpacked
 from kantor_agent.planners.market.planner import Market
 from kantor_agent.planners.market.rules import MarketRules
 from kantor_protocol.replication.registers import NUMBER_MAX
-from support.floors import member
-from support.markets import CORRIDOR, cost_map_of, mission, situation
 from support.strategies import examples
+from support.teams.floors import member
+from support.teams.markets import CORRIDOR, cost_map_of, mission, situation
 
 NUMBERS = st.integers(-NUMBER_MAX, NUMBER_MAX)
 

@@ -6,7 +6,7 @@ from kantor_fleet.execution.in_process_team import play
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.record.records import Batch, Record
 from kantor_worldsim.world.world import WorldSetup
-from support.markets import mission
+from support.teams.markets import mission
 
 UNSTRUCTURED = (
     "map.layout=unstructured",

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from kantor_agent.planners.market.rules import MarketRules
 from kantor_protocol.base.grid import FREE, NOWHERE, UNKNOWN
-from support.floors import member
-from support.markets import CORRIDOR, cost_map_of, mission, scattered_walls, situation
 from support.strategies import examples
+from support.teams.floors import member
+from support.teams.markets import CORRIDOR, cost_map_of, mission, scattered_walls, situation
 
 
 @pytest.mark.parametrize("rule", ["random", "greedy", "quadtree"])

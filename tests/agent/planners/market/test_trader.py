@@ -10,9 +10,9 @@ from kantor_agent.planners.market.memo import Memo, packed
 from kantor_agent.planners.market.planner import Market
 from kantor_agent.planners.market.trader import Holding
 from kantor_protocol.base.grid import FREE, NOWHERE
-from support.floors import member
-from support.markets import CORRIDOR, cost_map_of, floor_of, mission, situation
-from support.trading_team import Radio, TradingTeam
+from support.teams.floors import member
+from support.teams.markets import CORRIDOR, cost_map_of, floor_of, mission, situation
+from support.teams.trading_team import Radio, TradingTeam
 
 HALL = (
     "????............................????",

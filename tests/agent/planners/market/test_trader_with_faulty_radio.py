@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from kantor_agent.planners.market.memo import unpacked
 from kantor_protocol.base.grid import FREE, NOWHERE, UNKNOWN
-from support.markets import floor_of
 from support.strategies import examples
-from support.trading_team import Radio, TradingTeam, perfect_radio
+from support.teams.markets import floor_of
+from support.teams.trading_team import Radio, TradingTeam, perfect_radio
 
 KNOWN_BAND = (*["?" * 24] * 11, *["." * 24] * 2, *["?" * 24] * 11)
 """24 x 24 cells; two rows in the middle are free, all others unknown."""

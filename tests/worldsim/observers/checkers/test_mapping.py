@@ -29,7 +29,7 @@ from support.checkers import listed, rules
 from support.grounds import drawn
 from support.missions import ROOMS, explored, on_map, setup_of
 from support.records import Records, batches, gossip_of, step_records, uints
-from support.replicas import read_logs
+from support.replication.replicas import read_logs
 
 Change = Callable[[StepRecord], StepRecord]
 

@@ -18,7 +18,7 @@ from support.records import (
     step_records,
     uints,
 )
-from support.replicas import read_logs
+from support.replication.replicas import read_logs
 from support.variants import DISK_LOST
 
 BROKEN = BrokenRecords()

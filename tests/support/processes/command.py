@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 from typing import IO, NamedTuple
 
-from support.command_server import STATUS, Request
 from support.limits import EVENT_LIMIT_S
+from support.processes.command_server import STATUS, Request
 
 
 class Finished(NamedTuple):

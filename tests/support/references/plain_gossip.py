@@ -1,7 +1,7 @@
 """Parts of gossip messages, encoded in plain Python: an encoder of the wire format that shares nothing with the kernels."""
 
 from kantor_protocol.replication.replica import Replica
-from support import replicas
+from support.replication import replicas
 
 Message = tuple[bytes, bytes, bytes]
 Entry = tuple[int, int]

@@ -7,8 +7,8 @@ from kantor_agent.planners.map_base import TeamMember
 from kantor_agent.planners.market.memo import Memo, unpacked
 from kantor_agent.planners.market.planner import Market
 from kantor_agent.planners.market.trader import Holding
-from support.floors import Floor, member
-from support.markets import mission, situation
+from support.teams.floors import Floor, member
+from support.teams.markets import mission, situation
 
 Radio = Callable[[int, int, int], Sequence[int]]
 """Source, receiver and step to the delays, in steps, with which a memo arrives; none: it is lost."""

@@ -12,7 +12,7 @@ from kantor_agent.planners.market.costs import Costs
 from kantor_protocol.base.grid import NOWHERE
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
-from support.floors import Floor, drawn
+from support.teams.floors import Floor, drawn
 
 _MISSION = """
 name = "market"

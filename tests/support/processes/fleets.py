@@ -11,7 +11,7 @@ from kantor_worldsim.record.records import Batch, ProcessEvent, Record, StepReco
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
-    from support.command import Process
+    from support.processes.command import Process
 
 T = TypeVar("T")
 

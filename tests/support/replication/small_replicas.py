@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import spend
 from kantor_protocol.wire.weights import Units
-from support import replicas
-from support.plain_gossip import Entry, Message, full_message
+from support.references.plain_gossip import Entry, Message, full_message
+from support.replication import replicas
 
 N = 6
 UNITS = Units.of(8, N)

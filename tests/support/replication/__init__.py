@@ -1,0 +1,1 @@
+"""Small replicas, and their state as plain values."""
