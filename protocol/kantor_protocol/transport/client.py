@@ -152,7 +152,10 @@ def client(connect: str, identity: Identity, connect_timeout_s: float) -> zenoh.
 
 
 def _check_admitted(connect: str, session: zenoh.Session, identity: Certificate) -> None:
-    """Ask the router whether this identity is a member: a certificate may be valid and yet not in the member list. Raises BusError."""
+    """Ask the router whether this identity is a member. Raises BusError.
+
+    A certificate may be valid and yet not in the member list.
+    """
     reason = _reason_of_refusal(session, identity)
     if reason is None:
         raise BusError(

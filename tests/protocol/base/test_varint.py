@@ -14,20 +14,12 @@ from kantor_protocol.base.varint import (
     read_uint,
     sum_pairs,
 )
+from support.references.plain_varint import leb128, zigzag
 from support.strategies import COUNTS, examples
 
 BOUND = 5000
 SIGNED = st.integers(-(2**62), 2**62 - 1)
 PAIRS = st.lists(st.tuples(st.integers(0, BOUND - 1), COUNTS), max_size=80)
-
-
-def leb128(value: int) -> bytes:
-    """The reference: seven bits a byte, low bits first, the high bit on all but the last."""
-    out = bytearray()
-    while value > 127:
-        out.append(value % 128 + 128)
-        value //= 128
-    return bytes([*out, value])
 
 
 def packed(pairs: list[tuple[int, int]]) -> bytes:
@@ -62,7 +54,7 @@ def test_signed_number_is_folded(value: int) -> None:
     """0, -1, 1, -2, … become 0, 1, 2, 3, … so that small differences stay short."""
     out = np.zeros(10, dtype=np.uint8)
     end = put_int(out, 0, value)
-    folded = leb128(2 * value if value >= 0 else -2 * value - 1)
+    folded = leb128(zigzag(value))
 
     assert out[:end].tobytes() == folded
     assert read_int(np.frombuffer(folded, dtype=np.uint8), 0) == (value, end)

@@ -8,7 +8,8 @@ from hypothesis import given
 
 from kantor_protocol.replication.replica_kernels import KNOWN_MAX
 from kantor_protocol.wire.weights import Units
-from support.references.plain_gossip import leb128, suffix, version_vector
+from support.references.plain_gossip import suffix, version_vector
+from support.references.plain_varint import leb128
 from support.replication import replicas
 from support.replication.small_replicas import (
     MODES,

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_protocol.replication.registers import NUMBER_MAX, STAMP_MAX, Registers, read_register
+from support.references.plain_varint import leb128, zigzag
 from support.strategies import examples
 
 WIDTH = 3
@@ -46,19 +47,10 @@ def hear(held: Registers, source: int, said: bytes) -> None:
     held.merge(source, said, told)
 
 
-def leb128(value: int) -> bytes:
-    """Seven bits a byte, low bits first, the high bit on all but the last."""
-    out = bytearray()
-    while value > 127:
-        out.append(value % 128 + 128)
-        value //= 128
-    return bytes([*out, value])
-
-
 def register(origin: int, stamp: int, *numbers: int) -> bytes:
     """Origin, stamp, how many numbers, the numbers zigzag-folded."""
-    folded = (2 * number if number >= 0 else -2 * number - 1 for number in numbers)
-    return b"".join(leb128(value) for value in (origin, stamp, len(numbers), *folded))
+    counted = (origin, stamp, len(numbers), *map(zigzag, numbers))
+    return b"".join(map(leb128, counted))
 
 
 def content(stamps: list[int], *registers: bytes) -> bytes:

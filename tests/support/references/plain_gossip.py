@@ -1,19 +1,11 @@
 """Parts of gossip messages, encoded in plain Python: an encoder of the wire format that shares nothing with the kernels."""
 
 from kantor_protocol.replication.replica import Replica
+from support.references.plain_varint import leb128, zigzag
 from support.replication import replicas
 
 Message = tuple[bytes, bytes, bytes]
 Entry = tuple[int, int]
-
-
-def leb128(value: int) -> bytes:
-    """Seven bits a byte, low bits first, the high bit on all but the last."""
-    out = bytearray()
-    while value > 127:
-        out.append(value % 128 + 128)
-        value //= 128
-    return bytes([*out, value])
 
 
 def suffix(origin: int, start: int, entries: list[Entry], span: int | None = None) -> bytes:
@@ -23,7 +15,7 @@ def suffix(origin: int, start: int, entries: list[Entry], span: int | None = Non
     before = 0
     for index, value in entries:
         step, before = index - before, index
-        content += leb128(2 * step if step >= 0 else -2 * step - 1) + leb128(value)
+        content += leb128(zigzag(step)) + leb128(value)
     return content
 
 

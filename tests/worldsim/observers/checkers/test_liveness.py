@@ -107,7 +107,7 @@ def test_nothing_is_judged_before_it_can_be_known() -> None:
 
 
 def altered(records: Sequence[Record], change: Callable[[StepRecord], StepRecord]) -> list[Record]:
-    """The records with every act changed."""
+    """The records with every step record changed."""
     return [
         msgspec.structs.replace(r, step_records=tuple(map(change, r.step_records)))
         if isinstance(r, Batch)

@@ -25,13 +25,12 @@ from kantor_worldsim.observers.checkers.checker import Checker, check
 from kantor_worldsim.observers.checkers.mapping import MapChecker
 from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
+from support.broken_records import Change, outputs, put_step, verdict
 from support.checkers import listed, rules
 from support.grounds import drawn
 from support.missions import ROOMS, explored, on_map, setup_of
 from support.records import Records, batches, gossip_of, step_records, uints
 from support.replication.replicas import read_logs
-
-Change = Callable[[StepRecord], StepRecord]
 
 ALONE = ("radio.range_m=0.01", "radio.beacon=state")
 """No robot hears another, and each sends all that it knows all the time."""
@@ -50,19 +49,6 @@ PLANNERS = ("frontier", "burgard", "market", "kmeans", "hungarian")
 # Ways to change a record.
 
 
-def put(records: Records, old: StepRecord, change: Change) -> list[Record]:
-    """The records with one step record changed."""
-
-    def changed(batch: Batch) -> Batch:
-        replaced = tuple(
-            change(step_record) if step_record is old else step_record
-            for step_record in batch.step_records
-        )
-        return msgspec.structs.replace(batch, step_records=replaced)
-
-    return [changed(record) if isinstance(record, Batch) else record for record in records]
-
-
 def opened(records: Records, **values: Any) -> list[Record]:
     """The records with another opening."""
     return [msgspec.structs.replace(records[0], **values), *records[1:]]
@@ -70,14 +56,12 @@ def opened(records: Records, **values: Any) -> list[Record]:
 
 def goes(x_m: float, y_m: float) -> Change:
     """A change of where the world says a robot is."""
-    return lambda step_record: msgspec.structs.replace(
-        step_record, verdict=msgspec.structs.replace(step_record.verdict, pose=Pose(x_m, y_m))
-    )
+    return verdict(pose=Pose(x_m, y_m))
 
 
 def hurried(records: Records, step_record: StepRecord, change: Change) -> list[Record]:
     """The records with one step record changed, in a world without a speed limit."""
-    return put(opened(records, scenario=on_map("vehicle.speed_m_s=1000")), step_record, change)
+    return put_step(opened(records, scenario=on_map("vehicle.speed_m_s=1000")), step_record, change)
 
 
 def says(change: Callable[[GossipMessage], GossipMessage]) -> Change:
@@ -88,9 +72,7 @@ def says(change: Callable[[GossipMessage], GossipMessage]) -> Change:
         (envelope,) = step_record.outputs.outbox
         body = encode_gossip(change(decode_gossip(envelope.body)))
         sent: tuple[Envelope, ...] = (msgspec.structs.replace(envelope, body=body),)
-        return msgspec.structs.replace(
-            step_record, outputs=msgspec.structs.replace(step_record.outputs, outbox=sent)
-        )
+        return outputs(outbox=sent)(step_record)
 
     return changed
 
@@ -159,42 +141,42 @@ def _goes_through_wall(records: Records) -> list[Record]:
 def _tells_another_kind(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[5]
     log = own_log(step_record)
-    return put(records, step_record, says(logging([*log[:-1], log[-1] ^ 1])))
+    return put_step(records, step_record, says(logging([*log[:-1], log[-1] ^ 1])))
 
 
 def _leaves_one_out(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[5]
     log = own_log(step_record)
-    return put(records, step_record, says(logging([*log[:3], *log[4:]])))
+    return put_step(records, step_record, says(logging([*log[:3], *log[4:]])))
 
 
 def _tells_too_much(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[5]
-    return put(records, step_record, says(logging([*own_log(step_record), 2 * 17])))
+    return put_step(records, step_record, says(logging([*own_log(step_record), 2 * 17])))
 
 
 def _calls_far_frontier_none(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[5]
     far = dead_frontier(ROOMS.frame, ROOMS.frame.cell_of(14.5, 1.5))
     change = says(lambda gossip: having(logging([*own_log(step_record), far])(gossip), r1=1))
-    return put(records, step_record, change)
+    return put_step(records, step_record, change)
 
 
 def _calls_near_frontier_none(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[-1]
     near = dead_frontier(ROOMS.frame, ROOMS.frame.cell_of(2.5, 2.5))
     change = says(lambda gossip: having(logging([*own_log(step_record), near])(gossip), r1=1))
-    return put(records, step_record, change)
+    return put_step(records, step_record, change)
 
 
 def _starts_late(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[5]
-    return put(records, step_record, says(logging(own_log(step_record), start=10_000)))
+    return put_step(records, step_record, says(logging(own_log(step_record), start=10_000)))
 
 
 def _sends_rubbish(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[5]
-    return put(
+    return put_step(
         records, step_record, says(lambda gossip: msgspec.structs.replace(gossip, logs=b"\xff"))
     )
 
@@ -203,7 +185,7 @@ def _sends_weights(records: Records) -> list[Record]:
     """A suffix of entries with a value each, as on a density."""
     step_record = step_records(records, "r1")[5]
     valued = uints(0, 0, 1, 1) + uints(4, 1)
-    return put(
+    return put_step(
         records, step_record, says(lambda gossip: msgspec.structs.replace(gossip, logs=valued))
     )
 
@@ -218,7 +200,7 @@ def _hides_a_scan(records: Records) -> list[Record]:
         if gossip_of(before).version_vector[0:2] != gossip_of(step_record).version_vector[0:2]
     )
     version_vector = gossip_of(before).version_vector
-    return put(
+    return put_step(
         records,
         step_record,
         says(lambda gossip: msgspec.structs.replace(gossip, version_vector=version_vector)),
@@ -226,7 +208,9 @@ def _hides_a_scan(records: Records) -> list[Record]:
 
 
 def _forgets(records: Records) -> list[Record]:
-    return put(records, step_records(records, "r1")[-1], says(lambda gossip: having(gossip, r2=-1)))
+    return put_step(
+        records, step_records(records, "r1")[-1], says(lambda gossip: having(gossip, r2=-1))
+    )
 
 
 def _sees_what_is_not_there(records: Records) -> list[Record]:
@@ -258,17 +242,19 @@ def _redrawn(records: Records, x_m: float, y_m: float, old: int, new: int) -> li
 
 
 def _holds_more_than_there_is(records: Records) -> list[Record]:
-    return put(records, step_records(records, "r1")[-1], says(lambda gossip: having(gossip, r2=1)))
+    return put_step(
+        records, step_records(records, "r1")[-1], says(lambda gossip: having(gossip, r2=1))
+    )
 
 
 def _forwards_something_else(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[-1]
-    return put(records, step_record, says(logging([2 * 17], origin=1)))
+    return put_step(records, step_record, says(logging([2 * 17], origin=1)))
 
 
 def _forwards_too_much(records: Records) -> list[Record]:
     step_record = step_records(records, "r1")[-1]
-    return put(records, step_record, says(logging([2 * 17], origin=1, start=10_000)))
+    return put_step(records, step_record, says(logging([2 * 17], origin=1, start=10_000)))
 
 
 def _gives_up(records: Records) -> list[Record]:
@@ -279,7 +265,7 @@ def _gives_up(records: Records) -> list[Record]:
         rests = msgspec.structs.replace(step_record.outputs, state=State.FINISHED)
         return msgspec.structs.replace(step_record, outputs=rests)
 
-    return put(records, step_record, change)
+    return put_step(records, step_record, change)
 
 
 def _minds_walls(*overrides: str) -> Callable[[Records], list[Record]]:
@@ -366,7 +352,7 @@ def test_frontier_may_be_declared_dead_after_heading_for_it_in_vain() -> None:
     assert step_record.outputs.goal == steps[first].outputs.goal  # type: ignore[union-attr]
     cell = ROOMS.frame.cell_of(*step_record.outputs.goal)
     tells = logging([*own_log(step_record), dead_frontier(ROOMS.frame, cell)])
-    given_up = put(records, step_record, says(lambda gossip: having(tells(gossip), r1=1)))
+    given_up = put_step(records, step_record, says(lambda gossip: having(tells(gossip), r1=1)))
 
     def accused(records: Records) -> bool:
         return any("declares a frontier dead" in line for line in check(records).violations)
@@ -378,7 +364,7 @@ def test_frontier_may_be_declared_dead_after_heading_for_it_in_vain() -> None:
 def test_rules_of_every_run_hold_on_maps() -> None:
     """A jump is against the speed limit, whatever is explored."""
     records = explored(*ALONE)
-    jumps = put(records, step_records(records, "r1")[-1], goes(5.5, 10.5))
+    jumps = put_step(records, step_records(records, "r1")[-1], goes(5.5, 10.5))
 
     assert "speed" in rules(jumps)
 
