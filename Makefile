@@ -73,10 +73,8 @@ $(VENV)/.developing: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --group dev
 	@touch $@
 
-# Numba keeps a kernel until its own file changes; one that has another file's code inlined goes stale.
-$(VENV)/.kernels: $(shell find $(wildcard */kantor_*) -name "*.py") | $(VENV)/.installed
-	find $(wildcard */kantor_*) -name '*.nb[ic]' -delete
-	@echo "compiling kernels: minutes, once"
+# Two processes compile what this machine does not have; an edited kernel is compiled when it is called.
+$(VENV)/.kernels: | $(VENV)/.installed
 	$(BIN)/python -c 'from kantor_fleet.execution.preload import warm_up; warm_up()'
 	@touch $@
 

@@ -11,9 +11,8 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import pytest
-from numba import njit
-from numba.core.registry import CPUDispatcher
 
+from kantor_protocol.base.kernels import Kernel
 from kantor_protocol.replication.replica_kernels import ReplicaArrays
 from kantor_protocol.scenario.schema import Scenario
 
@@ -128,38 +127,25 @@ def replace_kernel(
 ) -> None:
     """Replace a kernel everywhere, also where it was inlined.
 
-    Numba inlines a kernel into those that call it and keeps the result on disk. So each of them, and each that
-    calls one of them, is compiled anew and is not kept.
+    A kernel is inlined into those that call it. So each of them, and each that calls one of them, is made anew.
     """
     modules = [each for key, each in sys.modules.items() if key.startswith("kantor_")]
     kernels = {
-        value
-        for each in modules
-        for value in vars(each).values()
-        if isinstance(value, CPUDispatcher)
+        value for each in modules for value in vars(each).values() if isinstance(value, Kernel)
     }
     original = getattr(module, name)
-    anew = {original: _compiled(mutated, original)}
+    anew = {original: Kernel(mutated, original.targetoptions)}
     while callers := [
         each for each in kernels - anew.keys() if not anew.keys().isdisjoint(_callees(each))
     ]:
-        anew |= {each: _compiled(each.py_func, each) for each in callers}
+        anew |= {each: Kernel(each.py_func, each.targetoptions) for each in callers}
     for each in modules:
         for key, value in list(vars(each).items()):
-            if isinstance(value, CPUDispatcher) and value in anew:
+            if isinstance(value, Kernel) and value in anew:
                 patch.setattr(each, key, anew[value])
 
 
-def _compiled(function: Callable[..., Any], like: CPUDispatcher) -> CPUDispatcher:
-    options = {
-        key: like.targetoptions[key]
-        for key in ("error_model", "fastmath", "_nrt")
-        if key in like.targetoptions
-    }
-    return njit(**options)(function)
-
-
-def _callees(kernel: CPUDispatcher) -> set[CPUDispatcher]:
+def _callees(kernel: Kernel) -> set[Kernel]:
     """The kernels that a kernel names, also by a module."""
     function = kernel.py_func
     names = function.__code__.co_names
@@ -170,4 +156,4 @@ def _callees(kernel: CPUDispatcher) -> set[CPUDispatcher]:
         if isinstance(value, ModuleType)
         for name in names
     ]
-    return {value for value in values if isinstance(value, CPUDispatcher)}
+    return {value for value in values if isinstance(value, Kernel)}

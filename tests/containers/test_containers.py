@@ -184,8 +184,8 @@ WARM = """
 import gc
 from kantor_fleet.execution.preload import warm_up
 warm_up()
-from numba.core.dispatcher import Dispatcher
-kernels = [o for o in gc.get_objects() if isinstance(o, Dispatcher) and o.py_func.__module__.startswith("kantor")]
+from kantor_protocol.base.kernels import Kernel
+kernels = [each for each in gc.get_objects() if isinstance(each, Kernel)]
 print(sum(sum(k.stats.cache_hits.values()) for k in kernels), sum(sum(k.stats.cache_misses.values()) for k in kernels))
 """
 
@@ -196,7 +196,7 @@ def test_nothing_is_compiled_in_a_container(image: str) -> None:
     told = call("docker", "run", "--rm", *safe, "--entrypoint", "python3", image, "-c", WARM)
     hits, misses = map(int, told.split())
 
-    assert hits > 50
+    assert hits > 20
     assert misses == 0
 
 

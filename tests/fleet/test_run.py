@@ -234,8 +234,8 @@ def test_ctrl_c_leaves_a_valid_partial_record(kantor: "Kantor") -> None:
 def test_ctrl_c_while_kernels_are_compiled_ends_the_command_at_once(kantor: "Kantor") -> None:
     """SIGINT to the whole group, as a terminal sends it: exit code 130 and no traceback."""
     cache = kantor.folder / "kernels"
-    process = kantor.start("run", "fleet", NUMBA_CACHE_DIR=str(cache))
-    wait_until(lambda: any(cache.rglob("*.nbi")))
+    process = kantor.start("run", "fleet", KANTOR_KERNELS=str(cache))
+    wait_until(lambda: any(cache.rglob("*.kernel")))
     started = psutil.Process(process.pid).children(recursive=True)
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=EVENT_LIMIT_S)

@@ -19,7 +19,7 @@ bad_s = 0.5
 kind = "partition"
 shape = "halves"
 from_s = 2.0
-until_s = 6.0
+until_s = 20.0
 
 [[faults]]
 kind = "delay"
@@ -39,7 +39,7 @@ age_s = 3.0
 [[faults]]
 kind = "clog"
 from_s = 7.0
-until_s = 15.0
+until_s = 30.0
 """
 WIDE = ("--set", "radio.range_m=inf", "energy.points=2000", "samples.count=1000")
 

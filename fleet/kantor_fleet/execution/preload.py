@@ -3,8 +3,13 @@
 It opens nothing: Zenoh must not be open in a process that forks.
 """
 
+import multiprocessing
+import sys
+from multiprocessing.process import BaseProcess
+
 import kantor_worldsim.exchange.main  # noqa: F401
 from kantor_fleet.execution.in_process_team import play
+from kantor_protocol.base import kernel_store
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import MAP_PLANNERS
 from kantor_worldsim.observers.recording import Recording
@@ -42,9 +47,31 @@ _VARIANTS = (
 
 
 def warm_up() -> None:
-    """Compile every kernel, or load it from the cache, by tiny missions."""
+    """Compile every kernel, or load it from the folder of kernels, by tiny missions.
+
+    The first time, another process compiles those for maps meanwhile; what both need, one of them compiles.
+    """
+    beside = _compile_beside() if kernel_store.is_empty() else None
     for overrides in _VARIANTS:
         _play(_TINY, [*overrides, "targets.diffusion_m=1"])
+    if beside is not None:
+        beside.join()
+    _play_on_maps()
+    kernel_store.prune()
+
+
+def _compile_beside() -> BaseProcess:
+    print(
+        "compiling kernels: once on this machine, for less than a minute",
+        file=sys.stderr,
+        flush=True,
+    )
+    process = multiprocessing.get_context("fork").Process(target=_play_on_maps, daemon=True)
+    process.start()
+    return process
+
+
+def _play_on_maps() -> None:
     for planner in sorted(MAP_PLANNERS):
         _play(_TINY_MAP, [f"planner='{planner}'"])
 

@@ -1,47 +1,74 @@
 """Compilation of kernels: for speed, to be called often, and kept on disk."""
 
-import contextlib
-from collections.abc import Callable
-from pathlib import Path
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cached_property
 from typing import Any
 
-from numba import njit
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
+from numba import config, types
+from numba.core.registry import CPUDispatcher
+
+from kantor_protocol.base.kernel_store import KernelStore
 
 
-class _InTree(InTreeCacheLocator):  # type: ignore[misc]
-    """Keeps the cache beside the source, also where nothing can be written but cached kernels exist, as in an image."""
+class Kernel(CPUDispatcher):  # type: ignore[misc]
+    """A compiled function that Python calls, and that kernels inline.
 
-    def ensure_cache_path(self) -> None:
-        """Accept an unwritable path with cached kernels; numba's own locator would compile anew elsewhere."""
-        try:
-            super().ensure_cache_path()
-        except OSError:
-            if not any(Path(self.get_cache_path()).glob("*.nbi")):
-                raise
+    For kernels it is compiled a second time, without the wrappers by which Python and C call a function: these take
+    as long to compile as the function itself, and most kernels are called by kernels alone.
+    """
+
+    def __init__(self, function: Callable[..., Any], targetoptions: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=targetoptions)
+        self._cache = KernelStore(self)
+
+    @cached_property
+    def inlined(self) -> "Kernel":
+        """This kernel as kernels call it."""
+        without_wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+        return Kernel(self.py_func, self.targetoptions | without_wrappers)
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """What numba asks for when it compiles a kernel that calls this one.
+
+        A literal is any number of its type; otherwise each constant in an argument would be a kernel of its own.
+        """
+        plain = tuple(map(types.unliteral, args))
+        named = {name: types.unliteral(kind) for name, kind in kws.items()}
+        return CPUDispatcher.get_call_template(self.inlined, plain, named)
+
+    def get_overload(self, sig: Any) -> Any:
+        """The compiled code that a kernel calls."""
+        return CPUDispatcher.get_overload(self.inlined, sig)
+
+    def compile(self, sig: Any) -> Any:
+        """Load or compile this kernel for a signature: in one process, while the others wait for it."""
+        if tuple(sig) in self.overloads:
+            return super().compile(sig)
+        with self._cache.one_compiles(sig), _garbage_kept():
+            return super().compile(sig)
 
 
-class _CacheFiles(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = tuple(
-        _InTree if locator is InTreeCacheLocator else locator
-        for locator in CompileResultCacheImpl._locator_classes  # noqa: SLF001
-    )
-
-
-class _Cache(FunctionCache):  # type: ignore[misc]
-    _impl_class = _CacheFiles
-
-    def save_overload(self, signature: Any, data: Any) -> None:
-        """Save a kernel; one that cannot be saved is compiled again the next time."""
-        with contextlib.suppress(OSError):
-            super().save_overload(signature, data)
+@contextmanager
+def _garbage_kept() -> Iterator[None]:
+    """Compilation makes millions of objects and hardly a cycle: looking for cycles takes a sixth of its time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     def compile_(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(error_model="numpy", _nrt=False, **options)(function)
-        dispatcher._cache = _Cache(function)  # noqa: SLF001  cache=True, and where it cannot be written as well
-        return dispatcher
+        if config.DISABLE_JIT:
+            return function
+        return Kernel(
+            function, {"nopython": True, "error_model": "numpy", "_nrt": False, **options}
+        )
 
     return compile_
 
