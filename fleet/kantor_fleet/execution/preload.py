@@ -9,7 +9,7 @@ from multiprocessing.process import BaseProcess
 
 import kantor_worldsim.exchange.main  # noqa: F401
 from kantor_fleet.execution.in_process_team import play
-from kantor_protocol.base import kernel_store
+from kantor_protocol.compilation import kernel_store
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import MAP_PLANNERS
 from kantor_worldsim.observers.recording import Recording

@@ -9,7 +9,7 @@ from typing import Any
 from numba import config, types
 from numba.core.registry import CPUDispatcher
 
-from kantor_protocol.base.kernel_store import KernelStore
+from kantor_protocol.compilation.kernel_store import KernelStore
 
 
 class Kernel(CPUDispatcher):  # type: ignore[misc]

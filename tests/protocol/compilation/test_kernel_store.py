@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from numba import typeof
 
-from kantor_protocol.base import kernel_store
 from kantor_protocol.base.counter_rng import uniform
-from kantor_protocol.base.kernel_store import content_of, kernel_folder, name_of_type
 from kantor_protocol.base.kernels import Kernel, kernel
+from kantor_protocol.compilation import kernel_store
+from kantor_protocol.compilation.kernel_store import content_of, kernel_folder, name_of_type
 from support.limits import EVENT_LIMIT_S
 
 PACKAGES = ("protocol", "agent", "supervisor", "worldsim", "fleet")
