@@ -161,7 +161,7 @@ MISSIONS = {
         16,
         LINKS,
         ("limit_s=90", "vehicle.name=unicycle"),
-        "ee4d04edc61aaa6a9604230e3fbd192152e3037b52ab4828328f386dbe66b9de",
+        "da0bb5d6e4afaf8fce53ca3c0e39152d9a9b209c5aa222813b195e5e73ad027f",
     ),
     "burgard-killed": (
         "office",

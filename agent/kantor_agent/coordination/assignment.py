@@ -161,7 +161,7 @@ class Assignment:
         fused_map, target = self._cost_map.fused_map, member.task.target
         if target == NOWHERE:
             return self._asked.get(member.robot) != fused_map.revision
-        if member.arrived or fused_map.dead_frontiers[target]:
+        if member.arrived or fused_map.is_abandoned(target):
             return True
         return self._on_events and not fused_map.is_frontier(target)
 

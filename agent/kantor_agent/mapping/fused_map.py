@@ -3,7 +3,10 @@
 Every origin (an incarnation of a robot) has a layer of its own, folded from its log alone
 (`occupancy_log.py`). The fused log odds of a cell are the sum over the layers, each counted as certain as
 evidence gets, and the sum is clamped once more. A cell is explored once any layer knows it, whatever its
-probability.
+probability. Where a robot has bumped there is a wall, whatever the layers say.
+
+A frontier that robots have given up as often as they have tried it again, or less, is a frontier. So a robot
+that has nothing else to do may try each once more, and those that do so at the same time do no harm.
 """
 
 import numpy as np
@@ -17,6 +20,9 @@ from kantor_protocol.replication.replica import Replica
 _P_OCC = 1.0 / (1.0 + np.exp(-np.array([-1.0, 0.0, 1.0]) * CERTAIN / 100.0))
 """Probability of occupancy where more layers say free, as many say either, or more say occupied."""
 
+LIVE, GIVEN_UP = 0, 1
+"""Frontiers that robots head for, and those that they have given up."""
+
 
 @kernel
 def _fold(
@@ -27,18 +33,29 @@ def _fold(
     votes: np.ndarray,
     cells: np.ndarray,
     dead_frontiers: np.ndarray,
+    given_up: np.ndarray,
+    bumps: np.ndarray,
     ranges: np.ndarray,
 ) -> bool:
     """Apply the entries log[first:length] of one origin; whether any is about a cell. cells: (n,) fused."""
     count = cells.shape[0]
+    beyond = 3 * count + ranges.shape[0]
     changed = False
     for i in range(first, length):
         entry = log[i, 0]
-        if entry >= 3 * count:
-            ranges[min(entry - 3 * count, ranges.shape[0] - 1)] += 1
+        if 3 * count <= entry < beyond:
+            ranges[entry - 3 * count] += 1
             continue
         changed = True
-        if entry >= 2 * count:
+        if entry >= beyond + 2 * count:
+            cell = entry - beyond - 2 * count
+            bumps[cell] = True
+            cells[cell] = OCCUPIED
+        elif entry >= beyond + count:
+            given_up[entry - beyond - count] -= 1
+        elif entry >= beyond:
+            given_up[entry - beyond] += 1
+        elif entry >= 2 * count:
             dead_frontiers[entry - 2 * count] = True
         elif entry >= 0:
             cell, kind = entry // 2, OCCUPIED if entry & 1 else FREE
@@ -46,19 +63,28 @@ def _fold(
                 0 if layer[cell] == UNKNOWN else 1 if layer[cell] == OCCUPIED else -1
             )
             layer[cell] = kind
-            cells[cell] = FREE if votes[cell] < 0 else OCCUPIED  # in doubt there is a wall
+            free = votes[cell] < 0 and not bumps[cell]
+            cells[cell] = FREE if free else OCCUPIED  # in doubt there is a wall
     return changed
 
 
 @kernel
 def _find_frontiers(
-    cells: np.ndarray, dead_frontiers: np.ndarray, columns: int, out: np.ndarray
+    cells: np.ndarray,
+    dead_frontiers: np.ndarray,
+    given_up: np.ndarray,
+    columns: int,
+    wanted: int,
+    out: np.ndarray,
 ) -> int:
-    """Write the frontiers into out (cells,), rising; returns how many there are."""
+    """Write frontiers into out (cells,), rising; returns how many there are.
+
+    wanted: GIVEN_UP for those that are given up, LIVE for the others.
+    """
     count = 0
     total = cells.shape[0]
     for cell in range(total):
-        if cells[cell] != FREE or dead_frontiers[cell]:
+        if cells[cell] != FREE or dead_frontiers[cell] or (given_up[cell] > 0) != wanted:
             continue
         column = cell % columns
         if (
@@ -82,12 +108,16 @@ class FusedMap:
         """origins: incarnations that may have a layer; `fold` adds layers when there are more."""
         self.frame = frame
         self.cells = np.zeros(frame.cells, dtype=np.uint8)
-        """(cells,) UNKNOWN where no layer knows the cell, FREE where more layers say free than occupied,
-        OCCUPIED elsewhere."""
+        """(cells,) OCCUPIED where a robot has bumped; elsewhere UNKNOWN where no layer knows the cell, FREE
+        where more layers say free than occupied, OCCUPIED otherwise."""
         self.ranges = np.zeros(RANGE_BINS, dtype=np.int64)
         """(bins,) measured ranges from 0 to the sensor's range, as the folded entries of all logs count them."""
         self.dead_frontiers = np.zeros(frame.cells, dtype=np.bool_)
         """(cells,) cells that a folded entry of any log calls a dead frontier."""
+        self._given_up = np.zeros(frame.cells, dtype=np.int32)
+        """(cells,) how often folded entries give a frontier up, less how often they try it again."""
+        self.bumps = np.zeros(frame.cells, dtype=np.bool_)
+        """(cells,) cells in which a folded entry tells of a wall that a robot has met."""
         self.revision = 0
         """Rises with every fold that reads an entry about a cell."""
         self._layers = np.zeros((origins, frame.cells), dtype=np.uint8)
@@ -99,13 +129,15 @@ class FusedMap:
         self._found = np.zeros(frame.cells, dtype=np.int64)
         """(cells,) output of `_find_frontiers`."""
         self._frontiers = self._found[:0]
-        """The frontiers of `cells` and `dead_frontiers` while `_frontiers_of` is `revision`, else out of date."""
+        """The frontiers, by the arrays above, while `_frontiers_of` is `revision`, else out of date."""
         self._frontiers_of = -1
 
     def validate(self, replica: Replica) -> None:
         """Assert what the attributes say of one another and of the logs. replica: the one that was folded."""
         shape, cells = (self.frame.rows, self.frame.columns), self.frame.cells
         dead_frontiers, ranges = np.zeros_like(self.dead_frontiers), np.zeros_like(self.ranges)
+        beyond = 3 * cells + RANGE_BINS
+        tallies = np.zeros((3, cells), dtype=np.int64)
         for origin, length in enumerate(self._folded.tolist()):
             assert length <= replica.store.length[origin]
             entries = replica.store.logs[origin, :length, 0].astype(np.int64)
@@ -116,19 +148,26 @@ class FusedMap:
             dead_frontiers[entries[(entries >= 2 * cells) & (entries < 3 * cells)] - 2 * cells] = (
                 True
             )
-            bins = np.minimum(entries[entries >= 3 * cells] - 3 * cells, RANGE_BINS - 1)
+            bins = entries[(entries >= 3 * cells) & (entries < beyond)] - 3 * cells
             ranges += np.bincount(bins, minlength=RANGE_BINS)
+            others = entries[entries >= beyond] - beyond
+            tallies += np.bincount(others, minlength=3 * cells).reshape(3, cells)
+        given_up, tried_again, bumps = tallies
+        assert np.array_equal(self._given_up, given_up - tried_again)
+        assert np.array_equal(self.bumps, bumps > 0)
         assert np.array_equal(self.dead_frontiers, dead_frontiers)
         assert np.array_equal(self.ranges, ranges)
         votes = (self._layers == OCCUPIED).sum(axis=0) - (self._layers == FREE).sum(axis=0)
         assert np.array_equal(self._votes, votes)
         fused = np.where(votes < 0, FREE, OCCUPIED)
         fused[(self._layers == UNKNOWN).all(axis=0)] = UNKNOWN
+        fused[self.bumps] = OCCUPIED
         assert np.array_equal(self.cells, fused)
         if self._frontiers_of == self.revision:
             unknown = np.pad((fused == UNKNOWN).reshape(shape), 1)
             beside = unknown[1:-1, :-2] | unknown[1:-1, 2:] | unknown[:-2, 1:-1] | unknown[2:, 1:-1]
-            found = np.flatnonzero((fused == FREE) & beside.ravel() & ~dead_frontiers)
+            given_up_now = dead_frontiers | (self._given_up > 0)
+            found = np.flatnonzero((fused == FREE) & beside.ravel() & ~given_up_now)
             assert np.array_equal(self._frontiers, found)
 
     def fold(self, replica: Replica) -> bool:
@@ -146,6 +185,8 @@ class FusedMap:
                 self._votes,
                 self.cells,
                 self.dead_frontiers,
+                self._given_up,
+                self.bumps,
                 self.ranges,
             )
             self._folded[origin] = lengths[origin]
@@ -162,14 +203,27 @@ class FusedMap:
 
     @property
     def frontiers(self) -> npt.NDArray[np.int64]:
-        """Known free cells with an unknown 4-neighbour that are not dead, rising; do not change the array."""
+        """Known free cells with an unknown 4-neighbour that are neither dead nor given up, rising.
+
+        Do not change the array.
+        """
         if self._frontiers_of != self.revision:
-            count = _find_frontiers(
-                self.cells, self.dead_frontiers, self.frame.columns, self._found
-            )
-            self._frontiers = self._found[:count].copy()
+            self._frontiers = self._find(LIVE)
             self._frontiers_of = self.revision
         return self._frontiers
+
+    def given_up_frontiers(self) -> npt.NDArray[np.int64]:
+        """Frontiers that are given up and not dead, rising."""
+        return self._find(GIVEN_UP)
+
+    def _find(self, wanted: int) -> npt.NDArray[np.int64]:
+        masks = (self.cells, self.dead_frontiers, self._given_up)
+        count = _find_frontiers(*masks, self.frame.columns, wanted, self._found)
+        return self._found[:count].copy()
+
+    def is_abandoned(self, cell: int) -> bool:
+        """Whether a cell is a dead frontier, or one that is given up."""
+        return bool(self.dead_frontiers[cell] or self._given_up[cell] > 0)
 
     def is_frontier(self, cell: int) -> bool:
         """Whether a cell is among the frontiers."""
@@ -179,7 +233,7 @@ class FusedMap:
 
     def p_occ(self) -> npt.NDArray[np.float64]:
         """(cells,) probability of occupancy, 0.5 where nothing is known."""
-        return np.asarray(_P_OCC[np.sign(self._votes) + 1])
+        return np.asarray(np.where(self.bumps, _P_OCC[2], _P_OCC[np.sign(self._votes) + 1]))
 
     def explored(self) -> npt.NDArray[np.bool_]:
         """(cells,) whether any layer knows the cell."""

@@ -21,6 +21,7 @@ from kantor_agent.coordination.assignment import (
 from kantor_agent.mapping.cost_map import CostMap
 from kantor_agent.mapping.fused_map import FusedMap
 from kantor_agent.mapping.navigation import Navigator
+from kantor_agent.mapping.pursuit import Pursuit, wall_met
 from kantor_agent.planners.map_base import Task, TeamMember
 from kantor_agent.vehicles import VEHICLES, StepTimer
 from kantor_protocol.base.grid import NOWHERE, Frame
@@ -34,13 +35,22 @@ from kantor_protocol.base.machine import (
     State,
 )
 from kantor_protocol.replication.gossip import Gossip, build_replica
-from kantor_protocol.replication.occupancy_log import OccupancyLog, dead_frontier, entries
+from kantor_protocol.replication.occupancy_log import (
+    OccupancyLog,
+    bump,
+    dead_frontier,
+    entries,
+    given_up_frontier,
+    retried_frontier,
+)
 from kantor_protocol.scenario.schema import Scenario
 
-_REST_STEPS = 3
+_REST_STEPS, _NOISY_REST_STEPS = 3, 30
 """Steps in a row without a frontier that can be reached, after which a robot rests."""
-_PROGRESS_CELLS = 0.25
-"""A robot makes progress when its way gets shorter by as much."""
+_NOISY_LOOKS = 10
+"""Scans at a target after which a robot that sees badly has looked around; one that sees well needs one."""
+_SHARP_CELLS = 1 / 6
+"""The noise up to which a robot sees well: three times as much is half a cell, which scans allow for."""
 
 
 class MappingRobot:
@@ -71,11 +81,15 @@ class MappingRobot:
         self._supervisor = scenario.robots.count if scenario.centralized else None
         self._period_ns = scenario.period_ns
         self._contact_limits = ContactLimits.of(scenario, scenario.period_ns)
-        self._stuck_limit_steps = scenario.planner.patience
         self._timer = StepTimer(scenario.period_ns, body)
         self._now_ns = 0
         self._step, self._pose = body.step, body.pose
-        self._explores_until = body.step + _REST_STEPS
+        sharp = scenario.sensor.noise_m <= _SHARP_CELLS * frame.resolution_m
+        self._rest_steps = _REST_STEPS if sharp else _NOISY_REST_STEPS
+        self._looks_needed = 1 if sharp else _NOISY_LOOKS
+        self._looks = 0
+        """Scans in a row that were made at the target."""
+        self._explores_until = body.step + self._rest_steps
         """A new incarnation knows nothing yet and does not rest before this step."""
         self._scanned_step = -1
         self._scanned_pose: Pose | None = None
@@ -84,8 +98,12 @@ class MappingRobot:
 
         After a step the own register says the same. The task of a robot that rests has no target.
         """
-        self._progress_step, self._left_cells = body.step, math.inf
-        """The last step with progress towards the target, and the length of the way that was left then."""
+        self._departed = body.pose
+        """The pose that world-sim accepted last, from which the last step drove off to `_pose`."""
+        self._pursuit = Pursuit(scenario.planner.patience)
+        """Of the target of `_task`."""
+        self._tried_again: set[int] = set()
+        """Frontiers that were given up and that this robot has tried again; each once."""
         self._idle_steps = 0
         """Steps in a row in which no frontier could be reached."""
         self._resting = False
@@ -124,19 +142,35 @@ class MappingRobot:
 
     def _locate(self, observation: Observation) -> None:
         """Take the pose that world-sim accepted. A late observation, of an older step, changes nothing."""
-        if observation.step == self._step:
-            self._pose = observation.pose
+        if observation.step != self._step:
+            return
+        start, stop = self._departed, observation.pose
+        moved_m = math.hypot(stop.x_m - start.x_m, stop.y_m - start.y_m)
+        turned_rad = stop.heading_rad - start.heading_rad
+        cells = moved_m / self._frame.resolution_m
+        self._pursuit.drive(cells, turned_rad, bumped=observation.bumped)
+        if observation.bumped:
+            self._tell_of_wall(stop)
+        self._pose = self._departed = stop
+
+    def _tell_of_wall(self, stop: Pose) -> None:
+        """Log the wall that has stopped the last move."""
+        wall = wall_met(self._frame, self._departed, self._pose, stop)
+        if wall != NOWHERE and not self._fused_map.bumps[wall]:
+            self._replica.append(np.array([bump(self._frame, wall)]))
 
     # Deciding.
 
     def _give_up(self) -> None:
-        """Log a dead frontier: a target that showed nothing new, or towards which there is no progress."""
+        """Log a target that showed nothing new as a dead frontier; give one up to which the robot does not get."""
         target = self._task.target
-        in_vain = self._arrived and self._fused_map.is_frontier(target)
-        stuck = not self._arrived and self._step - self._progress_step > self._stuck_limit_steps
-        if target != NOWHERE and not self._fused_map.dead_frontiers[target] and (in_vain or stuck):
+        if target == NOWHERE or self._fused_map.is_abandoned(target):
+            return
+        if self._arrived and self._fused_map.is_frontier(target):
             self._replica.append(np.array([dead_frontier(self._frame, target)]))
-            self._progress_step = self._step
+        elif not self._arrived and self._pursuit.is_vain:
+            self._replica.append(np.array([given_up_frontier(self._frame, target)]))
+            self._pursuit.begin()
 
     def _decide(self) -> None:
         """Take a new task, from the supervisor if it is in contact; rest when no frontier can be reached."""
@@ -150,7 +184,20 @@ class MappingRobot:
         elif registers.stamps[registers.me] > 0:
             self._assign()
         self._idle_steps = 0 if self._may_go_on() else self._idle_steps + 1
-        self._resting = self._idle_steps >= _REST_STEPS
+        if self._idle_steps >= self._rest_steps and self._try_again():
+            self._idle_steps = 0
+        self._resting = self._idle_steps >= self._rest_steps
+
+    def _try_again(self) -> bool:
+        """Try the frontiers that were given up and to which there is a way now; whether there are any."""
+        frontiers = self._fused_map.given_up_frontiers()
+        cell = self._frame.cell_of(self._pose.x_m, self._pose.y_m)
+        reachable = frontiers[np.isfinite(self._cost_map.travel(cell)[frontiers])]
+        again = [each for each in reachable.tolist() if each not in self._tried_again]
+        self._tried_again.update(again)
+        if again:
+            self._replica.append(np.array([retried_frontier(self._frame, each) for each in again]))
+        return bool(again)
 
     def _follow(self, target: int) -> None:
         """Take the target that the supervisor has assigned."""
@@ -169,8 +216,8 @@ class MappingRobot:
 
     def _adopt(self, task: Task) -> None:
         if task.target != self._task.target:
-            self._arrived = False
-            self._progress_step, self._left_cells = self._step, math.inf
+            self._arrived, self._looks = False, 0
+            self._pursuit.begin()
         self._task, self._since = task, self._tick
 
     def _may_go_on(self) -> bool:
@@ -196,7 +243,9 @@ class MappingRobot:
             self._replica.append(
                 self._occupancy.observe(observation.scan, observation.pose, moved=moved)
             )
-        self._arrived = self._task.target != NOWHERE and self._is_at(self._task.target)
+        at_target = self._task.target != NOWHERE and self._is_at(self._task.target)
+        self._looks = self._looks + 1 if at_target else 0
+        self._arrived = self._looks >= self._looks_needed
 
     def _is_at(self, cell: int) -> bool:
         """Whether the robot is in the cell itself: from beside it, what lies behind it may be hidden."""
@@ -207,13 +256,13 @@ class MappingRobot:
             return
         place = self._navigator.head(self._pose, self._task.target)
         if place is None:
+            self._pursuit.miss()
             return
-        if self._navigator.left_cells < self._left_cells - _PROGRESS_CELLS:
-            self._progress_step, self._left_cells = self._step, self._navigator.left_cells
+        self._pursuit.follow(self._navigator.left_cells)
         self._pose = self._vehicle.drive(self._pose, *place, dt_s)
 
     def _gives_way(self) -> bool:
-        """Whether a robot of a lower place, on the way to the same target, is too close: it goes first.
+        """Whether a robot in contact of a lower place, on the way to the same target, is too close: it goes first.
 
         Bodies do not merge. Points would, at the next bend, and would then move as one for ever.
         """
@@ -224,6 +273,7 @@ class MappingRobot:
         here = int(values[registers.me, CELL]) - 1
         return any(
             values[origin, TARGET] == self._task.target + 1
+            and registers.age_steps(origin) <= self._contact_limits.contact_timeout_steps
             and self._cost_map.cells_between(int(values[origin, CELL]) - 1, here)
             <= self._clearance_cells
             for origin in map(registers.newest, range(self._me))

@@ -130,5 +130,9 @@ def _of_map(result: Result, map_: MapResult) -> list[str]:
     )
     even = f"WTV {map_.wtv_mean.r8:.4g} (final {map_.wtv_final.r8:.4g}), EPV {map_.epv_mean.r8:.4g}"
     found = [_detected(result)] if result.targets else []
+    unseen = (
+        f"{map_.unseen} free cells that robots could reach; "
+        f"{_counted(map_.frontiers_left, 'cell')} from which they could go on"
+    )
     lines = [f"  explored  {explored}", f"  distance  {distance}", f"  8 regions {even}"]
-    return [*lines, *found]
+    return [*lines, *([f"  unseen    {unseen}"] if map_.unseen else []), *found]

@@ -9,6 +9,10 @@ Entries of a log, for a map of n cells
     2 cell          the cell is free        2 cell + 1     the cell is occupied
     2 n + cell      a dead frontier: the robot stood at it and saw nothing new
     3 n + bin       one measured range, of RANGE_BINS bins from 0 to the sensor's range
+With m = 3 n + RANGE_BINS:
+    m + cell        a frontier given up: the robot could not get there
+    m + n + cell    a frontier tried again that any robot has given up
+    m + 2 n + cell  a bump: the robot was stopped by a wall in the cell, whatever scans say of it
 Beams that met nothing count in the last bin. A few beams of each scan are enough to learn by.
 """
 
@@ -41,12 +45,27 @@ several cells to choose from."""
 
 def entries(frame: Frame) -> int:
     """The number of different entries; every entry of a log is below it."""
-    return 3 * frame.cells + RANGE_BINS
+    return 6 * frame.cells + RANGE_BINS
 
 
 def dead_frontier(frame: Frame, cell: int) -> int:
     """The entry that declares a frontier dead."""
     return 2 * frame.cells + cell
+
+
+def given_up_frontier(frame: Frame, cell: int) -> int:
+    """The entry that gives a frontier up."""
+    return 3 * frame.cells + RANGE_BINS + cell
+
+
+def retried_frontier(frame: Frame, cell: int) -> int:
+    """The entry by which a frontier that was given up is tried again."""
+    return 4 * frame.cells + RANGE_BINS + cell
+
+
+def bump(frame: Frame, cell: int) -> int:
+    """The entry that tells of a wall into which the robot has driven."""
+    return 5 * frame.cells + RANGE_BINS + cell
 
 
 @kernel

@@ -222,7 +222,8 @@ class PlannerOptions(ScenarioTable, frozen=True, kw_only=True):
     remember_s: Seconds = 60.0
     """map, decentralized: how long the target of a robot counts as assigned when no message of it is received."""
     patience: Annotated[int, Meta(ge=1)] = 60
-    """map: steps without progress after which a target counts as inaccessible."""
+    """map: cells that a robot drives beyond its way, or steps at a wall or without a way, after which it gives a
+    target up that it gets no nearer to."""
     coordinated: bool = True
     """burgard: false lets each robot take the frontier that is cheapest for it."""
     beta: NotNegative = 1.0

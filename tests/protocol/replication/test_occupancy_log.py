@@ -18,8 +18,11 @@ from kantor_protocol.replication.occupancy_log import (
     RANGE_BINS,
     OccupancyLog,
     beam_rad,
+    bump,
     dead_frontier,
     entries,
+    given_up_frontier,
+    retried_frontier,
 )
 from kantor_protocol.scenario.schema import SensorOptions
 from kantor_worldsim.world.maps import Ground
@@ -246,7 +249,14 @@ def test_ranges_are_reported_after_a_move_only() -> None:
     assert evidence.observe(near, Pose(0.5, 0.5), moved=True)[-4:].tolist() == 4 * [first + 11]
     assert evidence.observe(near, Pose(0.5, 0.5), moved=False).tolist() == []
     assert (evidence.observe(none, Pose(0.5, 0.5), moved=True)[-4:] == first + base - 1).all()
-    assert dead_frontier(ground.frame, 2) < first < entries(ground.frame) == first + base
+    kinds = (dead_frontier, given_up_frontier, retried_frontier, bump)
+    dead, given_up, retried, wall = (
+        [kind(ground.frame, cell) for cell in range(ground.frame.cells)] for kind in kinds
+    )
+    ranges = list(range(first, first + base))
+    assert [*dead, *ranges, *given_up, *retried, *wall] == list(
+        range(2 * ground.frame.cells, entries(ground.frame))
+    )
 
 
 @pytest.mark.parametrize("scan", [b"", b"\0", 719 * b"\0", 722 * b"\0"])

@@ -16,6 +16,7 @@ from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Domain, Scenario
 from kantor_protocol.wire.weights import Units
 from kantor_worldsim.world.density import samples_of, starts_of, targets_of
+from kantor_worldsim.world.feasibility import doubts_of_density, doubts_of_map
 from kantor_worldsim.world.maps import Ground
 from kantor_worldsim.world.sensors import RangeFinder, sense_targets, sense_targets_in_sight
 
@@ -42,20 +43,21 @@ class WorldSetup(NamedTuple):
     ground: Ground | None = None
     """The true map, if the robots explore one. There are no samples then."""
     warnings: tuple[str, ...] = ()
-    """Doubts about the map's file, one line each."""
+    """Doubts about the map's file and about the scenario, one line each."""
 
     @classmethod
     def of(cls, scenario: Scenario, seed: int) -> "WorldSetup":
         """Draw and read everything that a scenario starts from. Raises ScenarioError for an unusable file."""
         if scenario.mapping:
             return cls._of_map(scenario, seed)
-        return cls(
-            samples_of(scenario, seed), targets_of(scenario, seed), starts_of(scenario, seed)
-        )
+        samples_m = samples_of(scenario, seed)
+        doubts = doubts_of_density(scenario, samples_m)
+        targets_m, starts_m = targets_of(scenario, seed), starts_of(scenario, seed)
+        return cls(samples_m, targets_m, starts_m, warnings=tuple(doubts))
 
     @classmethod
     def _of_map(cls, scenario: Scenario, seed: int) -> "WorldSetup":
-        from kantor_worldsim.world.starts import starts_on  # noqa: PLC0415  only where there is a map
+        from kantor_worldsim.world.starts import observable, starts_on  # noqa: PLC0415  only where there is a map
 
         ground, warnings = ground_of(scenario)
         starts = scenario.starts
@@ -71,7 +73,8 @@ class WorldSetup(NamedTuple):
         left_m, right_m, bottom_m, top_m = ground.frame.extent_m
         over_map = Domain(min_m=(left_m, bottom_m), max_m=(right_m, top_m))
         targets_m = targets_of(msgspec.structs.replace(scenario, domain=over_map), seed)
-        return cls(np.zeros((0, 2)), targets_m, starts_m, ground, tuple(warnings))
+        doubts = doubts_of_map(scenario, ground, observable(ground, starts_m))
+        return cls(np.zeros((0, 2)), targets_m, starts_m, ground, (*warnings, *doubts))
 
     def poses(self, scenario: Scenario) -> dict[ParticipantId, Pose]:
         """Pose of every participant at time 0."""

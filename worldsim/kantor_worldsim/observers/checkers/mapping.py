@@ -13,6 +13,7 @@ from kantor_worldsim.observers.checkers.sight import Sight
 from kantor_worldsim.observers.checkers.state import DROPPED
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
 from kantor_worldsim.observers.metrics.map_tracker_kernels import (
+    FALSE_BUMP,
     FALSE_CELL,
     FAR_FRONTIER,
     FOREIGN,
@@ -20,6 +21,7 @@ from kantor_worldsim.observers.metrics.map_tracker_kernels import (
     GAP,
     MORE,
     NEVER,
+    NOT_GIVEN_UP,
     NOT_ITS_SCANS,
     SHORT,
     UNREADABLE,
@@ -39,6 +41,8 @@ _TEXTS = {
     FORGETS: ("map", "holds {a} entries of a log of which it held {b}"),
     FOREIGN: ("union", "forwards an entry at {b} of {origin}'s log that {origin} never sent"),
     MORE: ("union", "holds {a} entries of a log that has {b}"),
+    FALSE_BUMP: ("truth", "tells in its log at {b} of a wall where there is none"),
+    NOT_GIVEN_UP: ("map", "tries a frontier again that nobody has given up, in its log at {b}"),
     FALSE_CELL: ("truth", "sees cell {a} as {kind}, which it is not"),
 }
 """Rule and text of each violation."""
@@ -51,8 +55,10 @@ class MapChecker:
     -----
     wall        no robot is accepted in a cell that is not free, nor on a straight way through one
     map         what a robot sends of its log is what its scans say, entry for entry, but for frontiers that
-                it declares dead where it stood; a version vector never falls, so that no cell is forgotten
-    truth       no scan calls a cell free or occupied that is not (without noise)
+                it declares dead where it stood, gives up after a pursuit or tries again, and for bumps; a
+                version vector never falls, so that no cell is forgotten
+    truth       no scan calls a cell free or occupied that is not (without noise), and no robot bumps where
+                there is no wall
     union       what is forwarded of a log is what its robot sent, and no participant holds more of it than
                 that; so that what robots hold by their version vectors is the union of these prefixes
     sight       nothing is delivered through walls that block the radio

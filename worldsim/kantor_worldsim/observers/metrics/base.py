@@ -224,6 +224,10 @@ class RunMetrics:
         """The fields `w_ub` and `mass_left` of a Snapshot, and others that it may have, by the last row."""
         raise NotImplementedError
 
+    def _ended(self) -> str:
+        """How the mission ended."""
+        return self._ending.reason
+
     def _measured(self) -> dict[str, Any]:
         """The fields of a Result beside the counts."""
         raise NotImplementedError
@@ -290,7 +294,7 @@ class RunMetrics:
             + counts[REFUSED_BEFORE]
             + refused_at_door,
             absences=self._absences,
-            ended=self._ending.reason,
+            ended=self._ended(),
             record=record,
             violations=counts[VIOLATIONS] + len(complaints),
             complaints=complaints[:10],

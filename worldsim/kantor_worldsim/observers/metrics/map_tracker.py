@@ -13,7 +13,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.grid import NOWHERE
+from kantor_protocol.base.grid import FREE, NOWHERE
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX
 from kantor_protocol.base.machine import Observation, ParticipantId, Pose
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
@@ -21,12 +21,12 @@ from kantor_protocol.wire.messages import RefusedError
 from kantor_worldsim.observers.metrics.map_tracker_kernels import (
     AS_SENT,
     DEAD,
-    DEAD_ENTRIES,
     DEAD_FRONTIER_CELLS,
     FRONTIERS,
     HELD_CELLS,
     LOG_BYTES,
     NEVER,
+    NOT_SCANNED,
     NOTED,
     OWN,
     OWN_CELLS,
@@ -129,6 +129,17 @@ class MapTracker:
         return self.state.totals.item(SEEN)
 
     @property
+    def unseen(self) -> int:
+        """Free cells that robots could reach and that none has seen."""
+        free = self._ground.counting & (self._ground.truth.ravel() == FREE)
+        return int((free & (self.state.first_tick == NEVER)).sum())
+
+    @property
+    def frontiers(self) -> int:
+        """Free cells that robots have seen and could reach, with a neighbour that none has seen."""
+        return self.state.totals.item(FRONTIERS)
+
+    @property
     def stamps(self) -> npt.NDArray[np.int32]:
         """(seen,) the ticks at which the cells that count were first seen."""
         ticks = self.state.first_tick[self._ground.counting]
@@ -171,7 +182,7 @@ class MapTracker:
             return NEVER
         held = state.held[place]
         own = state.incarnation_ids[place]
-        known = state.written[own, SCANNED] + state.written[own, DEAD_ENTRIES]
+        known = state.written[own, SCANNED] + state.written[own, NOT_SCANNED]
         unsent = state.version_vector[place, own] > known
         while True:
             cell = int(find_way(held, start, self.frame.columns, self._queue))

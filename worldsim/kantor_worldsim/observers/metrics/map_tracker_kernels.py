@@ -5,9 +5,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.grid import FREE
+from kantor_protocol.base.grid import FREE, OCCUPIED
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.varint import read_int, read_uint
+from kantor_protocol.replication.occupancy_log import RANGE_BINS
 from kantor_worldsim.observers.metrics.gossip_reader import count_incarnations, is_log
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch
@@ -15,12 +16,13 @@ from kantor_worldsim.record.columnar import ColumnarBatch
 NEVER = -1
 
 
-KIND, DEAD, OWN = 3, 4, 8
-"""Bits of MapTrackerState.held: kind of a cell, dead frontier, seen by the robot itself."""
+KIND, DEAD, OWN, BUMP = 3, 4, 8, 32
+"""Bits of MapTrackerState.held: kind of a cell, a frontier that is dead or was given up, seen by the robot
+itself, a wall that a robot has met."""
 
 
 # Columns of MapTrackerState.written and .counts, and incarnation_ids of .totals.
-SCANNED, AS_SENT, MATCHED, DEAD_ENTRIES = 0, 1, 2, 3
+SCANNED, AS_SENT, MATCHED, NOT_SCANNED = 0, 1, 2, 3
 
 
 OWN_CELLS, HELD_CELLS, STOOD = 0, 1, 2
@@ -33,10 +35,14 @@ SEEN, FRONTIERS, LOG_BYTES, NOTED = 0, 1, 2, 3
 UNREADABLE, NOT_ITS_SCANS, FAR_FRONTIER, GAP, SHORT, FORGETS = 0, 1, 2, 3, 4, 5
 
 
-FOREIGN, MORE, FALSE_CELL = 6, 7, 8
+FOREIGN, MORE, FALSE_CELL, FALSE_BUMP, NOT_GIVEN_UP = 6, 7, 8, 9, 10
 
 
 VIOLATIONS_MAX = 100
+
+
+OF_CELL, OF_DEAD, OF_RANGE, OF_GIVEN_UP, OF_RETRIED, OF_BUMP = 0, 1, 2, 3, 4, 5
+"""What an entry of a log is about."""
 
 
 DEAD_FRONTIER_CELLS = 2
@@ -58,13 +64,13 @@ class MapTrackerState(NamedTuple):
     scanned: npt.NDArray[np.int32]
     """(ids, rows) the entries that each robot's scans gave."""
     as_sent: npt.NDArray[np.int32]
-    """(ids, rows) its log as it sends it: the same, and dead frontiers."""
+    """(ids, rows) its log as it sends it: the same, and what it says of frontiers and bumps."""
     version_vector: npt.NDArray[np.int64]
     """(p, ids) the version vector that each has sent last."""
     folded: npt.NDArray[np.int64]
     """(n, ids) entries of others' logs that are in `held`."""
     written: npt.NDArray[np.int64]
-    """(ids, 4) entries scanned and sent; of those sent, such that were scanned, and dead frontiers."""
+    """(ids, 4) entries scanned and sent; of those sent, such that were scanned, and others."""
     incarnation_ids: npt.NDArray[np.int64]
     """(p,) the id of each one's newest incarnation."""
     counts: npt.NDArray[np.int64]
@@ -145,18 +151,35 @@ def _stamp(state: MapTrackerState, ground: GroundTruth, cell: int, tick: int) ->
 
 
 @kernel
+def part_of(entry: int, cells: int) -> tuple[int, int]:
+    """What an entry of a log is about, and the cell; cells: of the map. See `occupancy_log`."""
+    if entry < 2 * cells:
+        return OF_CELL, entry >> 1
+    if entry < 3 * cells:
+        return OF_DEAD, entry - 2 * cells
+    if entry < 3 * cells + RANGE_BINS:
+        return OF_RANGE, NEVER
+    beyond = entry - 3 * cells - RANGE_BINS
+    if beyond < cells:
+        return OF_GIVEN_UP, beyond
+    if beyond < 2 * cells:
+        return OF_RETRIED, beyond - cells
+    return OF_BUMP, beyond - 2 * cells
+
+
+@kernel
 def _hold(state: MapTrackerState, ground: GroundTruth, who: int, entry: int) -> None:
     """A robot takes in an entry, its own or another's."""
     cells = state.first_tick.shape[0]
     held = state.held[who]
-    if entry >= 3 * cells:
-        return
-    if entry >= 2 * cells:
-        held[entry - 2 * cells] |= DEAD
-        return
-    cell = entry >> 1
-    state.counts[who, HELD_CELLS] += held[cell] & KIND == 0 and ground.counting[cell]
-    held[cell] = (held[cell] & (DEAD | OWN)) | (FREE + (entry & 1))
+    about, cell = part_of(entry, cells)
+    if about in (OF_DEAD, OF_GIVEN_UP):
+        held[cell] |= DEAD
+    elif about in (OF_CELL, OF_BUMP):
+        state.counts[who, HELD_CELLS] += held[cell] & KIND == 0 and ground.counting[cell]
+        wall = about == OF_BUMP or held[cell] & BUMP != 0
+        kind = OCCUPIED if wall else FREE + (entry & 1)
+        held[cell] = (held[cell] & (DEAD | OWN)) | (BUMP if wall else 0) | kind
 
 
 @kernel
@@ -228,14 +251,29 @@ def _is_near(state: MapTrackerState, who: int, cell: int, columns: int) -> bool:
 
 
 @kernel
+def _is_given_up(state: MapTrackerState, cell: int) -> bool:
+    """Whether any robot has said that it gives a frontier up."""
+    found = False
+    for robot in range(state.held.shape[0]):
+        found = found or state.held[robot, cell] & DEAD != 0
+    return found
+
+
+@kernel
 def _append(state: MapTrackerState, ground: GroundTruth, who: int, entry: int) -> int:
     """A robot sends the next entry of its log: the kind of a violation, or NEVER."""
     cells, own = state.first_tick.shape[0], state.incarnation_ids[who]
     written = state.written[own]
-    if 2 * cells <= entry < 3 * cells:
-        if not _is_near(state, who, entry - 2 * cells, ground.truth.shape[1]):
+    about, cell = part_of(entry, cells)
+    if about not in (OF_CELL, OF_RANGE):
+        columns = ground.truth.shape[1]
+        if about == OF_BUMP and ground.truth[cell // columns, cell % columns] == FREE:
+            return FALSE_BUMP
+        if about == OF_RETRIED and not _is_given_up(state, cell):
+            return NOT_GIVEN_UP
+        if about in (OF_DEAD, OF_GIVEN_UP) and not _is_near(state, who, cell, columns):
             return FAR_FRONTIER
-        written[DEAD_ENTRIES] += 1
+        written[NOT_SCANNED] += 1
         _hold(state, ground, who, entry)
     elif written[MATCHED] < written[SCANNED] and state.scanned[own, written[MATCHED]] == entry:
         written[MATCHED] += 1
@@ -284,7 +322,7 @@ def _follow_version_vector(
             if length > known:
                 _note(state, MORE, row, item, length, known)
         else:
-            known = state.written[origin, SCANNED] + state.written[origin, DEAD_ENTRIES]
+            known = state.written[origin, SCANNED] + state.written[origin, NOT_SCANNED]
             if not known <= length <= known + state.first_tick.shape[0]:
                 _note(state, SHORT, row, item, length, known)
 

@@ -25,7 +25,7 @@ from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.machine import State
 from kantor_worldsim.observers.metrics.base import RunMetrics
 from kantor_worldsim.observers.metrics.map_tracker import MapTracker
-from kantor_worldsim.observers.metrics.result import Bounds, ByRegions, MapResult
+from kantor_worldsim.observers.metrics.result import STUCK, Bounds, ByRegions, MapResult
 from kantor_worldsim.radio.channel import Walls, links
 from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, StepRecord
@@ -241,6 +241,11 @@ class MapMetrics(RunMetrics):
         last = self.rows[-1]
         return {"w_ub": 0.0, "mass_left": 1.0 - last.explored, "distance_m": last.distance_m}
 
+    def _ended(self) -> str:
+        """The reason on record; but robots that rest, although they could see more, are stuck."""
+        reason = super()._ended()
+        return STUCK if reason == "done" and self.map_tracker.unseen else reason
+
     def _measured(self) -> dict[str, Any]:
         map_tracker, last = self.map_tracker, self.rows[-1]
         mean = self._over_time / self._samples if self._samples else self._now
@@ -268,5 +273,7 @@ class MapMetrics(RunMetrics):
                 wtv_mean=ByRegions(*mean[0].tolist()),
                 epv_final=ByRegions(*self._now[1].tolist()),
                 epv_mean=ByRegions(*mean[1].tolist()),
+                unseen=map_tracker.unseen,
+                frontiers_left=map_tracker.frontiers,
             ),
         }

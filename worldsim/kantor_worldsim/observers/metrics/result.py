@@ -69,6 +69,10 @@ class MapResult(msgspec.Struct, frozen=True, kw_only=True):
     epv_final: ByRegions
     """Variance of the regions' explored share, squared percent."""
     epv_mean: ByRegions
+    unseen: int = 0
+    """Free cells that robots could reach and that none has seen."""
+    frontiers_left: int = 0
+    """Free cells that robots have seen and could reach, with a neighbour that none has seen."""
 
 
 class FaultCounts(msgspec.Struct, frozen=True, kw_only=True):
@@ -101,6 +105,9 @@ class FaultCounts(msgspec.Struct, frozen=True, kw_only=True):
     """Impostors."""
     let_in: int = 0
 
+
+STUCK = "stuck"
+"""How a mission on a map ended whose record says `done`, and that has left ground unseen."""
 
 LINK_COUNTERS = ("dropped", "delayed", "doubled", "replayed", "forged")
 
@@ -161,6 +168,8 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     messages_refused: int
     absences: int
     ended: str
+    """The reason on record, or `stuck`: on a map, all robots rest and there is ground that they could reach and
+    have not seen."""
     record: str
     """`whole`, or why it was cut."""
     violations: int
