@@ -26,6 +26,9 @@ Found = tuple[int, float, float]
 SPEED_TOLERANCE = 1e-6
 """Relative tolerance on the length of one move, for rounding alone."""
 
+_ROUNDINGS = 4.0
+"""Coordinates are rounded so often from one pose to the next. Far from the origin that can be more than a move."""
+
 STANDOFF_CELLS = 1 / 64
 """Distance, in cells along its way, at which a robot stops before a wall."""
 
@@ -211,7 +214,10 @@ class World:
         limit_m = 0.0 if name == SUPERVISOR else self._speed_m_s * (now_ns - body.moved_ns) * 1e-9
         start = body.pose
         way_m = math.hypot(pose.x_m - start.x_m, pose.y_m - start.y_m)
-        if not way_m <= limit_m * (1.0 + SPEED_TOLERANCE):  # also for a pose that is not finite
+        farthest_m = max(abs(start.x_m), abs(start.y_m))
+        rounding_m = _ROUNDINGS * math.ulp(farthest_m) if limit_m > 0.0 else 0.0
+        # Also false for a pose that is not finite.
+        if not way_m <= limit_m * (1.0 + SPEED_TOLERANCE) + rounding_m:
             return False
         body.pose = pose
         if self._ground is not None and name != SUPERVISOR:

@@ -29,6 +29,8 @@ from kantor_worldsim.record.columnar import ColumnarBatch
 
 _ROUNDING = 2e-6
 """By so much of the limit a move may be longer, for rounding."""
+_COORDINATES = 2.0**-49
+"""And by so much of the coordinates, since a pose is rounded where it is; none where nothing may move."""
 
 
 @kernel
@@ -93,6 +95,8 @@ def check_speed(state: CheckerState, limits: Limits, columns: ColumnarBatch, row
     limit_m_s = 0.0 if who == limits.supervisor else limits.speed_m_s
     limit_m = limit_m_s * elapsed_ns * 1e-9 * (1.0 + _ROUNDING)
     x_m, y_m = columns.poses_m[row, 0], columns.poses_m[row, 1]
+    if limit_m > 0.0:
+        limit_m += _COORDINATES * max(abs(state.poses_m[who, 0]), abs(state.poses_m[who, 1]))
     way_m = math.hypot(x_m - state.poses_m[who, 0], y_m - state.poses_m[who, 1])
     if not way_m <= limit_m:
         note_violation(state, SPEED, row, 0, 0, 0, way_m, limit_m)
