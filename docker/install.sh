@@ -18,5 +18,6 @@ kantor)
     # Without modules that only PDF output and tables of sweeps need.
     /opt/kantor/bin/python -m compileall -q -j 0 --invalidation-mode unchecked-hash -x '/(fontTools|pygments|scipy/(io|signal|stats))/' .
     /opt/kantor/bin/python -c 'from kantor_fleet.execution.preload import warm_up; warm_up()'
+    chmod -R a+rX "$KANTOR_KERNELS"
     ;;
 esac

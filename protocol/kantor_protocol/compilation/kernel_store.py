@@ -97,9 +97,9 @@ class KernelStore(_Cache):  # type: ignore[misc]
         """Hold the lock of a kernel that is not there yet. Kernels call no kernel that calls them: no deadlock."""
         path = self._path(sig)
         with ExitStack() as held:
-            if not path.exists():
-                with suppress(OSError):
-                    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with suppress(OSError):
+                if not path.exists():
+                    path.parent.mkdir(parents=True, exist_ok=True)
                     lock = held.enter_context(path.with_suffix(".lock").open("wb"))
                     fcntl.flock(lock, fcntl.LOCK_EX)
                     held.callback(path.with_suffix(".lock").unlink, missing_ok=True)

@@ -169,12 +169,13 @@ def test_a_broken_file_is_compiled_anew(store: Path, content: bytes) -> None:
     assert compilations(again) == 1
 
 
-def test_a_folder_that_cannot_be_made_costs_time_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", ["file", 300 * "x"], ids=["a file", "a name too long"])
+def test_a_folder_that_cannot_be_used_costs_time_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """A file stands where the folder should be."""
-    (tmp_path / "kernels").write_text("")
-    monkeypatch.setenv("KANTOR_KERNELS", str(tmp_path / "kernels"))
+    """A file stands where it should be, or the system refuses every access."""
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("KANTOR_KERNELS", str(tmp_path / name))
     assert kernel_store.is_empty()
     assert caller()(3) == 8
     kernel_store.prune()
