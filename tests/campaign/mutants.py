@@ -17,13 +17,19 @@ import pytest
 if __name__ == "__main__":
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
-from campaign import bugs_in_processes, bugs_in_radio, bugs_in_replication, bugs_in_robots
+from campaign import (
+    bugs_in_maps,
+    bugs_in_processes,
+    bugs_in_radio,
+    bugs_in_replication,
+    bugs_in_robots,
+)
 from campaign.planting import MUTANTS, Mutant
 from kantor_fleet.campaign.draw import draw
 from kantor_fleet.campaign.mission import Trial, attempt
 from kantor_fleet.execution.experiment import Case
 
-BUGS = (bugs_in_replication, bugs_in_radio, bugs_in_robots, bugs_in_processes)
+BUGS = (bugs_in_replication, bugs_in_radio, bugs_in_robots, bugs_in_maps, bugs_in_processes)
 """The modules that plant them."""
 
 LIMIT = 200

@@ -140,7 +140,7 @@ def _map(seed: int) -> Tree:
     layout, side_m, resolution_m = draws.one_of(
         [("blank", 14.0, 1.0), ("office", 12.0, 0.25), ("unstructured", 24.0, 1.0)]
     )
-    return {
+    tree: Tree = {
         "calm_s": short(draws.between(8.0, 30.0) * period_s),
         "coordination": "centralized" if draws.coin(_CENTRALIZED) else "decentralized",
         "limit_s": 1500.0,
@@ -165,6 +165,9 @@ def _map(seed: int) -> Tree:
         },
         "reach_m": side_m,
     }
+    noise = draws.between(0.05, 0.6) if draws.coin(0.3) else 0.0
+    tree["sensor"]["noise_m"] = short(noise * resolution_m)
+    return tree
 
 
 def _vehicle(draws: KeyedDraws, stride_m: float, period_s: float) -> Tree:

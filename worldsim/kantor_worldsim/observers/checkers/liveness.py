@@ -2,8 +2,9 @@
 
 Rules
 -----
-L1  when nothing has changed for long enough (no fault, no robot moves, nothing held up arrives), all participants
-    that hear one another, over others if need be, hold the same entries of all logs, and have the same view
+L1  when nothing has changed for long enough (no fault, no robot moves, nothing held up arrives, and no robot with
+    noisy ranges adds to its log, as it may where it stands), all participants that hear one another, over others
+    if need be, hold the same entries of all logs, and have the same view
 L2  a mission comes to its end before the limit of time
 L3  a robot that has not heard its supervisor for more than 9 of its own steps talks to all robots, and as
     soon as it hears it, to the supervisor alone
@@ -76,6 +77,8 @@ class _Participant:
         self.alive = True
         self.lowered: list[bytes] = []
         self.last: Outputs | None = None
+        self.logged = 0
+        """The length of its own log, followed where ranges are noisy."""
         self.unheard_steps = -timeout_steps
         """Own steps since it heard the supervisor."""
 
@@ -146,8 +149,17 @@ class LivenessChecker:
         before = self._poses.get(step_record.name)
         if before is None or pose.x_m != before.x_m or pose.y_m != before.y_m:
             self._poses[step_record.name], self._changed_ns = pose, now_ns
+        if self._scenario.mapping and self._scenario.sensor.noise_m > 0.0:
+            self._note_logging(state, outputs, now_ns)
         if step_record.name != SUPERVISOR and self._scenario.centralized:
             self._check_contact(state, step_record, outputs)
+
+    def _note_logging(self, state: _Participant, outputs: Outputs, now_ns: int) -> None:
+        version_vector = _version_vector_of(outputs, len(self._names), claims=False)
+        if version_vector is None or state.incarnation_id >= len(version_vector):
+            return
+        if version_vector[state.incarnation_id] != state.logged:
+            state.logged, self._changed_ns = version_vector[state.incarnation_id], now_ns
 
     def _note_late(self, batch: Batch) -> None:
         on_time_ns = batch.now_ns + self._way_ns
