@@ -21,6 +21,7 @@ from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.observers.metrics.result import Result
 from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.world.inputs import InputFile, changes_since
 from kantor_worldsim.world.world import WorldSetup
 
 _REASON_LETTERS = 300
@@ -33,6 +34,8 @@ class Case(msgspec.Struct, frozen=True):
     seed: int
     exact: bool = False
     """Also compute the exact Wasserstein distance at the end."""
+    inputs: tuple[InputFile, ...] = ()
+    """The files that the scenario is read from, with the contents that the run is known by."""
 
 
 class Outcome(msgspec.Struct, frozen=True, kw_only=True):
@@ -82,6 +85,8 @@ def reason(error: BaseException) -> str:
 def _run(case: Case) -> Result:
     scenario, seed = case.scenario, case.seed
     setup = WorldSetup.of(scenario, seed)
+    for change in changes_since(case.inputs):
+        raise ScenarioError(f"{change} since the sweep began; run it again")
     recording = Recording(scenario, seed, "in-process", exact_every=0 if case.exact else None)
     play(scenario, seed, setup, [recording.observe])
     return recording.finish()

@@ -5,9 +5,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from kantor_fleet.execution.in_process_team import participant, play
 from kantor_fleet.exits import Exit, fail
 from kantor_protocol.base.machine import WORLD_SIM, Outputs, ParticipantId, StateMachine
+from kantor_protocol.files.reading import UnreadableError, read_text
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError
@@ -26,6 +29,7 @@ from kantor_worldsim.record.records import (
     encode_record,
 )
 from kantor_worldsim.record.run_folder import JOURNAL, MANIFEST
+from kantor_worldsim.world.inputs import InputFile, changes_since, inputs_of
 from kantor_worldsim.world.world import World, WorldSetup
 
 _REALTIME = "wall"
@@ -51,10 +55,17 @@ def findings(folder: Path, records: list[tuple[bytes, Record]] | None = None) ->
     if not records or not isinstance(records[0][1], Opening):
         return [(False, f"{JOURNAL}: no opening record in it")]
     found = list(_findings_on_file(folder, manifest, records))
+    inputs = _inputs_of(manifest)
+    changes = list(changes_since(inputs))
+    if changes:
+        found.append(
+            (True, f"inputs: {', '.join(changes)} since the run; the record has what it read")
+        )
+    drawn_anew = not changes and (bool(inputs) or not _names_files(records[0][1].scenario))
     try:
         found += [
             _finding_of_checker(manifest, records),
-            _finding_of_execution(manifest, records),
+            _finding_of_execution(manifest, records, drawn_anew=drawn_anew),
         ]
     except (RefusedError, ScenarioError, ValueError) as error:
         problem = str(error).splitlines()[0]
@@ -65,14 +76,27 @@ def findings(folder: Path, records: list[tuple[bytes, Record]] | None = None) ->
 def _manifest(folder: Path) -> dict[str, Any]:
     path = folder / MANIFEST
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        fail(Exit.USAGE, f"{path}: no such file; give a folder that a run left")
-    except (OSError, ValueError):
+        manifest = json.loads(read_text(path))
+    except UnreadableError as error:
+        remedy = "give a folder that a run left" if error.missing else "it cannot be verified"
+        fail(Exit.USAGE, f"{error}; {remedy}")
+    except ValueError:
         fail(Exit.USAGE, f"{path}: not readable as JSON; it cannot be verified")
     if not isinstance(manifest, dict) or manifest.get("format") != 1:
         fail(Exit.USAGE, f"{path}: written by another version; verify it with that one")
     return manifest
+
+
+def _inputs_of(manifest: dict[str, Any]) -> tuple[InputFile, ...]:
+    """The files that a run was read from; none if its manifest does not say."""
+    try:
+        return msgspec.convert(manifest.get("inputs", ()), tuple[InputFile, ...])
+    except msgspec.ValidationError:
+        return ()
+
+
+def _names_files(scenario: Scenario) -> bool:
+    return bool(inputs_of(scenario, lambda _path: None))
 
 
 def _journal(folder: Path) -> list[tuple[bytes, Record]]:
@@ -112,12 +136,14 @@ def _finding_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Rec
     return False, f"checker: {checker.count} violations, first: {checker.violations[0]}"
 
 
-def _finding_of_execution(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Finding:
+def _finding_of_execution(
+    manifest: dict[str, Any], records: list[tuple[bytes, Record]], *, drawn_anew: bool
+) -> Finding:
     opening = records[0][1]
     assert isinstance(opening, Opening)
     if manifest.get("exchange") == _REALTIME or any(_unscheduled(opening.scenario, records)):
         return _replayed(opening, records)
-    return _executed(opening, records)
+    return _executed(opening, records, drawn_anew=drawn_anew)
 
 
 def _unscheduled(scenario: Scenario, records: list[tuple[bytes, Record]]) -> Iterator[bool]:
@@ -130,12 +156,15 @@ def _unscheduled(scenario: Scenario, records: list[tuple[bytes, Record]]) -> Ite
             yield not all(outages.dies(name, record.now_ns) for name in record.absent)
 
 
-def _executed(opening: Opening, records: list[tuple[bytes, Record]]) -> Finding:
-    """Execute the run again in this process, and compare it record by record."""
+def _executed(
+    opening: Opening, records: list[tuple[bytes, Record]], *, drawn_anew: bool
+) -> Finding:
+    """Execute the run again in this process, and compare it record by record.
+
+    drawn_anew: draw what it starts from again as well, and read its files; else take that from the record.
+    """
     scenario, seed = opening.scenario, opening.seed
-    world = scenario.map
-    from_files = scenario.samples.file or scenario.targets.file or (world and world.file)
-    setup = opening.setup if from_files else WorldSetup.of(scenario, seed)
+    setup = WorldSetup.of(scenario, seed) if drawn_anew else opening.setup
     expected = iter(payload for payload, _ in records)
     compared, differing = 0, -1
 

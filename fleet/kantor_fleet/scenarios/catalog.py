@@ -32,5 +32,13 @@ def find(scenario: str, overrides: Iterable[str] = (), chaos: Path | None = None
     chaos: a file of faults that are added to its own.
     """
     by_file = scenario.endswith(".toml") or "/" in scenario
-    found = load(Path(scenario) if by_file else path_of(scenario), overrides)
-    return found if chaos is None else with_chaos(found, chaos)
+    found = load(_at_home(Path(scenario)) if by_file else path_of(scenario), overrides)
+    return found if chaos is None else with_chaos(found, _at_home(chaos))
+
+
+def _at_home(path: Path) -> Path:
+    """A path in which `~` is a home; a shell leaves it in `--chaos=~/storm.toml`. Raises ScenarioError."""
+    try:
+        return path.expanduser()
+    except RuntimeError:
+        raise ScenarioError(f"{path}: no such home; write the folder out") from None

@@ -1,8 +1,10 @@
 """The plan of a sweep: variants of a scenario, each with the same seeds."""
 
+import contextlib
+import functools
 import hashlib
 import itertools
-import tomllib
+import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -12,9 +14,13 @@ import msgspec
 
 from kantor_fleet.execution.experiment import Case, code
 from kantor_fleet.scenarios.catalog import find
+from kantor_protocol.files.reading import UnreadableError, check, digest_of
 from kantor_protocol.scenario.dump import to_tree
 from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.load import value_of
 from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.world.inputs import Digest, InputFile, inputs_of
+from kantor_worldsim.world.world import doubts_about
 
 Value = bool | int | float | str
 
@@ -43,6 +49,8 @@ class Variant(NamedTuple):
     """A value for each varied key."""
     scenario: Scenario
     digest: str
+    inputs: tuple[InputFile, ...] = ()
+    """The files that it is read from, as they were when the sweep was planned."""
 
     def settings(self, keys: Iterable[str]) -> dict[str, str]:
         """Its values by key, as a user writes them."""
@@ -73,7 +81,20 @@ class SweepPlan(NamedTuple):
         """All runs, seed by seed: a sweep that is cut short has every variant with the same seeds."""
         for seed in self.seeds:
             for variant in self.variants:
-                yield self.key(variant, seed), Case(variant.scenario, seed, self.exact)
+                case = Case(variant.scenario, seed, self.exact, variant.inputs)
+                yield self.key(variant, seed), case
+
+    def doubts(self) -> list[str]:
+        """Warnings about the files of its scenarios, each once; a file that cannot be read fails its runs."""
+        by_source = {
+            (scenario.map, scenario.samples.file, scenario.targets.file): scenario
+            for scenario in (variant.scenario for variant in self.variants if variant.inputs)
+        }
+        found: dict[str, None] = {}
+        for scenario in by_source.values():
+            with contextlib.suppress(ScenarioError):
+                found |= dict.fromkeys(doubts_about(scenario))
+        return list(found)
 
 
 def plan(
@@ -98,8 +119,9 @@ def plan(
     for override in overrides:
         if override.partition("=")[0].strip() in varied:
             raise SweepError(f"--set {override}: it is varied as well; drop one of the two")
+    digest = functools.cache(digest_of)  # variants share most of their files
     variants = [
-        _variant(scenario, overrides, chaos, dict(zip(varied, texts, strict=True)))
+        _variant(scenario, overrides, chaos, dict(zip(varied, texts, strict=True)), digest)
         for texts in itertools.product(*varied.values())
     ]
     _refuse_twins(variants, tuple(varied))
@@ -139,62 +161,82 @@ def _axis(text: str) -> tuple[str, list[str]]:
     if not separator or not key:
         raise SweepError(f"--vary {text}: write it as key.sub=value,value")
     texts = _split(values)
+    if texts is None:
+        raise SweepError(f"--vary {text}: a quote without its end; close it")
     if not all(texts):
         raise SweepError(f"--vary {text}: a value is missing; write {key}=value,value")
     return key, texts
 
 
-def _split(values: str) -> list[str]:
-    """Parts between the commas that stand in no bracket."""
-    parts, depth = [""], 0
+def _split(values: str) -> list[str] | None:
+    """Parts between the commas that stand in no bracket and no quotes; None if a quote has no end.
+
+    As in TOML, a quote stands at the beginning of a value, or in brackets; elsewhere it is a letter.
+    """
+    parts, depth, quote, escaped = [""], 0, "", False
     for letter in values:
-        depth += (letter in "[{") - (letter in "]}")
-        if letter == "," and depth == 0:
+        if quote:
+            ends = letter == quote and not escaped
+            escaped = letter == "\\" and quote == '"' and not escaped
+            quote = "" if ends else quote
+        elif letter in "\"'" and (depth > 0 or not parts[-1].strip(_BEFORE_QUOTE)):
+            quote = letter
+        else:
+            depth += (letter in "[{") - (letter in "]}")
+        if letter == "," and depth == 0 and not quote:
             parts.append("")
         else:
             parts[-1] += letter
-    return [part.strip() for part in parts]
+    return None if quote else [part.strip() for part in parts]
+
+
+_BEFORE_QUOTE = " \t\"'"
+"""Three quotes begin a text as one does."""
 
 
 def _variant(
-    scenario: str, overrides: Sequence[str], chaos: Path | None, texts: dict[str, str]
+    scenario: str,
+    overrides: Sequence[str],
+    chaos: Path | None,
+    texts: dict[str, str],
+    digest: Digest,
 ) -> Variant:
     settings = [f"{key}={text}" for key, text in texts.items()]
     try:
         resolved = find(scenario, [*overrides, *settings], chaos)
-        digest = _digest(resolved)
+        inputs = inputs_of(resolved, digest)
+        _check_inputs(inputs)
     except ScenarioError as error:
         place = f"{' '.join(settings)}: " if settings else ""
         raise SweepError(f"{place}{error}") from None
-    return Variant(tuple(map(_value, texts.values())), resolved, digest)
+    values = tuple(map(_value, texts.values()))
+    return Variant(values, resolved, _digest(resolved, inputs), inputs)
 
 
 def _value(text: str) -> Value:
     """The value of a text in a table: a plain TOML value, or else the text itself."""
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except ValueError:
-        return text
+    value = value_of(text)
     return value if isinstance(value, bool | int | float | str) else text
 
 
-def _digest(scenario: Scenario) -> str:
+def _digest(scenario: Scenario, inputs: Sequence[InputFile]) -> str:
     """Digest of a scenario and of the contents of its files, wherever these are."""
     tree = to_tree(scenario)
-    for key, name in (("samples", scenario.samples.file), ("targets", scenario.targets.file)):
-        if name is not None:
-            tree[key]["file"] = Path(name).suffix + _file_digest(Path(name))
+    for file in inputs:
+        table, _, key = file.key.partition(".")
+        tree[table][key] = f"{file.path.suffix}{file.blake2b}"
     return hashlib.blake2b(msgspec.json.encode(tree), digest_size=16).hexdigest()
 
 
-def _file_digest(path: Path) -> str:
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "blake2b").hexdigest()
-    except FileNotFoundError:
-        raise SweepError(f"{path}: no such file") from None
-    except OSError as error:
-        raise SweepError(f"{path}: cannot be read: {error.strerror}") from None
+def _check_inputs(inputs: Iterable[InputFile]) -> None:
+    """Refuse files that cannot be read. Raises SweepError."""
+    for file in inputs:
+        if file.blake2b is None:
+            try:
+                check(file.path, sys.maxsize)
+            except UnreadableError as error:
+                raise SweepError(f"{file.key}: {error}") from None
+            raise SweepError(f"{file.key}: {file.path}: cannot be read; check who may")
 
 
 def _refuse_twins(variants: Sequence[Variant], keys: Sequence[str]) -> None:

@@ -13,7 +13,7 @@ import msgspec
 
 from kantor_fleet.execution.experiment import Case
 from kantor_fleet.execution.pools import ClusterError, Pool
-from kantor_fleet.exits import Exit
+from kantor_fleet.exits import Exit, warn
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.report.progress import printable
 from kantor_fleet.report.run_progress import RunProgressView, table_console
@@ -50,6 +50,7 @@ def sweep(config: SweepConfig, start: Callable[[Iterable[Case]], Pool]) -> Exit:
     """
     _check(config)
     plan = config.plan
+    warn(plan.doubts())
     with Interrupts() as interrupts, RunsJournal(config.folder / RUNS) as journal:
         _write_plan(config)
         left = {case: key for key, case in plan.cases() if _is_due(config, journal, key)}
@@ -150,6 +151,7 @@ def _write_plan(config: SweepConfig) -> None:
             {
                 "varied": dict(zip(plan.keys, variant.values, strict=True)),
                 "digest": variant.digest,
+                "inputs": msgspec.to_builtins(variant.inputs),
                 "scenario": to_tree(variant.scenario),
             }
             for variant in plan.variants

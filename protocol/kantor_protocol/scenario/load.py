@@ -5,20 +5,22 @@ A key that does not exist, a value of the wrong type or out of bounds is refused
 
 import difflib
 import re
-import tomllib
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
+from kantor_protocol.files.reading import NotTextError, UnreadableError, read_text
+from kantor_protocol.files.toml import TomlError, parse_toml
 from kantor_protocol.scenario.dump import to_tree
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.faults.schedule import FAULTS_MAX, KINDS, Chaos
+from kantor_protocol.scenario.file_names import rooted
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.scenario.types import ScenarioTable
-from kantor_protocol.scenario.validate import complaints, not_finite
+from kantor_protocol.scenario.validate import complaints, unusable_numbers
 from kantor_protocol.scenario.validate_faults import complaints_of_faults
 
 Table = TypeVar("Table", bound=ScenarioTable)
@@ -30,18 +32,19 @@ def parse(text: str, origin: str, overrides: Iterable[str] = ()) -> Scenario:
     `origin` names the text in messages. Raises ScenarioError.
     """
     tree = _tree_of(text, origin)
-    for override in overrides:
-        _override(tree, override)
+    _override(tree, [_parsed(override) for override in overrides])
     return from_tree(tree, origin)
 
 
 def load(path: Path, overrides: Iterable[str] = ()) -> Scenario:
-    """A checked scenario from a TOML file; relative files in it are relative to its folder.
+    """A checked scenario from a TOML file.
 
-    Raises ScenarioError.
+    A relative file name in it is beside it, one in an override is in the current folder. Raises ScenarioError.
     """
     text = _read(path, "no such scenario file; `kantor scenarios` lists the packaged ones")
-    return rooted(parse(text, str(path), overrides), path.parent)
+    tree = rooted(_tree_of(text, str(path)), path.parent)
+    _override(tree, [_rooted(_parsed(override), Path.cwd()) for override in overrides])
+    return from_tree(tree, str(path))
 
 
 def with_chaos(scenario: Scenario, path: Path) -> Scenario:
@@ -52,37 +55,11 @@ def with_chaos(scenario: Scenario, path: Path) -> Scenario:
     if len(faults) > FAULTS_MAX:
         raise ScenarioError(f"{path}: faults: with the scenario's own more than {FAULTS_MAX}")
     for complaint in (
-        *not_finite(to_tree(chaos)),
+        *unusable_numbers(to_tree(chaos)),
         *complaints_of_faults(chaos.faults, scenario, scenario.faults),
     ):
         raise ScenarioError(f"{path}: {complaint}")
     return msgspec.structs.replace(scenario, faults=faults)
-
-
-def rooted(scenario: Scenario, folder: Path) -> Scenario:
-    """The scenario with its relative file names turned into absolute ones below `folder`.
-
-    A name that exists in the current folder stays relative to it, so that `--set samples.file=…` means what a
-    shell user expects.
-    """
-
-    def place(name: str | None) -> str | None:
-        if name is None or Path(name).is_absolute():
-            return name
-        try:
-            Path(name).stat()  # unlike `exists`, it raises for a name that no file can have
-        except (FileNotFoundError, NotADirectoryError):
-            return str((folder / name).resolve())
-        except (OSError, ValueError) as error:
-            raise ScenarioError(f"{name}: cannot be the name of a file: {error}") from None
-        return str(Path(name).resolve())
-
-    return msgspec.structs.replace(
-        scenario,
-        map=scenario.map and msgspec.structs.replace(scenario.map, file=place(scenario.map.file)),
-        samples=msgspec.structs.replace(scenario.samples, file=place(scenario.samples.file)),
-        targets=msgspec.structs.replace(scenario.targets, file=place(scenario.targets.file)),
-    )
 
 
 def from_tree(tree: dict[str, Any], origin: str) -> Scenario:
@@ -96,20 +73,19 @@ def from_tree(tree: dict[str, Any], origin: str) -> Scenario:
 def _read(path: Path, missing: str) -> str:
     """The text of a TOML file. missing: the message if there is no such file. Raises ScenarioError."""
     try:
-        return path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ScenarioError(f"{path}: {missing}") from None
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{path}: not valid TOML: {error}") from None
-    except (OSError, ValueError) as error:
-        raise ScenarioError(f"{path}: cannot be read: {error}") from None
+        return read_text(path)
+    except NotTextError as error:
+        raise ScenarioError(f"{path}: not valid TOML: {error.problem}") from None
+    except UnreadableError as error:
+        problem = missing if error.missing else f"cannot be read: {error.problem}"
+        raise ScenarioError(f"{path}: {problem}") from None
 
 
 def _tree_of(text: str, origin: str) -> dict[str, Any]:
     """Parsed TOML. Raises ScenarioError."""
     try:
-        return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+        return parse_toml(text)
+    except TomlError as error:
         raise ScenarioError(f"{origin}: not valid TOML: {error}") from None
 
 
@@ -123,23 +99,70 @@ def _converted(tree: dict[str, Any], whole: type[Table], origin: str) -> Table:
         raise ScenarioError(f"{origin}: a text in it is not UTF-8; write it so") from None
 
 
-def _override(tree: dict[str, Any], override: str) -> None:
-    key, separator, text = override.partition("=")
+class _Override(NamedTuple):
+    """A value for a key of a scenario."""
+
+    text: str
+    """As it was given."""
+    path: tuple[str, ...]
+    value: Any
+
+    @property
+    def key(self) -> str:
+        return ".".join(self.path)
+
+
+def _parsed(text: str) -> _Override:
+    """An override from `key.sub=value`. Raises ScenarioError."""
+    key, separator, written = text.partition("=")
     path = key.strip().split(".")
     if not separator or not all(path):
-        raise ScenarioError(f"--set {override}: write it as key.sub=value")
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):
-        value = text.strip()
+        raise ScenarioError(f"--set {text}: write it as key.sub=value")
+    if len(path) > _PARTS_MAX:
+        raise ScenarioError(f"--set {text[:80]}: no key has so many parts")
+    value = value_of(written)
     if isinstance(value, str) and ".".join(path) in _NAMED:
         path.append("name")  # planner=spectral names the planner
-    table = tree
-    for i, part in enumerate(path[:-1]):
-        table = table.setdefault(part, {})
-        if not isinstance(table, dict):
-            raise ScenarioError(f"--set {override}: {'.'.join(path[: i + 1])} is not a table")
-    table[path[-1]] = value
+    return _Override(text, tuple(path), value)
+
+
+def value_of(text: str) -> Any:
+    """A value as it is typed: TOML, or plain text without its quotes."""
+    try:
+        return parse_toml(f"value = {text}")["value"]
+    except TomlError:
+        return text.strip()
+
+
+def _rooted(override: _Override, folder: Path) -> _Override:
+    return override._replace(value=rooted(override.value, folder, override.key))
+
+
+def _override(tree: dict[str, Any], overrides: Sequence[_Override]) -> None:
+    """Set the keys of a tree, in order. Raises ScenarioError."""
+    _give_way(tree, {override.key for override in overrides})
+    for override in overrides:
+        table = tree
+        for i, part in enumerate(override.path[:-1]):
+            table = table.setdefault(part, {})
+            if not isinstance(table, dict):
+                above = ".".join(override.path[: i + 1])
+                raise ScenarioError(f"--set {override.text}: {above} is not a table")
+        table[override.path[-1]] = override.value
+
+
+def _give_way(tree: dict[str, Any], keys: Collection[str]) -> None:
+    """Leave out what describes the map that an override replaces: a layout for a file, or a file for a layout."""
+    options = tree.get("map")
+    if isinstance(options, dict) and ("map.file" in keys) != ("map.layout" in keys):
+        replaced = _OF_LAYOUT if "map.file" in keys else _OF_FILE
+        for key in replaced:
+            options.pop(key, None)
+
+
+_OF_LAYOUT = ("layout", "size_m", "resolution_m", "seed")
+_OF_FILE = ("file", "resolution_m")
+_PARTS_MAX = 8
 
 
 _NAMED = frozenset({"planner", "vehicle"})

@@ -2,10 +2,10 @@
 
 import math
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from kantor_protocol.scenario.dump import to_tree
+from kantor_protocol.scenario.file_names import path_of
 from kantor_protocol.scenario.schema import MAP_PLANNERS, Domain, Scenario
 from kantor_protocol.scenario.validate_faults import complaints_of_faults
 
@@ -15,11 +15,11 @@ _PERIODS_UNDER_WAY = 1000
 
 def complaints(scenario: Scenario) -> Iterable[str]:
     """Reasons why a scenario cannot be run: `key: what, and the remedy`. The first one is reported."""
-    yield from not_finite(to_tree(scenario))
+    yield from unusable_numbers(to_tree(scenario))
     yield from _complaints_of_map(scenario) if scenario.map else _complaints_of_density(scenario)
     yield from complaints_of_faults(scenario.faults, scenario)
     for key, name in (("samples", scenario.samples.file), ("targets", scenario.targets.file)):
-        if name is not None and Path(name).suffix.lower() not in POINT_FILES | IMAGE_FILES:
+        if name is not None and path_of(name).suffix.lower() not in POINT_FILES | IMAGE_FILES:
             known = ", ".join(sorted(POINT_FILES | IMAGE_FILES))
             yield f"{key}.file: {name} has an unknown kind; use one of {known}"
     clock = scenario.clock
@@ -84,18 +84,24 @@ def _starts_given(scenario: Scenario) -> str:
     )
 
 
-def not_finite(tree: Any, path: str = "") -> Iterable[str]:
-    """Reasons for numbers that are not finite. Only a radio range may be infinite."""
+def unusable_numbers(tree: Any, path: str = "") -> Iterable[str]:
+    """Reasons for numbers that no run can work with. A radio range may be as large as it wants, and infinite."""
     if isinstance(tree, dict):
         for key, value in tree.items():
-            yield from not_finite(value, f"{path}.{key}".lstrip("."))
+            yield from unusable_numbers(value, f"{path}.{key}".lstrip("."))
     elif isinstance(tree, list):
         for i, value in enumerate(tree):
-            yield from not_finite(value, f"{path}[{i}]")
-    elif isinstance(tree, float) and not math.isfinite(tree):
-        boundless = tree == math.inf and path in {"radio.range_m", "supervisor.range_m"}
-        if not boundless:
+            yield from unusable_numbers(value, f"{path}[{i}]")
+    elif isinstance(tree, float) and not (tree >= 0.0 and path in _BOUNDLESS):
+        if not math.isfinite(tree):
             yield f"{path}: {tree} is no usable number; set a finite one"
+        elif abs(tree) > NUMBER_MAX:
+            yield f"{path}: {tree:g} is no usable number; stay within {NUMBER_MAX:g}"
+
+
+_BOUNDLESS = frozenset({"radio.range_m", "supervisor.range_m"})
+NUMBER_MAX = 1e30
+"""Largest number in a scenario: its fourth power is still a number."""
 
 
 def _complaints_of_starts(scenario: Scenario) -> Iterable[str]:
@@ -121,4 +127,4 @@ IMAGE_FILES = frozenset({".png", ".jpg", ".jpeg", ".pgm", ".tif", ".tiff", ".bmp
 
 def is_image(name: str) -> bool:
     """Whether a file name stands for a grey-scale density."""
-    return Path(name).suffix.lower() in IMAGE_FILES
+    return path_of(name).suffix.lower() in IMAGE_FILES

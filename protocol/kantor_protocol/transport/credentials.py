@@ -9,7 +9,6 @@ with the list of the members that it admits.
 import os
 import re
 import secrets
-import tomllib
 from collections.abc import Iterable, Mapping
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -18,6 +17,8 @@ from typing import Any, TypeVar
 import msgspec
 
 from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
+from kantor_protocol.files.reading import UnreadableError, read_text
+from kantor_protocol.files.toml import TomlError, parse_toml
 
 HOST = WORLD_SIM
 OBSERVER = "observer"
@@ -215,8 +216,8 @@ def read(path: Path, kind: type[T]) -> T | None:
 
 def _tree(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):  # unreadable, no text, or no TOML
+        return parse_toml(read_text(path))
+    except (UnreadableError, TomlError):
         return {}
 
 

@@ -33,6 +33,7 @@ from kantor_worldsim.record.run_folder import (
     write_json,
     write_text,
 )
+from kantor_worldsim.world.inputs import inputs_of
 
 
 def metrics_of(
@@ -104,6 +105,7 @@ class Recording:
             write_text(folder / SCENARIO, to_toml(self._scenario))
             self._manifest = new_manifest(self._scenario, self._seed, self._exchange)
             self._manifest |= {"run": self.run, "speed": speed, "exact_every": exact_every}
+            self._manifest["inputs"] = msgspec.to_builtins(inputs_of(self._scenario))
         write_json(folder / MANIFEST, self._manifest)
         return MetricsFile(folder / METRICS, self.metrics.columns)
 

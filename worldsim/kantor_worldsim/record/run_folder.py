@@ -11,6 +11,7 @@ from typing import IO, Any, NamedTuple
 
 import msgspec
 
+from kantor_protocol.files.reading import UnreadableError, read_text
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.records import Ending, Opening, Record
@@ -67,10 +68,10 @@ class Past(NamedTuple):
     def of(cls, folder: Path) -> "Past":
         """Read a run folder. Raises ResumeError; OverError if the mission has come to its end."""
         try:
-            manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+            manifest = json.loads(read_text(folder / MANIFEST))
             records = [record for _, record in read(folder / JOURNAL)]
             terms = msgspec.convert(manifest, Terms)
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        except (OSError, UnreadableError, json.JSONDecodeError) as error:
             reason = error.strerror if isinstance(error, OSError) else str(error)
             raise ResumeError(
                 f"{folder}: no run to go on with ({reason}); give its folder"

@@ -4,19 +4,21 @@ Samples are sorted along a Morton curve, so that neighbours in space are neighbo
 what is sent.
 """
 
-from pathlib import Path
-from tokenize import TokenError
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.counter_rng import Purpose, generator
 from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.file_names import path_of
 from kantor_protocol.scenario.schema import Domain, Gaussian, Scenario
 from kantor_protocol.scenario.validate import is_image
-from kantor_worldsim.world.maps import UNREADABLE
+from kantor_worldsim.world.pictures import decoded, opacity
+from kantor_worldsim.world.points import Points, points_in
 
-Points = npt.NDArray[np.float64]
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 
 def samples_of(scenario: Scenario, seed: int) -> Points:
@@ -39,7 +41,7 @@ def targets_of(scenario: Scenario, seed: int) -> Points:
     if targets.count == 0:
         return np.zeros((0, 2))
     if scenario.samples.file is not None and not is_image(scenario.samples.file):
-        return _around(_points("samples", scenario.samples.file), targets.count, seed)
+        return _around(points_in("samples", scenario.samples.file), targets.count, seed)
     return _drawn("targets", scenario, scenario.samples.file, targets.count, seed, stratified=False)
 
 
@@ -69,7 +71,7 @@ def _drawn(
         if count is None:
             raise ScenarioError(f"{key}.count: missing; an image needs the number of points")
         return _from_image(key, file, scenario.domain, count, random)
-    points = _points(key, file)
+    points = points_in(key, file)
     if count is None or count >= points.shape[0]:
         return points
     subset = generator(seed, Purpose.SUBSET).choice(points.shape[0], count, replace=False)
@@ -98,17 +100,12 @@ def _from_image(
     key: str, file: str, domain: Domain, count: int, random: np.random.Generator
 ) -> Points:
     """Draws by the brightness of pixels, uniform within a pixel; the image spans the domain, top row up."""
-    from PIL import Image  # noqa: PLC0415  only where an image is used
-
-    try:
-        with Image.open(file) as image:
-            grey = np.asarray(image.convert("F"), dtype=np.float64)
-    except FileNotFoundError:
-        raise ScenarioError(f"{key}.file: {file}: no such file") from None
-    except (*UNREADABLE, Image.DecompressionBombError) as error:
-        raise ScenarioError(f"{key}.file: {file}: not a readable image: {error}") from None
+    path = path_of(file)
+    grey, _ = decoded(path, f"{key}.file:", _brightness)
     if not np.isfinite(grey).all() or grey.min() < 0.0 or grey.sum() <= 0.0:
-        raise ScenarioError(f"{key}.file: {file}: no bright pixel; white is dense, black is empty")
+        raise ScenarioError(
+            f"{key}.file: {path}: no bright pixel; white is dense, black and transparent are empty"
+        )
     shares = (grey / grey.sum()).ravel()
     pixel = random.choice(shares.shape[0], count, p=shares)
     row, column = np.divmod(pixel, grey.shape[1])
@@ -117,48 +114,22 @@ def _from_image(
     return np.asarray(low + place / np.array(grey.shape[::-1]) * (high - low))
 
 
-def _points(key: str, file: str) -> Points:
-    """Rows of x, y in metres from CSV (a header is allowed) or NPY."""
-    path = Path(file)
-    try:
-        points = _csv(path) if path.suffix.lower() == ".csv" else _npy(path)
-    except FileNotFoundError:
-        raise ScenarioError(f"{key}.file: {file}: no such file") from None
-    except (*UNREADABLE, TokenError) as error:
-        problem = str(error).splitlines()[0]
-        raise ScenarioError(f"{key}.file: {file}: not a table of x, y: {problem}") from None
-    if points.ndim != 2 or points.shape[1] != 2 or points.dtype.kind not in "fiu":
-        raise ScenarioError(
-            f"{key}.file: {file}: shape {points.shape}; give two columns, x and y in metres"
-        )
-    if points.shape[0] == 0:
-        raise ScenarioError(f"{key}.file: {file}: no points in it; give at least one")
-    points = points.astype(np.float64)
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if bad.size:
-        raise ScenarioError(f"{key}.file: {file}: row {bad[0] + 1} is not finite; remove it")
-    return points
+def _brightness(image: "Image") -> npt.NDArray[np.float64]:
+    """(rows, columns), top row first: brightness as far as a pixel is opaque."""
+    grey = np.asarray(image.convert("F"), dtype=np.float64)
+    alpha = opacity(image)
+    return grey if alpha is None else grey * (alpha / 255.0)
 
 
-def _csv(path: Path) -> Points:
-    text = (line.partition("#")[0] for line in path.read_text(encoding="utf-8-sig").splitlines())
-    lines = [line for line in text if line.strip()]
-    rows = lines if lines and _is_row(lines[0]) else lines[1:]
-    return np.loadtxt(rows, delimiter=",", ndmin=2) if rows else np.zeros((0, 2))
-
-
-def _npy(path: Path) -> Points:
-    with path.open("rb") as file:  # np.load would also open archives
-        return np.asarray(np.lib.format.read_array(file, allow_pickle=False))
-
-
-def _is_row(line: str) -> bool:
-    """Whether a line of CSV holds numbers; a header does not."""
-    try:
-        _ = [float(cell) for cell in line.split(",")]
-    except ValueError:
-        return False
-    return True
+def doubts_about_images(scenario: Scenario) -> list[str]:
+    """Warnings about the files of images from which samples and targets are drawn. Raises ScenarioError."""
+    named = (("samples", scenario.samples.file), ("targets", scenario.targets.file))
+    return [
+        line
+        for key, name in named
+        if name is not None and is_image(name)
+        for line in decoded(path_of(name), f"{key}.file:", lambda _image: None)[1]
+    ]
 
 
 def _around(points: Points, count: int, seed: int) -> Points:

@@ -16,7 +16,8 @@ from kantor_protocol.base.counter_rng import Purpose, generator
 from kantor_protocol.base.grid import CELLS_MAX, FREE, OCCUPIED, Frame
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.types import Point
-from kantor_worldsim.world.maps import RESOLUTION_MAX_M, RESOLUTION_MIN_M, Cells, Ground, parts
+from kantor_worldsim.world.maps import Cells, Ground, parts
+from kantor_worldsim.world.nav2 import RESOLUTION_MAX_M, RESOLUTION_MIN_M
 
 
 def layout(

@@ -13,9 +13,10 @@ from kantor_protocol.base.machine import SUPERVISOR, Body, Observation, Outputs,
 from kantor_protocol.base.random_walk import RandomWalk
 from kantor_protocol.base.varint import sum_pairs
 from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.file_names import path_of
 from kantor_protocol.scenario.schema import Domain, Scenario
 from kantor_protocol.wire.weights import Units
-from kantor_worldsim.world.density import samples_of, starts_of, targets_of
+from kantor_worldsim.world.density import doubts_about_images, samples_of, starts_of, targets_of
 from kantor_worldsim.world.feasibility import doubts_of_density, doubts_of_map
 from kantor_worldsim.world.maps import Ground
 from kantor_worldsim.world.sensors import RangeFinder, sense_targets, sense_targets_in_sight
@@ -46,7 +47,7 @@ class WorldSetup(NamedTuple):
     ground: Ground | None = None
     """The true map, if the robots explore one. There are no samples then."""
     warnings: tuple[str, ...] = ()
-    """Doubts about the map's file and about the scenario, one line each."""
+    """Doubts about the files that it was read from and about the scenario, one line each."""
 
     @classmethod
     def of(cls, scenario: Scenario, seed: int) -> "WorldSetup":
@@ -54,9 +55,9 @@ class WorldSetup(NamedTuple):
         if scenario.mapping:
             return cls._of_map(scenario, seed)
         samples_m = samples_of(scenario, seed)
-        doubts = doubts_of_density(scenario, samples_m)
+        doubts = (*doubts_about_images(scenario), *doubts_of_density(scenario, samples_m))
         targets_m, starts_m = targets_of(scenario, seed), starts_of(scenario, seed)
-        return cls(samples_m, targets_m, starts_m, warnings=tuple(doubts))
+        return cls(samples_m, targets_m, starts_m, warnings=doubts)
 
     @classmethod
     def _of_map(cls, scenario: Scenario, seed: int) -> "WorldSetup":
@@ -76,8 +77,9 @@ class WorldSetup(NamedTuple):
         left_m, right_m, bottom_m, top_m = ground.frame.extent_m
         over_map = Domain(min_m=(left_m, bottom_m), max_m=(right_m, top_m))
         targets_m = targets_of(msgspec.structs.replace(scenario, domain=over_map), seed)
-        doubts = doubts_of_map(scenario, ground, observable(ground, starts_m))
-        return cls(np.zeros((0, 2)), targets_m, starts_m, ground, (*warnings, *doubts))
+        warnings += doubts_about_images(scenario)
+        warnings += doubts_of_map(scenario, ground, observable(ground, starts_m))
+        return cls(np.zeros((0, 2)), targets_m, starts_m, ground, tuple(warnings))
 
     def poses(self, scenario: Scenario) -> dict[ParticipantId, Pose]:
         """Pose of every participant at time 0."""
@@ -96,9 +98,15 @@ def ground_of(scenario: Scenario) -> tuple[Ground, list[str]]:
     options = scenario.map
     assert options is not None
     if options.file is not None:
-        return read(options.file, options.resolution_m)
+        return read(path_of(options.file), options.resolution_m)
     assert options.layout is not None
     return layout(options.layout, options.size_m, options.resolution_m, options.seed), []
+
+
+def doubts_about(scenario: Scenario) -> list[str]:
+    """Warnings about the files of a scenario, which are the same for every seed. Raises ScenarioError."""
+    of_map = ground_of(scenario)[1] if scenario.mapping else []
+    return [*of_map, *doubts_about_images(scenario)]
 
 
 def units_of(scenario: Scenario, samples: int) -> Units:
