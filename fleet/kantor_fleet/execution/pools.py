@@ -5,6 +5,7 @@ when nothing has completed for a moment, so that its caller can look for signals
 cases that are running.
 """
 
+import asyncio
 import importlib.util
 import logging
 import os
@@ -19,6 +20,7 @@ from itertools import islice
 from multiprocessing.connection import Connection, wait
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, NamedTuple
+from urllib.parse import urlsplit
 
 from kantor_fleet.execution.experiment import Case, Outcome, code, reason, run_case
 from kantor_fleet.execution.fork_server import await_fork_server, fork_server
@@ -66,7 +68,32 @@ def pool(
             Exit.USAGE,
             f"--jobs {jobs}: the cluster at {address} has its own workers; drop one of the two",
         )
+    if address != SLURM and (problem := _problem_of(address)):
+        fail(Exit.USAGE, f"--cluster {address}: {problem}; write HOST:PORT, or slurm")
     return partial(cluster, address=address, jobs=jobs, work=work)
+
+
+def _problem_of(address: str) -> str | None:
+    """Why nothing can be reached at an address of a scheduler, whatever runs there."""
+    try:
+        parts = urlsplit(_with_scheme(address))
+        if parts.scheme not in _SCHEMES:
+            return f"unknown protocol {parts.scheme}; known: {', '.join(_SCHEMES)}"
+        if not parts.hostname:
+            return "no host in it"
+        if not parts.port:
+            return "no port in it"
+    except ValueError as error:
+        return str(error).lower()
+    return "more than a host and a port in it" if parts.path.strip("/") or parts.query else None
+
+
+def _with_scheme(address: str) -> str:
+    return address if "://" in address else f"tcp://{address}"
+
+
+_SCHEMES = ("tcp", "tls", "ucx", "ws", "wss")
+"""Protocols of Dask by which a scheduler is reached."""
 
 
 def local(cases: Iterable[Case], jobs: int, work: Work = run_case) -> Pool:
@@ -200,14 +227,40 @@ def _client(address: str, jobs: int | None) -> Iterator["Client"]:
     with ExitStack() as stack:
         scheduler = stack.enter_context(_slurm(jobs)) if address == SLURM else address
         try:
+            if address != SLURM:
+                asyncio.run(_greet(address))
             client = stack.enter_context(
                 Client(scheduler, timeout=_CONNECT_S, set_as_default=False)
             )
-        except (OSError, ValueError) as error:
+        except Exception as error:  # noqa: BLE001  Dask decodes whatever another server answers
+            problem = str(error) or f"no answer within {_CONNECT_S:g} s"
             raise ClusterError(
-                f"{address}: no Dask scheduler there ({error}); start `dask scheduler`"
+                f"{address}: no Dask scheduler there ({problem}); start `dask scheduler`"
             ) from None
         yield client
+
+
+async def _greet(address: str) -> None:
+    """Ask a scheduler who it is: a Client waits for an answer without end, and cannot be closed without one.
+
+    Raises OSError, TimeoutError, or whatever Dask makes of the answer of another server.
+    """
+    from distributed import Security  # noqa: PLC0415  an extra
+    from distributed.comm import connect  # noqa: PLC0415
+
+    parts = urlsplit(_with_scheme(address))
+    async with asyncio.timeout(_CONNECT_S):
+        _, writer = await asyncio.open_connection(parts.hostname, parts.port)  # refused at once
+        writer.close()
+        options = Security().get_connection_args("client")
+        scheduler = await connect(_with_scheme(address), timeout=_CONNECT_S, **options)
+        try:
+            await scheduler.write({"op": "identity", "reply": True})
+            answer = await scheduler.read()
+        finally:
+            scheduler.abort()
+    if not isinstance(answer, dict) or answer.get("type") != "Scheduler":
+        raise OSError("something else answers")
 
 
 @contextmanager
