@@ -1,5 +1,7 @@
 """The `kantor` command."""
 
+import contextlib
+import io
 import sys
 from collections.abc import Callable
 
@@ -45,6 +47,9 @@ def main() -> None:
     from kantor_protocol.transport.credentials import CredentialsError  # noqa: PLC0415
     from kantor_protocol.transport.session import BusError  # noqa: PLC0415
 
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        with contextlib.suppress(OSError):  # another stream may have taken its place
+            sys.stdout.reconfigure(errors="surrogateescape")  # names of files may be any bytes
     try:
         code = _run(_spread_repeated(sys.argv[1:]))
     except (ScenarioError, CredentialsError) as error:

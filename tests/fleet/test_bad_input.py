@@ -1,5 +1,6 @@
 """Bad input: one clear line that names the place and the remedy, the right exit code, no traceback."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,9 @@ def refused(kantor: "Kantor", *arguments: object) -> tuple[int, str]:
         ("clock.jitter_s=5", "clock.jitter_s: must be below the shortest period"),
         ("radio.drop=1.5", "radio.drop: expected `float` < 1.0"),
         ("radio=3", "radio: expected `object`, got `int`"),
+        ("domain.max_m=[1e308,1e308]", "domain.max_m[0]: 1e+308 is no usable number; stay within"),
+        ("vehicle.speed_m_s=1e308", "vehicle.speed_m_s: 1e+308 is no usable number; stay within"),
+        (".".join("a" * 30000) + "=1", "no key has so many parts"),
     ],
 )
 def test_a_bad_scenario_value_is_refused_by_name(
@@ -205,6 +209,42 @@ def test_a_useless_file_of_samples_is_refused(
 
     assert code == 2
     assert message in line
+
+
+def test_a_name_of_any_bytes_is_a_name(kantor: "Kantor") -> None:
+    """A mission below such a folder leaves a whole record; a missing file is named and leaves none."""
+    name = os.fsdecode(b"caf\xe9")
+    folder = kantor.folder / name
+    folder.mkdir()
+    (folder / "p.csv").write_text("800,700\n810,720\n" * 20)
+    quick = ("energy.points=20", "energy.steps=20", f"samples.file={name}/p.csv")
+    arguments = ("run", "fleet", "--exchange", "in-process", "--set", *quick)
+    assert (
+        "nowhere.csv: no such file"
+        in refused(kantor, *arguments[:-1], f"samples.file={name}/nowhere.csv")[1]
+    )
+
+    for out in ("runs", f"{name}/runs"):
+        finished = kantor(*arguments, "--out", out)
+        assert (finished.code, finished.err) == (0, "")
+        (run,) = (kantor.folder / out).iterdir()
+        assert (run / "result.json").exists()
+        assert kantor("verify", run).code == 0
+
+
+def test_a_scenario_takes_its_own_file_wherever_the_command_runs(kantor: "Kantor") -> None:
+    """Another file of the same name in the current folder is not taken for it."""
+    (kantor.folder / "mine").mkdir()
+    scenario = kantor("scenarios", "show", "office").out
+    text = scenario.replace('layout = "office"', 'file = "m.png"\nresolution_m = 0.1')
+    (kantor.folder / "mine" / "s.toml").write_text(text)
+    painted(kantor.folder, "m.png", 255)
+    painted(kantor.folder / "mine", "m.png", 255, side=50)
+    finished = kantor("run", "mine/s.toml", "--exchange", "in-process", "--set", "limit_s=1")
+
+    assert finished.err == ""
+    (run,) = kantor.runs()
+    assert f'file = "{kantor.folder}/mine/m.png"' in (run / "scenario.toml").read_text()
 
 
 def test_usage_errors_exit_with_two(kantor: "Kantor") -> None:

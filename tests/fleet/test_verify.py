@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from kantor_fleet.execution.in_process_team import team
@@ -17,6 +18,7 @@ from kantor_worldsim.exchange.in_process import InProcessExchange
 from kantor_worldsim.observers.metrics.result import Result
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.record.run_folder import MANIFEST
+from kantor_worldsim.world.inputs import inputs_of
 from kantor_worldsim.world.world import WorldSetup
 from support.strategies import SMALL
 
@@ -141,3 +143,68 @@ def test_absence_that_no_fault_schedules_is_replayed(
     assert result.absences == 3
     assert "participants, all the same" in out
     assert code == Exit.DONE, out
+
+
+def from_points(folder: Path, points: str) -> Scenario:
+    """A small mission whose samples are in a file."""
+    path = folder / "points.csv"
+    path.write_text(points)
+    return parse(SMALL, "small", (f"samples.file={path}", "samples.count=9", "limit_s=1"))
+
+
+def test_an_input_that_has_changed_since_is_told_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The run is executed from its record, and is as sound as it was."""
+    points = "\n".join(f"{x},{x}" for x in range(10, 90, 10))
+    recorded(from_points(tmp_path, points), tmp_path)
+    assert verify(tmp_path) is Exit.DONE
+    assert "inputs" not in capsys.readouterr().out
+
+    from_points(tmp_path, points + "\n11,11")
+    assert verify(tmp_path) is Exit.DONE
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "inputs" in line]
+    assert line.startswith(f"ok    inputs: samples.file {tmp_path / 'points.csv'} has changed")
+
+
+def test_inputs_as_they_were_are_read_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A record that begins with other samples than its files give is found out."""
+    points = "\n".join(f"{x},{x}" for x in range(10, 90, 10))
+    recorded(from_points(tmp_path, points), tmp_path)
+    manifest = json.loads((tmp_path / MANIFEST).read_text())
+    from_points(tmp_path, points.replace("10,10", "10,11"))
+    now = [msgspec.to_builtins(file) for file in inputs_of(from_points(tmp_path, "1,1"))]
+    (tmp_path / MANIFEST).write_text(json.dumps(manifest | {"inputs": now}))
+
+    assert verify(tmp_path) is Exit.NOT_MET
+    assert "FAIL  executed again: record 0 differs" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("inputs", [None, 3, [{"key": 1}], [["a"]], "x"])
+def test_a_manifest_that_does_not_say_its_inputs_is_verified_from_the_record(
+    tmp_path: Path, inputs: object
+) -> None:
+    """As one of an earlier version, or a damaged one."""
+    recorded(from_points(tmp_path, "10,10\n20,20\n"), tmp_path)
+    manifest = json.loads((tmp_path / MANIFEST).read_text())
+    (tmp_path / MANIFEST).write_text(json.dumps(manifest | {"inputs": inputs}))
+    (tmp_path / "points.csv").unlink()
+
+    assert verify(tmp_path) is Exit.DONE
+
+
+@pytest.mark.parametrize("content", [b"[" * 100_000, b"\xff", b"{", b"[]", b'{"format": 2}'])
+def test_a_manifest_that_is_none_is_refused(
+    tmp_path: Path, content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One line with its path, and exit code 2."""
+    (tmp_path / MANIFEST).write_bytes(content)
+    with pytest.raises(SystemExit) as ended:
+        verify(tmp_path)
+
+    err = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert err.startswith(f"kantor: {tmp_path / MANIFEST}: ")
+    assert err.count("\n") == 1

@@ -3,10 +3,12 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -179,6 +181,39 @@ def test_an_unreachable_cluster_ends_with_exit_code_4(
     err = capsys.readouterr().err
     assert err.startswith(f"kantor: {address}: no Dask scheduler there (")
     assert err.count("\n") == 1
+
+
+def test_a_server_that_is_no_scheduler_ends_with_exit_code_4(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whether it answers nothing or something else: one line after a bounded time, and no client is left."""
+    monkeypatch.setattr(pools, "_CONNECT_S", 0.5)
+    for answer in (b"", b"HTTP/1.0 400 Bad Request\r\n\r\n" + b"x" * 4000):
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+            answering = threading.Thread(target=_answer, args=(server, answer), daemon=True)
+            answering.start()
+            start = partial(pools.cluster, address=address)
+            code = sweep(SweepConfig(small_plan(), tmp_path), start)
+            server.shutdown(socket.SHUT_RDWR)
+            answering.join()
+
+        assert code is Exit.UNREACHABLE
+        err = capsys.readouterr().err
+        assert err.startswith(f"kantor: {address}: no Dask scheduler there (")
+        assert err.count("\n") == 1
+
+
+def _answer(server: socket.socket, answer: bytes) -> None:
+    """Answer every connection and keep it open until the server is shut down."""
+    kept = []
+    with suppress(OSError):
+        while True:
+            connection, _ = server.accept()
+            kept.append(connection)
+            connection.sendall(answer)
+    for connection in kept:
+        connection.close()
 
 
 def test_slurm_jobs_are_requested_and_cancelled(kantor: "Kantor", reference: Path) -> None:

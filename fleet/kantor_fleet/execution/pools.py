@@ -69,7 +69,10 @@ def pool(
             f"--jobs {jobs}: the cluster at {address} has its own workers; drop one of the two",
         )
     if address != SLURM and (problem := _problem_of(address)):
-        fail(Exit.USAGE, f"--cluster {address}: {problem}; write HOST:PORT, or slurm")
+        fail(
+            Exit.USAGE,
+            f"--cluster {address}: {problem}; write HOST:PORT, such as localhost:8786, or slurm",
+        )
     return partial(cluster, address=address, jobs=jobs, work=work)
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import msgspec
 
+from kantor_protocol.scenario.file_names import name_of, path_of
+
 _FILE = "worldsim.json"
 
 
@@ -21,7 +23,9 @@ def note(state: Path, run: Path) -> None:
     """Point to the run that this machine is in. Raises OSError."""
     state.mkdir(parents=True, exist_ok=True)
     draft = state / f".{_FILE}"
-    draft.write_bytes(msgspec.json.encode(_ResumePointer(socket.gethostname(), str(run))))
+    draft.write_bytes(
+        msgspec.json.encode(_ResumePointer(socket.gethostname(), name_of(run.absolute())))
+    )
     draft.replace(state / _FILE)
 
 
@@ -31,4 +35,4 @@ def run_in(state: Path) -> Path | None:
         pointer = msgspec.json.decode((state / _FILE).read_bytes(), type=_ResumePointer)
     except (OSError, msgspec.MsgspecError):
         return None
-    return Path(pointer.run) if pointer.machine == socket.gethostname() else None
+    return path_of(pointer.run) if pointer.machine == socket.gethostname() else None

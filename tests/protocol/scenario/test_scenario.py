@@ -15,7 +15,7 @@ from kantor_protocol.base.machine import SUPERVISOR
 from kantor_protocol.scenario.clocks import step_clocks
 from kantor_protocol.scenario.dump import to_toml, to_tree
 from kantor_protocol.scenario.errors import ScenarioError
-from kantor_protocol.scenario.load import from_tree, load, parse, rooted
+from kantor_protocol.scenario.load import from_tree, load, parse
 from kantor_protocol.scenario.schema import PlannerOptions, Scenario
 from kantor_protocol.scenario.validate import is_image
 from kantor_protocol.wire.weights import Units
@@ -294,11 +294,14 @@ def test_files_are_found_beside_the_scenario(tmp_path: Path) -> None:
     assert load(path).samples.file is None
 
 
-def test_absolute_file_is_left_alone() -> None:
-    """An absolute name is a name."""
-    scenario = mission("samples.file='/data/points.npy'")
+def test_absolute_file_is_left_alone(tmp_path: Path) -> None:
+    """An absolute name is a name, in the file and in an override."""
+    path = tmp_path / "mine.toml"
+    path.write_text(SMALL + "[targets]\nfile = '/data/targets.csv'\n")
+    scenario = load(path, ["samples.file='/data/points.npy'"])
 
-    assert rooted(scenario, Path("/elsewhere")).samples.file == "/data/points.npy"
+    assert scenario.targets.file == "/data/targets.csv"
+    assert scenario.samples.file == "/data/points.npy"
 
 
 @pytest.mark.parametrize("name", ["a" * 300 + ".csv", "a\\u0000.csv"])

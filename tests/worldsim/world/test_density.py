@@ -298,6 +298,48 @@ def test_an_image_of_any_mode_is_read(folder: Path, mode: str) -> None:
     assert sampled(path, "samples.count=5", *DOMAIN).shape == (5, 2)
 
 
+@pytest.mark.parametrize("mode", ["LA", "RGBA", "PA"])
+def test_a_transparent_pixel_is_empty(folder: Path, mode: str) -> None:
+    """A pixel is dense as far as it is white and opaque; opaque ones are as without transparency."""
+    grey = np.array([[255, 255], [85, 0]], dtype=np.uint8)
+    alpha = np.array([[0, 85], [255, 255]], dtype=np.uint8)
+    image = Image.fromarray(np.dstack([grey, alpha]), "LA")
+    path = folder / "clear.png"
+    image.convert("RGBA" if mode == "PA" else mode).save(path)
+    if mode == "PA":
+        colours = Image.fromarray(np.array([[1, 2], [3, 0]], dtype=np.uint8), "P")
+        colours.putpalette([0, 0, 0, 255, 255, 255, 255, 255, 255, 85, 85, 85])
+        colours.save(path, transparency=bytes([255, 0, 85, 255]))
+    points = sampled(path, "samples.count=20000", *DOMAIN)
+    left, top = points[:, 0] < 0.0, points[:, 1] > 25.0
+
+    assert not (left & top).any()
+    assert not (~left & ~top).any()
+    assert abs(float((~left & top).mean()) - 0.5) < 0.02
+
+
+def test_a_wholly_transparent_image_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "clear.png"
+    Image.new("RGBA", (3, 3), (255, 255, 255, 0)).save(path)
+
+    with pytest.raises(ScenarioError, match=r"no bright pixel; .* transparent are empty"):
+        sampled(path, "samples.count=5", *DOMAIN)
+
+
+def test_an_image_is_guarded_as_a_map_is(tmp_path: Path) -> None:
+    """By its content: no program that draws, no image that is decoded before its size is known."""
+    path = tmp_path / "a.png"
+    for content, words in (
+        (b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EOF\n", "not a readable image"),
+        (b"GIF89a" + bytes(40), "not a readable image"),
+        (b"P5\n4001 4000\n255\n", "more than 16000000 pixels; scale it down"),
+        (b"P5\n99999999 99999999\n255\n", "more than 16000000 pixels; scale it down"),
+    ):
+        path.write_bytes(content)
+        with pytest.raises(ScenarioError, match=words):
+            sampled(path, "samples.count=5", *DOMAIN)
+
+
 # Bad files: one line that names the key and the file.
 
 
