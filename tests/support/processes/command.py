@@ -109,7 +109,8 @@ class CommandServer:
         socket.send_fds(self._requests, [content], [stdout, stderr, sender])
         for descriptor in (stdout, stderr, sender):
             os.close(descriptor)
-        return Process(status, os.fdopen(out), os.fdopen(err))
+        streams = (os.fdopen(pipe, errors="surrogateescape") for pipe in (out, err))
+        return Process(status, *streams)
 
     def close(self) -> None:
         """End the server."""
