@@ -287,6 +287,7 @@ TOML_TOKENS = tuple(
         *("\x00", "\u202e", "\ud7ff", '"\\ud800"', "a.b.c", "[" * 50, "[" * 5000, "{a=" * 50),
         *('"dubins"', '"min"', '"spectral"', '"centralized"', '"a.csv"', "4611686018427387904"),
         *("1e-9", "1e9", "3", "2000", "from_s = -1\n", "until_s = 0.5\n", 'who = ["r1"]\n'),
+        *("a." * 40 + "a", "a." * 3000 + "a", '"~/a.csv"', '"file:///a%E9.csv"', "\ufeff", "1e308"),
         *("[faults]\n", "[[faults]]\n", "[radio]\n", "drop = 0.5\n", *FAULT_TABLES),
     )
 )
@@ -311,6 +312,13 @@ def chaos_files() -> Mutations:
     return texts(
         (("".join(FAULT_TABLES[i : i + 2])).encode() for i in range(len(FAULT_TABLES))), TOML_TOKENS
     )
+
+
+def manifests() -> Mutations:
+    """JSON of the manifest of a run."""
+    text = b'{"format": 1, "exchange": "wall", "inputs": [\n{"key": "map.file", "name": "/m", "blake2b": null}]}\n'
+    words = (b"[", b"{", b"[" * 3000, b"null", b"1e999", b'"', b"\xff", b"9" * 5000, b'"\\ud800"')
+    return texts((text, text.replace(b"null", b'"ab"')), words)
 
 
 def overrides() -> Mutations:
@@ -398,11 +406,17 @@ def _grey() -> Image.Image:
     return Image.fromarray(cells)
 
 
+def _clear() -> Image.Image:
+    image = _grey().convert("RGBA")
+    image.putalpha(_grey())
+    return image
+
+
 def pictures(*kinds: str) -> Mutations:
     """Small images in these formats."""
     contents = []
     for kind in kinds:
-        for image in (_grey(), _grey().convert("RGBA") if kind == "PNG" else _grey().convert("1")):
+        for image in (_grey(), _clear() if kind == "PNG" else _grey().convert("1")):
             file = BytesIO()
             image.save(file, kind)
             contents.append(file.getvalue())
@@ -427,15 +441,43 @@ def nav2() -> Mutations:
     """YAML of Nav2's map_server, beside an image."""
     words = (b"&a", b"*a", b"{", b"[", b"!!python/object:os.system", b"- ", b".nan", b"1e400", b"~",
              b"raw", b"scale", b"../map.pgm", b"/dev/null", b"<<: ", b"0x1", b"1:30", b"\t", b"---\n",
+             b"<<: *a\n", b"&a {x: 1}\n", b"!!int 1:30", b"59:" * 3000 + b"1", b"- " * 3000, b"[*a, *a]",
+             b"resolution: 0.1\n", b"image: [*a]\n", b"0x" + b"f" * 3000, b"\xff\xfe", b"{" * 3000,
              b"[" * 50, b"? ", b"| ", b"'", b'"', b"2001-01-01", b"%YAML 9\n")  # fmt: skip
     return texts((NAV2, NAV2.replace(b"trinary", b"scale")), words)
 
 
 def tables_of_points() -> Mutations:
     """CSV."""
-    good = (b"1.0,2.0\n3.5,-4\n", b"x,y\n1,2\n3,4\n5,6\n", b"# note\n1e3,2e-3\n\n7,8 # here\n")
+    more = b'y,name,x\n1,"a, # b",2\n3,,4\n'
+    good = (
+        more,
+        b"1.0,2.0\n3.5,-4\n",
+        b"x,y\n1,2\n3,4\n5,6\n",
+        b"# note\n1e3,2e-3\n\n7,8 # here\n",
+    )
     return texts(
-        good, (b",", b",,", b"nan", b"inf", b"1e999", b"#", b"\n", b'"', b"0x1", b"1_0", b"\xff")
+        good,
+        (
+            b",",
+            b",,",
+            b";",
+            b"1e308",
+            b"x,y\n",
+            b"y",
+            b'""',
+            b"\r",
+            b"12.5O",
+            b"nan",
+            b"inf",
+            b"1e999",
+            b"#",
+            b"\n",
+            b'"',
+            b"0x1",
+            b"1_0",
+            b"\xff",
+        ),
     )
 
 

@@ -19,12 +19,14 @@ import tempfile
 import time
 import traceback
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 if __name__ == "__main__":
     sys.path[0] = str(Path(__file__).resolve().parents[1])
 
+from fuzz.decoding import Decode
 from fuzz.targets import TARGETS
 
 BATCH = 500
@@ -33,6 +35,10 @@ _WARM_BATCHES = 20
 """By then whatever is compiled, imported or kept once is there."""
 _STUCK_S = 300.0
 """No input takes so long, however busy the machine is, and kernels to be compiled."""
+INPUT_CPU_S = 10.0
+"""What one input may take of the CPU."""
+INPUT_BYTES = 512 << 20
+"""What one input may add to the peak of memory: the largest image, and room to work on it."""
 _ROOM_BYTES = 1 << 30
 """What a decoder may take at any time beyond what it begins with."""
 _GROWTH_BYTES = 32 << 20
@@ -76,10 +82,12 @@ def fuzz(name: str, seed: int, inputs: int, page: Any = None, first: int = 0) ->
         for batch in range(first, first + -(-inputs // BATCH)):
             contents = inventive.batch(f"{name} {seed} {batch}", min(BATCH, inputs - done))
             decode = target.start(Path(folder))
+            compiling = target.in_kernels and batch == first
+            attempt = decode if compiling else partial(within_limits, decode)
             for i, content in enumerate(contents):
                 _PAGE.pack_into(page, 0, batch, i)
                 try:
-                    taken += decode(content)
+                    taken += attempt(content)
                 except BaseException as error:  # noqa: BLE001  whatever it is, it is a finding
                     why = f"{type(error).__name__}: {error}".splitlines()[0]
                     failure = Failure(batch, i, why, traceback.format_exc())
@@ -96,6 +104,29 @@ def fuzz(name: str, seed: int, inputs: int, page: Any = None, first: int = 0) ->
     if inputs > 2 * _WARM_BATCHES * BATCH and grown > _GROWTH_BYTES:
         failure = Failure(first, -1, f"{grown >> 20} MiB more than before")
     return Tally(name, done, taken, spent_s, before_bytes, held_bytes(), failure)
+
+
+class LimitError(Exception):
+    """An input that cost more than one may."""
+
+
+def within_limits(decode: Decode, content: bytes) -> bool:
+    """What a decoder makes of an input. Raises LimitError if that took more time or memory than its length explains.
+
+    Time is the CPU's, so that other work on the machine does not count; memory is the peak, which never falls.
+    """
+    begun_s, before_bytes = time.process_time(), _peak_bytes()
+    taken = decode(content)
+    spent_s, more_bytes = time.process_time() - begun_s, _peak_bytes() - before_bytes
+    if spent_s > INPUT_CPU_S:
+        raise LimitError(f"{spent_s:.1f} s for an input of {len(content)} bytes")
+    if more_bytes > INPUT_BYTES:
+        raise LimitError(f"{more_bytes >> 20} MiB for an input of {len(content)} bytes")
+    return taken
+
+
+def _peak_bytes() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
 def content_of(name: str, seed: int, inputs: int, batch: int, index: int) -> bytes:

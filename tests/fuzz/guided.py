@@ -17,9 +17,15 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])
 _DECODERS = [
     *(
         f"kantor_protocol.{name}"
-        for name in ("scenario", "transport.credentials", "wire", "node.wal")
+        for name in ("files", "scenario", "transport.credentials", "wire", "node.wal")
     ),
-    *(f"kantor_worldsim.{name}" for name in ("world.maps", "world.density", "record.journal")),
+    *(
+        f"kantor_worldsim.{name}"
+        for name in (
+            *("world.maps", "world.nav2", "world.pictures", "world.points", "world.density"),
+            "record.journal",
+        )
+    ),
     *("kantor_fleet.sweep", "tomllib", "mcap"),
 ]
 

@@ -6,6 +6,7 @@ from fuzz import corpora
 from fuzz.decoders import files, messages, participants, records, replication
 from fuzz.decoding import Target, refuses, stateless
 from fuzz.toml_trees import Trees
+from kantor_protocol.files.toml import TomlError
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.wire.messages import RefusedError, decode_inputs, decode_progress
 
@@ -70,6 +71,9 @@ TARGETS: dict[str, Target] = {
     "scenario-text": Target(
         corpora.scenarios, stateless(refuses(ScenarioError, files.scenario_text))
     ),
+    "scenario-file": Target(corpora.scenarios, files.scenario_file),
+    "toml": Target(corpora.scenarios, stateless(refuses(TomlError, files.toml_text))),
+    "manifest": Target(corpora.manifests, files.manifest),
     "chaos-file": Target(corpora.chaos_files, files.chaos_file),
     "override": Target(corpora.overrides, stateless(refuses(ScenarioError, files.override))),
     "keys": Target(corpora.keys, stateless(files.key_expression)),
@@ -77,6 +81,7 @@ TARGETS: dict[str, Target] = {
     "journal": Target(corpora.journals, stateless(records.journal)),
     "runs-of-sweep": Target(corpora.logs_of_runs, files.runs_of_sweep),
     "map-nav2": Target(corpora.nav2, files.map_file(".yaml")),
+    "inputs-of-map": Target(corpora.nav2, files.inputs_of_map),
     "map-movingai": Target(corpora.moving_ai, files.map_file(".map")),
     "map-pgm": Target(lambda: corpora.pictures("PPM"), files.map_file(".pgm")),
     "map-png": Target(lambda: corpora.pictures("PNG", "BMP"), files.map_file(".png")),
@@ -84,5 +89,8 @@ TARGETS: dict[str, Target] = {
     "points-csv": Target(corpora.tables_of_points, files.points_file(".csv")),
     "points-npy": Target(corpora.arrays_in_files, files.points_file(".npy")),
     "points-image": Target(lambda: corpora.pictures("PNG", "PPM"), files.points_file(".png")),
+    "points-tiff": Target(
+        lambda: corpora.pictures("TIFF", "JPEG", "BMP"), files.points_file(".tif")
+    ),
 }
 """Decoders by name. A name is part of the seed of its inputs: another name meets other inputs."""

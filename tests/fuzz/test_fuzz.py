@@ -2,6 +2,7 @@
 
 import os
 import re
+import time
 from itertools import pairwise
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -22,6 +23,7 @@ SLOW = {
     *("scenario-text", "scenario-tree", "override", "chaos-file", "credentials", "wal-file"),
     *("runs-of-sweep", "map-nav2", "map-movingai", "map-pgm", "map-png", "map-tiff"),
     *("points-csv", "points-npy", "points-image", "mapper", "allocation", "journal"),
+    *("scenario-file", "toml", "manifest", "inputs-of-map", "points-tiff"),
 }
 """Tens of microseconds for an input, or hundreds."""
 
@@ -123,6 +125,40 @@ def test_a_decoder_that_keeps_memory_is_reported(
     assert re.search(r"FAIL \d+ MiB more than before", told)
     assert "--only news --seed 0 --batch 0 --inputs 22000" in told
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("costs", ["time", "memory"])
+def test_an_input_that_costs_too_much_is_reported(
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    costs: str,
+) -> None:
+    """Time of the CPU, or memory at its peak, although the decoder refuses it in the end."""
+
+    def takes_time() -> None:
+        end_s = time.process_time() + 0.2
+        while time.process_time() < end_s:
+            pass
+
+    def takes_memory() -> None:
+        assert len(b"x" * (64 << 20)) == 64 << 20
+
+    def wastes(_folder: Path) -> Decode:
+        take = takes_time if costs == "time" else takes_memory
+        return lambda content: len(content) <= 300 or bool(take())
+
+    monkeypatch.setattr(fuzz, "INPUT_CPU_S", 0.1)
+    monkeypatch.setattr(fuzz, "INPUT_BYTES", 32 << 20)
+    monkeypatch.setitem(TARGETS, "news", TARGETS["news"]._replace(start=wastes))
+    arguments = ["fuzz.py", "--only", "news", "--inputs", "1000", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", arguments)
+
+    assert fuzz.main() == 1
+    unit = " s" if costs == "time" else " MiB"
+    assert re.search(
+        rf"FAIL LimitError: [\d.]+{unit} for an input of \d+ bytes", capfd.readouterr().out
+    )
 
 
 def grown_bytes(pipe: Connection) -> None:

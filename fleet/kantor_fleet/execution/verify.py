@@ -50,12 +50,12 @@ def print_findings(found: "list[Finding]") -> Exit:
 
 def findings(folder: Path, records: list[tuple[bytes, Record]] | None = None) -> "list[Finding]":
     """A finding on the file, on the rules and on the execution. records: the journal, if it has been read."""
-    manifest = _manifest(folder)
+    manifest = read_manifest(folder)
     records = _journal(folder) if records is None else records
     if not records or not isinstance(records[0][1], Opening):
         return [(False, f"{JOURNAL}: no opening record in it")]
     found = list(_findings_on_file(folder, manifest, records))
-    inputs = _inputs_of(manifest)
+    inputs = inputs_in(manifest)
     changes = list(changes_since(inputs))
     if changes:
         found.append(
@@ -73,7 +73,8 @@ def findings(folder: Path, records: list[tuple[bytes, Record]] | None = None) ->
     return found
 
 
-def _manifest(folder: Path) -> dict[str, Any]:
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of a run folder; ends the command if there is none that can be verified."""
     path = folder / MANIFEST
     try:
         manifest = json.loads(read_text(path))
@@ -87,7 +88,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def _inputs_of(manifest: dict[str, Any]) -> tuple[InputFile, ...]:
+def inputs_in(manifest: dict[str, Any]) -> tuple[InputFile, ...]:
     """The files that a run was read from; none if its manifest does not say."""
     try:
         return msgspec.convert(manifest.get("inputs", ()), tuple[InputFile, ...])

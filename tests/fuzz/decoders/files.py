@@ -1,6 +1,8 @@
 """Decoders of texts and files: scenarios, keys, credentials, runs of sweeps, maps and points."""
 
+import tomllib
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -9,15 +11,20 @@ import numpy as np
 from fuzz import corpora
 from fuzz.decoding import Decode, refuses
 from kantor_fleet.execution.experiment import Outcome
+from kantor_fleet.execution.verify import inputs_in, read_manifest
 from kantor_fleet.sweep.journal import RunsJournal
 from kantor_fleet.sweep.plan import SweepError
 from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN
+from kantor_protocol.files.toml import parse_toml
 from kantor_protocol.scenario.dump import to_toml
 from kantor_protocol.scenario.errors import ScenarioError
-from kantor_protocol.scenario.load import from_tree, parse, with_chaos
+from kantor_protocol.scenario.load import from_tree, load, parse, with_chaos
 from kantor_protocol.transport import credentials
 from kantor_protocol.wire import keys
+from kantor_worldsim.record.run_folder import MANIFEST, Past, ResumeError
 from kantor_worldsim.world import density, maps
+from kantor_worldsim.world.inputs import inputs_of
+from support.missions import on_map
 from support.strategies import SMALL, mission
 
 
@@ -35,6 +42,56 @@ def override(content: bytes) -> None:
 def scenario_tree(content: bytes) -> None:
     """A scenario as a tree, packed with msgpack."""
     from_tree(msgspec.msgpack.decode(content), "any")
+
+
+def toml_text(content: bytes) -> None:
+    """TOML that is read is the same as without the guard."""
+    text = content.decode("utf-8", "surrogateescape")
+    assert repr(parse_toml(text)) == repr(tomllib.loads(text))
+
+
+def scenario_file(folder: Path) -> Decode:
+    """The file of a scenario, whose names of files are absolute and text."""
+    path = folder / "scenario.toml"
+
+    def read(content: bytes) -> None:
+        path.write_bytes(content)
+        scenario = load(path)
+        for file in inputs_of(scenario):
+            assert file.path.is_absolute()
+            assert file.name.encode()
+
+    return refuses(ScenarioError, read)
+
+
+def inputs_of_map(folder: Path) -> Decode:
+    """The inputs of a map's file are listed, whatever is in it."""
+    path = folder / "map.yaml"
+    scenario = on_map(f"map={{file='{path}'}}")
+
+    def read(content: bytes) -> bool:
+        path.write_bytes(content)
+        first, *image = inputs_of(scenario)
+        assert first.key == "map.file"
+        assert first.blake2b is not None
+        return bool(image)
+
+    return read
+
+
+def manifest(folder: Path) -> Decode:
+    """The manifest of a run: verified, and gone on from."""
+
+    def read(content: bytes) -> None:
+        (folder / MANIFEST).write_bytes(content)
+        with suppress(ResumeError):
+            Past.of(folder)
+        try:
+            inputs_in(read_manifest(folder))
+        except SystemExit:
+            raise ScenarioError("refused") from None
+
+    return refuses(ScenarioError, read)
 
 
 def chaos_file(folder: Path) -> Decode:
@@ -92,7 +149,8 @@ def map_file(suffix: str) -> Callable[[Path], Decode]:
 
         def read(content: bytes) -> None:
             path.write_bytes(content)
-            ground, _ = maps.read(path)
+            ground, warnings = maps.read(path)
+            assert not any("\n" in line for line in warnings)
             rows, columns = ground.cells.shape
             assert (ground.frame.rows, ground.frame.columns) == (rows, columns)
             assert set(np.unique(ground.cells).tolist()) <= {UNKNOWN, FREE, OCCUPIED}

@@ -11,7 +11,7 @@ from typing import IO, Any, NamedTuple
 
 import msgspec
 
-from kantor_protocol.files.reading import UnreadableError, read_text
+from kantor_protocol.files.reading import read_text
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.records import Ending, Opening, Record
@@ -71,13 +71,13 @@ class Past(NamedTuple):
             manifest = json.loads(read_text(folder / MANIFEST))
             records = [record for _, record in read(folder / JOURNAL)]
             terms = msgspec.convert(manifest, Terms)
-        except (OSError, UnreadableError, json.JSONDecodeError) as error:
+        except msgspec.ValidationError as error:
+            raise ResumeError(f"{folder / MANIFEST}: of another version: {error}") from None
+        except (OSError, ValueError) as error:  # no file, no text, or no JSON
             reason = error.strerror if isinstance(error, OSError) else str(error)
             raise ResumeError(
                 f"{folder}: no run to go on with ({reason}); give its folder"
             ) from None
-        except msgspec.ValidationError as error:
-            raise ResumeError(f"{folder / MANIFEST}: of another version: {error}") from None
         if not records or not isinstance(records[0], Opening):
             raise ResumeError(f"{folder / JOURNAL}: nothing has happened in it; start the run anew")
         last = records[-1]

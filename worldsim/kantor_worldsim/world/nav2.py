@@ -74,21 +74,28 @@ def image_of(path: Path, name: str) -> Path:
     if name.startswith("~/"):
         return Path(name).expanduser()
     beside = path.parent / name
-    if beside.exists() or not path.is_symlink():
+    if not path.is_symlink() or _is_there(beside):
         return beside
     behind = path.resolve().parent / name
-    if not behind.exists():
+    if not _is_there(behind):
         raise ScenarioError(
             f"map.file: {path}: image {beside}: no such file, and none at {behind}, beside what it links to"
         )
     return behind
 
 
+def _is_there(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError:  # a name that is too long, or a folder that may not be entered
+        return False
+
+
 def image_named_in(path: Path) -> Path | None:
     """The image of a map's YAML file; None if the file cannot be read. Raises nothing."""
     try:
         return image_of(path, read_config(path)[0].image)
-    except (ScenarioError, OSError, ValueError):
+    except ScenarioError:
         return None
 
 
