@@ -92,7 +92,7 @@ def inputs_in(manifest: dict[str, Any]) -> tuple[InputFile, ...]:
     """The files that a run was read from; none if its manifest does not say."""
     try:
         return msgspec.convert(manifest.get("inputs", ()), tuple[InputFile, ...])
-    except msgspec.ValidationError:
+    except (msgspec.ValidationError, UnicodeEncodeError):  # JSON may hold what is no text
         return ()
 
 
