@@ -119,7 +119,7 @@ def _ship_packed(
         counters,
     )
     # Of the configuration, spending reads only whose log it is and whether it is a ledger.
-    config = ReplicaConfig(me, ledger != 0, False, False, False, 0, 0, 0, 0)
+    config = ReplicaConfig(me, ledger != 0, False, False, False, 0, 0, 0, 0, 0, 0)
     count = ship(grid, store, config, x, y, point, _Shipment(best, near, sample, units))
     used: int = pack_pairs(sample, units, count, out)
     return used

@@ -5,10 +5,7 @@ from collections import deque
 
 from kantor_protocol.base.machine import Envelope, Inputs
 from kantor_protocol.scenario.clocks import step_clocks
-from kantor_protocol.wire.messages import Mission, StartClock
-
-INBOX_MAX = 4096
-"""Envelopes that wait for the next step of a participant that holds; the oldest are dropped for newer ones."""
+from kantor_protocol.wire.messages import INBOX_MAX, Mission, StartClock
 
 
 class WallClock:
@@ -20,7 +17,7 @@ class WallClock:
         self.skew_ns = start.skew_ns
         """The lead of the clock that the machine reads over this one."""
         self.inbox: deque[Envelope] = deque(maxlen=INBOX_MAX)
-        """Envelopes since the last step, in order of arrival."""
+        """Envelopes since the last step, in order of arrival; the oldest are dropped for newer ones."""
         self.reported_ns = 0
         """Time of the last report, by the monotonic clock."""
         self._observation = start.observation

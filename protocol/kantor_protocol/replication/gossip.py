@@ -3,11 +3,19 @@
 import math
 from collections.abc import Callable, Iterable
 
+import numpy as np
+
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
-from kantor_protocol.replication.registers import Registers
+from kantor_protocol.replication.registers import Registers, are_registers
 from kantor_protocol.replication.replica import Replica
-from kantor_protocol.replication.replica_kernels import NO_INDEX
-from kantor_protocol.scenario.clocks import step_clocks
+from kantor_protocol.replication.replica_kernels import (
+    LENGTH_MAX,
+    NO_INDEX,
+    ReplicaArrays,
+    ReplicaConfig,
+    is_mergeable,
+)
+from kantor_protocol.scenario.clocks import step_clocks, steps_max
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import (
     VERSION,
@@ -16,6 +24,7 @@ from kantor_protocol.wire.messages import (
     decode_gossip,
     encode_gossip,
 )
+from kantor_protocol.wire.version_vector import count_ids
 from kantor_protocol.wire.weights import Units
 
 CONTACT_PERIODS = 8
@@ -102,6 +111,8 @@ def build_replica(
         relay=relay,
         beacon=beacon,
         ack_timeout_steps=timeout_steps,
+        length_max=log_length_max(scenario, units, samples),
+        stamp_max=steps_max(scenario),
         registers=Registers(
             incarnation_id,
             roster,
@@ -110,7 +121,82 @@ def build_replica(
             relay=relay,
             beacon=beacon,
             ack_timeout_steps=timeout_steps,
+            stamp_max=steps_max(scenario),
         ),
+    )
+
+
+_ENTRIES_PER_CELL = 32
+"""On a map with a noisy sensor a cell may change its kind many times."""
+_RANGES_PER_STEP = 8
+"""More than any scan shares."""
+
+
+def log_length_max(scenario: Scenario, units: Units | None, samples: int) -> int:
+    """No origin of a mission writes more entries. units, samples: see `build_replica`.
+
+    On a map: a small multiple of the cells, and a few ranges in each step. ledger: an entry ships one unit at least,
+    and the energy of the team lasts for so many. min: every entry lowers a weight by one unit at least.
+    """
+    if units is None:
+        return _ENTRIES_PER_CELL * samples + _RANGES_PER_STEP * steps_max(scenario)
+    if scenario.merge == "ledger":
+        points = max(scenario.energy.points, scenario.steps_per_robot)
+        return min(points * units.point, LENGTH_MAX)
+    return min(samples * units.sample, LENGTH_MAX)
+
+
+class MessageCheck:
+    """The checks of every receiver on arrival, for one who is no participant and holds nothing."""
+
+    def __init__(self, scenario: Scenario, units: Units | None, samples: int) -> None:
+        """units, samples: see `build_replica`."""
+        self._roster = len(scenario.roster)
+        self._parts = 2 if scenario.claiming else 1
+        self._width = scenario.register_width
+        self._sums = not scenario.mapping
+        self._stamp_max = steps_max(scenario)
+        ledger = scenario.mapping or scenario.merge == "ledger"
+        config = ReplicaConfig(
+            me=NO_INDEX,
+            ledger=ledger,
+            claims=scenario.claiming,
+            relay=False,
+            beacon=False,
+            ack_timeout_steps=1,
+            value_max=0 if units is None else units.point if ledger else units.sample,
+            bound=samples,
+            roster=self._roster,
+            length_max=log_length_max(scenario, units, samples),
+            stamp_max=self._stamp_max,
+        )
+        self._fields = (*_nothing_held(self._roster), np.array(config, dtype=np.int64))
+
+    def passes(self, source: int, message: GossipMessage) -> bool:
+        """Whether every participant but its sender would take a message. source: the sender's incarnation id."""
+        vector, registers = message.version_vector, message.registers
+        if registers:
+            covered = count_ids(vector, self._roster, self._parts)
+            if not are_registers(
+                registers, covered, self._width, sums=self._sums, stamp_max=self._stamp_max
+            ):
+                return False
+        return bool(is_mergeable(*self._fields, vector, message.logs, message.claims, source))
+
+
+def _nothing_held(origins: int) -> ReplicaArrays:
+    """Arrays without an entry, which checks may read."""
+    none32, none64 = np.zeros(0, dtype=np.int32), np.zeros(3, dtype=np.int64)
+    return ReplicaArrays(
+        weights=none32,
+        logs=np.zeros((1, 1, 2), dtype=np.int32),
+        length=np.zeros(origins, dtype=np.int64),
+        known=np.zeros((1, 1), dtype=np.int32),
+        sending=np.zeros((1, 1), dtype=np.int64),
+        claims=np.zeros((4, origins), dtype=np.int64),
+        lowered=none32,
+        mark=none32,
+        counters=none64,
     )
 
 

@@ -32,6 +32,7 @@ from kantor_protocol.wire.version_vector import raise_entries
 Register = npt.NDArray[np.int64]
 
 STAMP_MAX = 1 << 40
+"""No register of any mission was written more often."""
 NUMBER_MAX = 1 << 52
 """Sums over a thousand origins stay within 64 bits."""
 _BYTES_MAX = 48 * 1024
@@ -68,7 +69,7 @@ def _read_head(
 
 
 @kernel
-def _is_well_formed(content: bytes, covered: int, width: int, sums: bool) -> bool:
+def _is_well_formed(content: bytes, covered: int, width: int, sums: bool, stamp_max: int) -> bool:
     """Whether content is the stamps of `covered` origins, and then whole registers of theirs.
 
     sums: the first number of a register bounds the others, as the number of visits bounds every sum over
@@ -77,10 +78,12 @@ def _is_well_formed(content: bytes, covered: int, width: int, sums: bool) -> boo
     at = 0
     for _ in range(covered):
         stamp, at = read_uint(content, at)
-        if at < 0 or stamp > STAMP_MAX:
+        if at < 0 or stamp > stamp_max:
             return False
     while at < len(content):
-        _origin, _stamp, numbers, at = _read_head(content, at, covered, width)
+        _origin, stamp, numbers, at = _read_head(content, at, covered, width)
+        if stamp > stamp_max:
+            return False
         bound = NUMBER_MAX
         for i in range(numbers):
             number, at = read_int(content, at)
@@ -205,16 +208,19 @@ class Registers:
         relay: bool = False,
         beacon: bool = False,
         ack_timeout_steps: int = 2,
+        stamp_max: int = STAMP_MAX,
     ) -> None:
         """Registers without a write.
 
         me: its incarnation id. roster: participants in the roster. width: integers in a register, or 0. sums:
-        registers are sums, the first number of which is the largest in size.
+        registers are sums, the first number of which is the largest in size. stamp_max: no origin writes more often
+        in this mission.
         """
         self.me = me
         """One of the origins."""
         self._roster = roster
         self._sums = sums
+        self._stamp_max = min(stamp_max, STAMP_MAX)
         self._settings = np.array([me, relay, beacon, max(1, ack_timeout_steps)], dtype=np.int64)
         self.step = 0
         """The current step."""
@@ -295,8 +301,9 @@ class Registers:
 
         covered: incarnation ids that its sender knows.
         """
-        width = self.total.shape[0]
-        return width > 0 and bool(_is_well_formed(content, covered, width, self._sums))
+        return are_registers(
+            content, covered, self.total.shape[0], sums=self._sums, stamp_max=self._stamp_max
+        )
 
     def merge(self, source: int, content: bytes, covered: int) -> None:
         """Merge well-formed content of an origin. There must be room for `covered` origins."""
@@ -360,6 +367,16 @@ class Registers:
         assert not self._updated[unwritten | ~others].any()
         assert ((self._sent[0] >= 0) & (self._sent[0] <= self.stamps)).all()
         assert ((self._sent[1] >= 0) & (self._sent[1] <= self.step)).all()
+
+
+def are_registers(
+    content: bytes, covered: int, width: int, *, sums: bool, stamp_max: int = STAMP_MAX
+) -> bool:
+    """Whether content is well-formed, whole; without registers (width 0) none is. See `Registers`.
+
+    covered: incarnation ids that its sender knows.
+    """
+    return width > 0 and bool(_is_well_formed(content, covered, width, sums, stamp_max))
 
 
 @kernel

@@ -41,7 +41,7 @@ import numpy.typing as npt
 
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX, known_ids
 from kantor_protocol.base.varint import Pairs
-from kantor_protocol.replication.registers import Registers
+from kantor_protocol.replication.registers import STAMP_MAX, Registers
 from kantor_protocol.replication.replica_kernels import (
     ENTRIES_MAX,
     HISTORY,
@@ -88,6 +88,8 @@ class Replica:
         relay: bool = False,
         beacon: bool = False,
         ack_timeout_steps: int = 2,
+        length_max: int = LENGTH_MAX,
+        stamp_max: int = STAMP_MAX,
         registers: Registers | None = None,
     ) -> None:
         """An empty replica. Raises ValueError for an incarnation too many.
@@ -111,6 +113,8 @@ class Replica:
             value_max=units.point if ledger else units.sample,
             bound=samples,
             roster=roster,
+            length_max=min(length_max, LENGTH_MAX),
+            stamp_max=stamp_max,
         )
         """`me` is one of the origins."""
         self._initial_weight = units.sample
@@ -295,9 +299,10 @@ class Replica:
         assert (store.length >= 0).all()
         if config.ledger:
             assert (store.length <= store.logs.shape[1]).all()
+            assert (np.delete(store.length, config.me) <= config.length_max).all()
         else:
             assert store.length[config.me] <= store.logs.shape[1]
-            assert (store.length <= 2 * LENGTH_MAX).all()
+            assert (store.length <= config.length_max).all()
         for log in self._held_logs():
             assert (log >= 0).all()
             assert (log[:, 0] < config.bound).all()

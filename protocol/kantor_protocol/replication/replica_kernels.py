@@ -31,7 +31,7 @@ _REPEATED_ENTRIES = 32
 for the acknowledgement instead: there are dozens of them a step, and a late cell does no harm."""
 
 LENGTH_MAX = 1 << 40
-"""No log is longer; it keeps sums of positions within 64 bits."""
+"""No log of any mission is longer; it keeps sums of positions within 64 bits."""
 
 KNOWN_MAX = (1 << 31) - 2
 """More is not remembered of what another holds: it fits into 32 bits, and no log gets so long."""
@@ -59,8 +59,8 @@ class ReplicaArrays(NamedTuple):
     """(n, capacity, 2) entries: sample, value. min: (1, capacity, 2), the own log only. Of row i, `length[i]`
     entries count. Samples are below `ReplicaConfig.bound`, values between 0 and `ReplicaConfig.value_max`."""
     length: npt.NDArray[np.int64]
-    """(n,) entries held of each log, at most its capacity. min: of other origins, how much has been merged, at most
-    twice LENGTH_MAX."""
+    """(n,) entries held of each log, at most its capacity. min: of other origins, how much has been merged.
+    Of other origins at most `ReplicaConfig.length_max`."""
     known: npt.NDArray[np.int32]
     """(n, 2n) what each origin is known to hold: log lengths, then claim stamps; each between 0 and KNOWN_MAX. 0 in
     the own row, in rows of origins from which nothing was received, and for stamps in missions without claims."""
@@ -103,6 +103,10 @@ class ReplicaConfig(NamedTuple):
     """Every index in a log is below it."""
     roster: int
     """Participants in the roster; incarnation ids come in blocks of so many."""
+    length_max: int
+    """No origin writes a longer log in this mission; at most LENGTH_MAX."""
+    stamp_max: int
+    """No claim has a later stamp in this mission."""
 
 
 @kernel
@@ -170,7 +174,7 @@ def _walk_suffixes(
         count, at = read_uint(suffixes, at)
         if at < 0 or origin >= covered or count > span or count > len(suffixes):
             return -1
-        if start > LENGTH_MAX or span > LENGTH_MAX:
+        if start > config.length_max or span > config.length_max - start:
             return -1
         if (ledger and count != span) or (not ledger and origin != source):
             return -1
@@ -210,7 +214,7 @@ def _walk_claims(
         stamp, at = read_uint(claims, at)
         sample, at = read_uint(claims, at)
         since, at = read_uint(claims, at)
-        if at < 0 or origin >= covered or sample > store.weights.shape[0]:
+        if at < 0 or origin >= covered or sample > config.bound or stamp > config.stamp_max:
             return -1
         if apply and origin != config.me and stamp > store.claims[STAMP, origin]:
             store.claims[SAMPLE, origin] = sample - 1
@@ -251,7 +255,60 @@ def config_of(settings: np.ndarray) -> ReplicaConfig:
         settings[6],
         settings[7],
         settings[8],
+        settings[9],
+        settings[10],
     )
+
+
+@kernel
+def _check(
+    store: ReplicaArrays,
+    config: ReplicaConfig,
+    version_vector: bytes,
+    suffixes: bytes,
+    claimed: bytes,
+    source: int,
+) -> int:
+    """Check a message whole: how many entries some log may hold after it, or MALFORMED."""
+    covered = count_ids(version_vector, config.roster, 2 if config.claims else 1)
+    if not 0 <= source < covered or source == config.me:
+        return MALFORMED
+    longest = _walk_suffixes(store, config, suffixes, source, covered, False)
+    if longest < 0 or _walk_claims(store, config, claimed, covered, False) < 0:
+        return MALFORMED
+    return longest
+
+
+@kernel
+def is_mergeable(
+    weights: np.ndarray,
+    logs: np.ndarray,
+    length: np.ndarray,
+    known: np.ndarray,
+    sending: np.ndarray,
+    claims: np.ndarray,
+    lowered: np.ndarray,
+    mark: np.ndarray,
+    counters: np.ndarray,
+    settings: np.ndarray,
+    version_vector: bytes,
+    suffixes: bytes,
+    claimed: bytes,
+    source: int,
+) -> bool:
+    """Whether `merge` would take a message. Arguments: as for `merge`; nothing changes."""
+    store = ReplicaArrays(
+        weights,
+        logs,
+        length,
+        known,
+        sending,
+        claims,
+        lowered,
+        mark,
+        counters,
+    )
+    return _check(store, config_of(settings), version_vector, suffixes, claimed, source) >= 0
 
 
 @kernel
@@ -290,10 +347,8 @@ def merge(
     )
     config = config_of(settings)
     covered = count_ids(version_vector, config.roster, 2 if config.claims else 1)
-    if not 0 <= source < covered or source == config.me:
-        return MALFORMED
-    longest = _walk_suffixes(store, config, suffixes, source, covered, False)
-    if longest < 0 or _walk_claims(store, config, claimed, covered, False) < 0:
+    longest = _check(store, config, version_vector, suffixes, claimed, source)
+    if longest < 0:
         return MALFORMED
     if covered > length.shape[0]:
         return -covered

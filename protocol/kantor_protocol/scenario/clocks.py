@@ -64,5 +64,17 @@ def step_clocks(scenario: Scenario, seed: int) -> dict[ParticipantId, StepClock]
     return made
 
 
+def steps_max(scenario: Scenario) -> int:
+    """The most steps that any participant can make in a mission, whatever the seed."""
+    clock = scenario.clock
+    turns = scenario.robots.count if scenario.centralized and clock.order == "turn" else 1
+    shortest = scenario.period_ns * (1.0 - clock.spread) * (1.0 - clock.drift_ppm * 1e-6) / turns
+    return _SPARE_STEPS + int(scenario.limit_ns / max(1.0, shortest))
+
+
+_SPARE_STEPS = 1000
+"""Steps that are due before the limit and made after it, and rounding."""
+
+
 def _signed(seed: int, purpose: Purpose, who: int) -> float:
     return float(np.float64(2.0 * uniform(seed, int(purpose), who, 0, 0) - 1.0))

@@ -1,8 +1,10 @@
 """Rate limits of participants: a token bucket of messages and of bytes, without a clock of its own.
 
-Each request grants one reply, however fast requests follow each other; unsolicited messages draw on tokens that
-accrue with time. A correct participant answers each request once, sends no more by itself than one report for each
-step of its clock, and repeats a report now and then. Messages beyond the quota are dropped.
+Each request for a step grants one reply, however fast requests follow each other; nothing else that world-sim sends
+grants anything, so that no message pays for itself. Unsolicited messages draw on tokens that accrue with time. A
+report costs as much as it causes: one token for each envelope to the whole team, less for one to a few. A correct
+participant answers each request once, sends no more by itself than one report with one envelope for each step of its
+clock, and repeats a report now and then. Messages beyond the quota are dropped.
 """
 
 from collections.abc import Iterable
@@ -88,6 +90,19 @@ class TokenBucket:
             return False
         self._messages -= 1.0
         self._bytes -= size
+        return True
+
+    def charge(self, work: float, now_s: float) -> bool:
+        """Whether the work that an admitted message causes is within the quota; if so, it is charged.
+
+        work: in messages; the message itself has been charged for one.
+        """
+        self._fill(now_s)
+        more = max(0.0, work - 1.0)
+        if self._messages < more:
+            self._excess_messages += 1
+            return False
+        self._messages -= more
         return True
 
     def _fill(self, now_s: float) -> None:

@@ -12,10 +12,11 @@ A client connects again by itself when world-sim comes back: its token and its s
 that world-sim sees it join with the nonce that it had.
 """
 
+import contextlib
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -120,9 +121,16 @@ class HubRouter(Router):
         blocking: wait while the queue is full, up to 0.2 s, instead of dropping the message.
         """
         congestion = self._block if blocking else self._drop
-        if blocking:  # messages that may be dropped request nothing
-            self._buckets[name].grant_reply()
         self._session.put(self._rx[name], payload, congestion_control=congestion, express=True)
+
+    def grant_reply(self, name: ParticipantId) -> None:
+        """Let a participant answer the request that is sent to it next."""
+        self._buckets[name].grant_reply()
+
+    def charge(self, name: ParticipantId, work: float) -> bool:
+        """Charge a participant for the work that one of its messages causes; whether that is within its quota."""
+        with self._charging(name) as bucket:
+            return bucket.charge(work, time.monotonic())
 
     def limit(self, quotas: Mapping[ParticipantId, RateLimit]) -> None:
         """Set the quotas of participants; before that, little more than replies is admitted."""
@@ -156,15 +164,20 @@ class HubRouter(Router):
 
     def _admits(self, name: ParticipantId, size: int) -> bool:
         """Whether a message or a token of a participant is within its quota."""
-        bucket = self._buckets.get(name)
-        if bucket is None:
+        if name not in self._buckets:
             return False
+        with self._charging(name) as bucket:
+            return bucket.admit(size, time.monotonic())
+
+    @contextlib.contextmanager
+    def _charging(self, name: ParticipantId) -> Iterator[TokenBucket]:
+        """The bucket of a participant, for one thread at a time; the first excess is an event."""
         with self._admitting:  # messages and tokens come in different threads
+            bucket = self._buckets[name]
             exceeded_before = bucket.exceeded
-            admitted = bucket.admit(size, time.monotonic())
+            yield bucket
             if bucket.exceeded and not exceeded_before:
                 self._events.put(Flooded(name))
-            return admitted
 
 
 class RefusalResponder:

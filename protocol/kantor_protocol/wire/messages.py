@@ -6,11 +6,12 @@ that does not decode, has another version or a number that is not finite is refu
 """
 
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta, Raw
 
 from kantor_protocol.base.grid import Frame
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX
@@ -22,6 +23,12 @@ BODY_BYTES_MAX = 262_144
 """The longest body of an envelope."""
 MESSAGE_BYTES_MAX = 4 * 1024 * 1024
 """The longest message from a participant to world-sim."""
+OUTBOX_MAX = 8
+"""Envelopes in one report, at most; every participant of this version sends one a step."""
+INBOX_MAX = 4096
+"""Envelopes in one inbox, at most; so many wait for the next step of a participant that holds."""
+NONCE_MAX = 64
+"""Characters of a nonce, at most."""
 
 
 class RefusedError(ValueError):
@@ -194,11 +201,44 @@ class Progress(_Message, frozen=True, array_like=True, tag=22):
     """On a map: the distance that all robots have driven."""
 
 
+_NIL = Raw(b"\xc0")
+
+
+class _OutputsShape(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """Outputs, of which only the number of envelopes is looked at."""
+
+    step: Raw
+    pose: Raw
+    goal: Raw = _NIL
+    spent: Raw = _NIL
+    lowered: Raw = _NIL
+    weights: Raw = _NIL
+    outbox: Annotated[tuple[Raw, ...], Meta(max_length=OUTBOX_MAX)] = ()
+
+
+class _ReportShape(msgspec.Struct, frozen=True, array_like=True, tag=6, gc=False):
+    """A Report, of which only numbers of items are looked at: nothing in it is decoded or copied."""
+
+    version: Raw
+    nonce: Annotated[str, Meta(max_length=NONCE_MAX)]
+    outputs: _OutputsShape
+    now_ns: Raw = _NIL
+    heard: Annotated[tuple[Raw, ...], Meta(max_length=INBOX_MAX)] = ()
+
+
+class _ReadyShape(msgspec.Struct, frozen=True, array_like=True, tag=7, gc=False):
+    """A Ready, likewise."""
+
+    version: Raw
+    nonce: Annotated[str, Meta(max_length=NONCE_MAX)]
+
+
 FromParticipant = Report | Ready
 ToParticipant = Mission | Refusal | StartClock | StepRequest | Stop
 
 _ENCODER = msgspec.msgpack.Encoder()
 _FROM_PARTICIPANT = msgspec.msgpack.Decoder(FromParticipant)
+_SHAPE = msgspec.msgpack.Decoder(_ReportShape | _ReadyShape)
 _TO_PARTICIPANT = msgspec.msgpack.Decoder(ToParticipant)
 _PROGRESS = msgspec.msgpack.Decoder(Progress)
 
@@ -238,9 +278,10 @@ def decode_gossip(body: bytes) -> GossipMessage:
 
 
 def decode_from_participant(payload: bytes) -> FromParticipant:
-    """A message on `<id>/tx`. Raises RefusedError."""
+    """A message on `<id>/tx`. Raises RefusedError; for one with too many items before any of them is decoded."""
     if len(payload) > MESSAGE_BYTES_MAX:
         raise RefusedError(f"message of {len(payload)} bytes")
+    _decoded(_SHAPE, payload)
     message: FromParticipant = _checked(_FROM_PARTICIPANT, payload)
     if isinstance(message, Report):
         check_outputs(message.outputs)

@@ -16,6 +16,8 @@ from kantor_protocol.base.varint import Pairs
 
 Weights = npt.NDArray[np.signedinteger]
 
+SAMPLES_MAX = 50_000_000
+"""Samples of a mission, at most."""
 _SIZES = (np.dtype("<u1"), np.dtype("<u2"), np.dtype("<u4"))
 
 
@@ -118,20 +120,25 @@ class WeightsPublisher:
 class WeightsSubscriber:
     """Rebuilds a robot's exact weight vector from the messages on its weights key."""
 
-    def __init__(self) -> None:
+    def __init__(self, size: int | None = None) -> None:
+        """size: N, if it is known: a message about another number of samples is malformed."""
         self.weights: Weights | None = None
         """None until the first keyframe, and again after a gap until the next one."""
+        self._size = size
         self._sequence = 0
         self._pairs = Pairs()
         self._decoder = msgspec.msgpack.Decoder(WeightsMessage)
 
     def apply(self, payload: bytes) -> bool:
-        """Apply a message; False when it is malformed or does not follow the last one."""
+        """Apply a message; False when it is malformed or does not follow the last one.
+
+        A keyframe is inflated only once its size is known to be possible, and never beyond it.
+        """
         try:
             message = self._decoder.decode(payload)
         except (msgspec.MsgspecError, RecursionError):
             return False
-        if message.version != 1 or not 0 < message.size <= 50_000_000:
+        if message.version != 1 or not self._is_possible(message.size):
             return False
         if message.base == 0:
             weights = _from_keyframe(message.content, message.size)
@@ -142,11 +149,15 @@ class WeightsSubscriber:
             self.weights is None
             or message.base != self._sequence
             or message.size != self.weights.shape[0]
-        ) or not self._apply(self.weights, message.content):
+            or not self._apply(self.weights, message.content)
+        ):
             self.weights = None
             return False
         self._sequence = message.sequence
         return True
+
+    def _is_possible(self, size: int) -> bool:
+        return 0 < size <= SAMPLES_MAX and self._size in (None, size)
 
     def _apply(self, weights: Weights, content: bytes) -> bool:
         pairs = self._pairs.decode(content, weights.shape[0])
@@ -162,7 +173,13 @@ def _keyframe(weights: Weights) -> bytes:
     return zlib.compress(weights.astype(kind).tobytes(), 6)
 
 
+def weights_bytes_max(size: int) -> int:
+    """No message about so many weights is longer: five bytes for an entry, or nine for one that changed."""
+    return 16 * size + 1024
+
+
 def _from_keyframe(content: bytes, size: int) -> Weights | None:
+    """(size,) inflated weights, never more; None if it is malformed."""
     inflate = zlib.decompressobj()
     try:
         raw = inflate.decompress(content, 4 * size + 1)

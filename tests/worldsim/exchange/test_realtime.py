@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_protocol.base.machine import Envelope
-from kantor_protocol.node.wall_clock import INBOX_MAX
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import INBOX_MAX
 from kantor_worldsim.engine.process_faults import schedule_of
 from kantor_worldsim.exchange.config import needs_process_control
 from kantor_worldsim.exchange.fault_injector import world_starts_ns

@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterable
 
 import msgspec
 
-from kantor_protocol.base.machine import WORLD_SIM, Body, ParticipantId
+from kantor_protocol.base.incarnations import INCARNATIONS_MAX
+from kantor_protocol.base.machine import EVERYBODY, WORLD_SIM, Body, Outputs, ParticipantId
 from kantor_protocol.transport.events import Flooded, Joined, Left, Received
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import LEASE_MS, BusError
@@ -29,8 +30,10 @@ from kantor_protocol.wire.messages import (
     encode,
 )
 from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.admission import Admission
 from kantor_worldsim.exchange.config import MissionConfig, late_participants
 from kantor_worldsim.exchange.membership import REFUSALS, JoinDecision, Membership
+from kantor_worldsim.observers.metrics.result import RefusedReports
 from kantor_worldsim.observers.progress import PROGRESS_S, ProgressReporter
 from kantor_worldsim.record.process_events import ProcessEventKind
 from kantor_worldsim.record.records import ProcessEvent, Record
@@ -44,6 +47,8 @@ RETRY_S = 1.0
 seen before it can be reached."""
 POLL_S = 0.02
 """Interval at which an awaited condition is checked."""
+_REASONS_MAX = 5
+"""Reasons for refused reports of one participant that are kept."""
 
 
 class Lobby:
@@ -58,8 +63,12 @@ class Lobby:
         reporter: ProgressReporter,
         stopped: Callable[[], bool],
         say: Callable[[str], None],
+        admission: Admission | None = None,
     ) -> None:
-        """run: the run's name, which processes compare with that in their write-ahead log. say: prints a line."""
+        """run: the run's name, which processes compare with that in their write-ahead log. say: prints a line.
+
+        admission: has observed all records so far; by default one of a mission that begins.
+        """
         self.refused = 0
         """Messages that were malformed, or from a process that does not play that participant."""
         self._host = host
@@ -69,6 +78,10 @@ class Lobby:
         self._reporter = reporter
         self._stopped = stopped
         self._say = say
+        self._admission = admission or Admission(config.scenario, config.setup)
+        self._refused_reports: dict[ParticipantId, RefusedReports] = {}
+        self._unsound: set[ParticipantId] = set()
+        """Participants whose last report was refused."""
         self._membership = Membership(config.scenario.roster)
         self._ready: dict[ParticipantId, str] = {}
         """Nonce of the process that plays each ready participant: on the bus, and with its mission."""
@@ -141,6 +154,8 @@ class Lobby:
             absent = name not in self._ready and name not in self._excused
             if absent and name not in self._away and self._simulation.acted(name):
                 self._note(name, ProcessEventKind.LEAVE)
+            elif not absent and self._is_reborn(name):
+                self._lose(name)
             if absent:
                 self._away.add(name)
             elif name in self._away:
@@ -190,13 +205,18 @@ class Lobby:
 
     # For the exchanges.
 
+    @property
+    def roster(self) -> tuple[ParticipantId, ...]:
+        """All participants of the mission."""
+        return self._config.scenario.roster
+
     def is_ready(self, name: ParticipantId) -> bool:
         """Whether a participant's process is on the bus and has its mission."""
         return name in self._ready
 
     def is_expected(self, name: ParticipantId) -> bool:
-        """Whether a participant may answer."""
-        return name in self._ready or name in self._doubtful
+        """Whether a participant may answer, and has not just answered with what is refused."""
+        return name in self._ready.keys() | self._doubtful and name not in self._unsound
 
     def is_present(self, name: ParticipantId) -> bool:
         """Whether a process that plays a participant is on the bus."""
@@ -211,9 +231,13 @@ class Lobby:
         return self._last_ready[name]
 
     @property
-    def latest_ready_ns(self) -> int:
-        """The latest simulated time that a participant reported when it became ready; 0 if none has."""
-        return max((ready.now_ns for ready in self._last_ready.values()), default=0)
+    def ready_ns(self) -> int:
+        """The simulated time by the clocks of those that became ready: their median, which no single one can push.
+
+        0 if no clock runs.
+        """
+        running_ns = sorted(ready.now_ns for ready in self._last_ready.values() if ready.now_ns > 0)
+        return running_ns[(len(running_ns) - 1) // 2] if running_ns else 0
 
     def excuse(self, name: ParticipantId) -> None:
         """Expect a participant to be absent, because of a fault."""
@@ -234,6 +258,15 @@ class Lobby:
     def forget_newcomers(self) -> None:
         """Drop the newcomers; in lockstep no clock is started for them."""
         self._newcomers.clear()
+
+    @property
+    def refused_reports(self) -> dict[ParticipantId, RefusedReports]:
+        """The reports that were refused, of each participant that sent any."""
+        return dict(self._refused_reports)
+
+    def grant_reply(self, name: ParticipantId) -> None:
+        """Let a participant answer its next step request, whatever its quota says."""
+        self._host.grant_reply(name)
 
     def request(self, name: ParticipantId, request: StepRequest, *, blocking: bool) -> None:
         """Send a participant a step request."""
@@ -331,19 +364,53 @@ class Lobby:
         if isinstance(message, Ready):
             self._get_ready(event.name, message)
             return None
-        return (event.name, message) if event.name in self._ready else None
+        if event.name not in self._ready or not self._admits(event.name, message.outputs):
+            return None
+        return event.name, message
+
+    def _admits(self, name: ParticipantId, outputs: Outputs) -> bool:
+        """Whether the outputs in a report may be settled, or are those of a step that is settled already."""
+        done = self._simulation.body(name).step
+        if outputs.step <= done:
+            return True
+        if not self._host.charge(name, self._work_of(outputs)):
+            return False
+        if outputs.step == done + 1:
+            reason = self._admission.refusal_reason(name, outputs)
+        else:
+            reason = f"step {outputs.step} after {done}"
+        if reason:
+            self._refuse_report(name, reason)
+            return False
+        self._unsound.discard(name)
+        return True
+
+    def _work_of(self, outputs: Outputs) -> float:
+        """Receivers of the envelopes of a step, over those of one envelope to the whole team."""
+        others = max(1, len(self._config.scenario.roster) - 1)
+        targets = [envelope.target for envelope in outputs.outbox]
+        return sum(1.0 if target == EVERYBODY else 1.0 / others for target in targets)
+
+    def _refuse_report(self, name: ParticipantId, reason: str) -> None:
+        """Count a report that no honest participant sends, and name its sender, once."""
+        self.refused += 1
+        self._unsound.add(name)
+        before = self._refused_reports.get(name, RefusedReports(0, ()))
+        if not before.count:
+            self._say(f"{name} sends what it cannot, and it is not taken in: {reason}")
+        reasons = tuple(dict.fromkeys((*before.reasons, reason)))[:_REASONS_MAX]
+        self._refused_reports[name] = RefusedReports(before.count + 1, reasons)
 
     def _get_ready(self, name: ParticipantId, message: Ready) -> None:
-        if not _continues(message, self._simulation.body(name)):
-            reason = (
-                "its write-ahead log is of another run; delete its .diary file and start it again"
-            )
+        if reason := _objection(message, self._simulation.body(name)):
             self._refuse(Joined(name, message.nonce), reason)
             return
         self._last_ready[name] = message
         self._arrive(name, message.nonce)
 
     def _arrive(self, name: ParticipantId, nonce: str) -> None:
+        if self._clock is not None and self._is_reborn(name):
+            self._lose(name)  # its predecessor has left, and that was not seen
         self._ready[name] = nonce
         self._briefed_s.pop(name, None)
         self._met.add(nonce)
@@ -352,6 +419,13 @@ class Lobby:
         if self._clock is not None and name in self._away:
             self._come_back(name)
         self._newcomers.append(name)
+
+    def _is_reborn(self, name: ParticipantId) -> bool:
+        """Whether a participant comes as an incarnation that is not on record, and no event will say so."""
+        ready = self._last_ready.get(name)
+        if ready is None or name in self._away | self._excused:
+            return False
+        return ready.incarnation > self._simulation.body(name).incarnation
 
     def _come_back(self, name: ParticipantId) -> None:
         self._away.discard(name)
@@ -370,7 +444,14 @@ class Lobby:
         self._simulation.note(ProcessEvent(now_ns, name, kind, -1, step, incarnation))
 
 
-def _continues(ready: Ready, body: Body) -> bool:
-    """Whether a process goes on from the world's state: at most a step ahead, or one incarnation."""
+def _objection(ready: Ready, body: Body) -> str:
+    """Why a process cannot go on from the world's state; empty if it can.
+
+    It can if it is at most one step ahead, as the same incarnation or the next one.
+    """
     reborn = ready.incarnation == body.incarnation + 1
-    return (ready.incarnation == body.incarnation or reborn) and ready.step - body.step in {0, 1}
+    if reborn and ready.incarnation > INCARNATIONS_MAX:
+        return f"has lost its write-ahead log {INCARNATIONS_MAX} times; it takes no more part in this run"
+    if (ready.incarnation == body.incarnation or reborn) and ready.step - body.step in {0, 1}:
+        return ""
+    return "its write-ahead log is of another run; delete its .diary file and start it again"

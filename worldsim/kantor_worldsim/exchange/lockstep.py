@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping
+from typing import NamedTuple
 
 from kantor_protocol.base.machine import WORLD_SIM, Body, Inputs, Outputs, ParticipantId
 from kantor_protocol.scenario.faults.processes import Disk
@@ -14,17 +15,29 @@ from kantor_worldsim.exchange.process_control import (
 )
 
 BARRIER_S = 10.0
-"""Timeout of a step: a participant that has not answered by then misses it."""
+"""Timeout of a step: a participant that has not answered by then misses it, and is silent until it answers."""
+_PATIENCE_MIN_S = 0.05
+"""Whoever misses steps again and again is waited for half as long each time, down to this."""
 _WAIT_S = 0.05
 """Longest wait for the next report, after which unanswered requests are checked again."""
 
 
 class LockstepExchange:
-    """Exchange and process control over the bus, with a barrier for each batch of steps."""
+    """Exchange and process control over the bus, with a barrier for each batch of steps.
+
+    Nobody waits for a participant that is *silent*: it has missed a step, and has not made it since. It is asked now
+    and then, and its answer counts in its next batch, whenever it comes.
+    """
 
     def __init__(self, lobby: Lobby, controller: ProcessController) -> None:
         self._lobby = lobby
         self._controller = controller
+        self._silent: set[ParticipantId] = set()
+        self._patience_s = dict.fromkeys(lobby.roster, BARRIER_S)
+        self._late: dict[ParticipantId, Outputs] = {}
+        """Answers of silent participants that came between their batches."""
+        self._asked: dict[ParticipantId, _Asked] = {}
+        """The last request to each participant that has not answered it."""
 
     def __call__(
         self, inputs: Mapping[ParticipantId, Inputs], /
@@ -32,36 +45,66 @@ class LockstepExchange:
         """Step all participants of a batch. Those that return meanwhile, or are silent, are asked again."""
         lobby = self._lobby
         outputs: dict[ParticipantId, Outputs] = {}
-        asked: dict[ParticipantId, tuple[int, float]] = {}
-        give_up = time.monotonic() + BARRIER_S
-        while time.monotonic() < give_up:
-            self._ask(inputs, outputs, asked)
-            if all(name in outputs or not lobby.is_expected(name) for name in inputs):
+        for name in inputs:
+            if (late := self._late.pop(name, None)) is not None:
+                self._take(name, late, inputs, outputs)
+        started_s = time.monotonic()
+        while True:
+            missing = [name for name in inputs if name not in outputs]
+            self._ask({name: inputs[name] for name in missing})
+            waited_s = time.monotonic() - started_s
+            if not any(self._is_awaited(name, waited_s) for name in missing):
                 break
             report = lobby.next(_WAIT_S)
             while report is not None:
-                name, step = report[0], report[1].outputs.step
-                if name in inputs and step == inputs[name].observation.step + 1:
-                    outputs[name] = report[1].outputs
+                self._take(report[0], report[1].outputs, inputs, outputs)
                 report = lobby.next(0.0)
+        for name in inputs:
+            if name not in outputs and lobby.is_expected(name) and name not in self._silent:
+                self._silent.add(name)
+                self._patience_s[name] = max(_PATIENCE_MIN_S, self._patience_s[name] / 2.0)
         lobby.forget_newcomers()
         return outputs
 
-    def _ask(
+    def _take(
         self,
+        name: ParticipantId,
+        made: Outputs,
         inputs: Mapping[ParticipantId, Inputs],
-        outputs: Mapping[ParticipantId, Outputs],
-        asked: dict[ParticipantId, tuple[int, float]],
+        outputs: dict[ParticipantId, Outputs],
     ) -> None:
+        """Take the outputs of a step, if they are those that are asked for, now or in a batch to come."""
+        if name in inputs:
+            if made.step == inputs[name].observation.step + 1:
+                outputs[name] = made
+                self._silent.discard(name)
+                self._asked.pop(name, None)
+        elif name in self._silent:
+            self._late[name] = made
+
+    def _is_awaited(self, name: ParticipantId, waited_s: float) -> bool:
+        """Whether the barrier still waits for a participant; for silent ones only while nobody else is there."""
+        lobby = self._lobby
+        if not lobby.is_expected(name) or waited_s >= self._patience_s[name]:
+            return False
+        return name not in self._silent or not any(
+            lobby.is_expected(other) and other not in self._silent for other in lobby.roster
+        )
+
+    def _ask(self, inputs: Mapping[ParticipantId, Inputs]) -> None:
         """Send requests to ready participants without outputs: at once, and again after a while or a return."""
         lobby, now_s = self._lobby, time.monotonic()
-        for name in inputs:
-            arrivals = lobby.arrivals(name)
-            arrivals_then, asked_s = asked.get(name, (-1, 0.0))
-            due = arrivals_then != arrivals or now_s - asked_s > RETRY_S
-            if lobby.is_ready(name) and name not in outputs and due:
-                asked[name] = arrivals, now_s
-                lobby.request(name, StepRequest(VERSION, inputs[name]), blocking=True)
+        for name, given in inputs.items():
+            arrivals, step = lobby.arrivals(name), given.observation.step
+            last = self._asked.get(name)
+            fresh = last is None or last.step != step or now_s - last.asked_s > RETRY_S
+            returned = last is not None and last.arrivals != arrivals
+            if lobby.is_ready(name) and (fresh or returned):
+                if fresh:  # who only says that it is back is granted nothing
+                    lobby.grant_reply(name)
+                self._asked[name] = _Asked(step, arrivals, now_s)
+                silent = name in self._silent  # it may not read, either
+                lobby.request(name, StepRequest(VERSION, given), blocking=not silent)
 
     def kill(self, name: ParticipantId) -> None:
         """Kill a process; world-sim's own kill does not return."""
@@ -96,3 +139,13 @@ class LockstepExchange:
 
         self._lobby.wait_for(ended, f"{name}: what became of the impostor?")
         return not refused
+
+
+class _Asked(NamedTuple):
+    """A request for a step."""
+
+    step: int
+    """The step before."""
+    arrivals: int
+    """How often its participant had arrived by then."""
+    asked_s: float

@@ -13,6 +13,7 @@ from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.wire.messages import Progress, encode
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
+from kantor_worldsim.exchange.admission import Admission
 from kantor_worldsim.exchange.config import MissionConfig
 from kantor_worldsim.exchange.lobby import COME_BACK_S, RETURN_S, Lobby
 from kantor_worldsim.exchange.lockstep import LockstepExchange
@@ -48,14 +49,18 @@ def run(
         show(progress)
 
     reporter = ProgressReporter(recording.metrics, scenario, publish)
-    observers = (recording.observe, reporter.observe)
+    admission = Admission(scenario, config.setup)
+    observers = (recording.observe, reporter.observe, admission.observe)
     if past is None:
         simulation = Simulation(scenario, seed, config.setup, observers)
     else:
         simulation = Simulation.resumed(scenario, seed, config.setup, past.records, observers)
     simulation.forget()
-    lobby = Lobby(host, config, recording.run, simulation, reporter, stopped, say)
+    run_name = recording.run
+    lobby = Lobby(host, config, run_name, simulation, reporter, stopped, say, admission)
     if past is not None:
+        for record in past.records:
+            admission.observe(record)
         lobby.recall(past.records)
     lobby.gather(config.start_after_s if past is None else RETURN_S)
     if config.exchange == "wall":
@@ -68,7 +73,7 @@ def run(
         reason = simulate(simulation, lockstep, seed, stopped, lockstep)
     lobby.dismiss(reason, 0.0 if past is None else COME_BACK_S)
     recording.refused_at_door = lobby.refused
-    recording.excess = host.excess
+    recording.excess, recording.refused_reports = host.excess, lobby.refused_reports
     result = recording.finish()
     reporter.report("over", reason, at_once=True)
     return result

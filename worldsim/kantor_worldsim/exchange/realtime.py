@@ -8,12 +8,13 @@ from itertools import islice
 import msgspec
 
 from kantor_protocol.base.machine import WORLD_SIM, Envelope, Inputs, ParticipantId
-from kantor_protocol.node.wall_clock import INBOX_MAX
-from kantor_protocol.wire.messages import VERSION, Report, StepRequest
+from kantor_protocol.scenario.clocks import step_clocks
+from kantor_protocol.wire.messages import INBOX_MAX, VERSION, Report, StepRequest
 from kantor_worldsim.engine.simulation import Simulation, Step
 from kantor_worldsim.exchange.config import MissionConfig
 from kantor_worldsim.exchange.fault_injector import FaultInjector
 from kantor_worldsim.exchange.lobby import POLL_S, Lobby
+from kantor_worldsim.exchange.pace import Pace
 from kantor_worldsim.exchange.process_control import ProcessController
 from kantor_worldsim.observers.progress import PROGRESS_S
 from kantor_worldsim.radio.fault_kernels import DUE_MAX_NS
@@ -55,6 +56,10 @@ class RealtimeExchange:
         self._injector = FaultInjector(lobby, simulation, config, controller)
         start_ns = self._resumed_ns() if resumed else 0
         self._origin_ns = time.monotonic_ns() - round(start_ns / self._speed)
+        clocks = step_clocks(config.scenario, config.seed)
+        self._paces = {name: Pace(clock, start_ns) for name, clock in clocks.items()}
+        self._moved_ns = dict.fromkeys(clocks, 0)
+        """Time of each participant's last accepted step in this process of world-sim, by its own clock."""
 
     def _resumed_ns(self) -> int:
         """Restore what had been handed out, as participants may still report it; the time to go on from."""
@@ -62,7 +67,7 @@ class RealtimeExchange:
         for name, outbox in self._outboxes.items():
             outbox.handed += simulation.inputs(name, DUE_MAX_NS).inbox
         stopped_ns, restart_ns = simulation.now_ns, self._injector.world_starts_ns
-        start_ns = max(stopped_ns, self._lobby.latest_ready_ns, restart_ns or 0)
+        start_ns = max(stopped_ns, self._lobby.ready_ns, restart_ns or 0)
         if restart_ns is None:
             simulation.note(ProcessEvent(stopped_ns, WORLD_SIM, ProcessEventKind.LEAVE))
             simulation.note(ProcessEvent(start_ns, WORLD_SIM, ProcessEventKind.JOIN))
@@ -114,6 +119,7 @@ class RealtimeExchange:
         while (name := self._lobby.pop_newcomer()) is not None:
             if self._lobby.is_ready(name):
                 self._injector.welcome(name)
+                self._paces[name].restart()
                 self._set_clock(name, self._now_ns)
 
     def _set_clock(self, name: ParticipantId, now_ns: int) -> None:
@@ -125,18 +131,23 @@ class RealtimeExchange:
         if report.outputs.step <= done:  # the acknowledgement has not arrived yet
             self._hand(name)
         elif not self._injector.kills_in_step(name):
+            now_ns = self._now_ns
+            if not self._paces[name].permits(report.now_ns, now_ns):
+                return  # it is repeated, and its time may come
             inputs = self._inputs(name, done, report)
             if inputs is None:
                 self._lobby.refused += 1
                 return
+            self._paces[name].count(report.now_ns, now_ns)
+            self._moved_ns[name] = report.now_ns
             step = Step(name, inputs, report.outputs, report.skew_ns)
-            self._simulation.settle(self._now_ns, [step])
+            self._simulation.settle(now_ns, [step])
             self._hand(name)
 
     def _inputs(self, name: ParticipantId, done: int, report: Report) -> Inputs | None:
         """The inputs that a participant reports, if they are possible. done: its last step on record."""
         ahead_ns = report.now_ns - self._now_ns
-        if report.observed != done or report.outputs.step != done + 1:
+        if report.observed != done or report.now_ns < self._moved_ns[name]:
             return None
         if ahead_ns > _CLOCK_TOLERANCE_NS * self._speed or abs(report.skew_ns) > _SKEW_MAX_NS:
             return None

@@ -16,7 +16,7 @@ from kantor_worldsim.observers.checkers.checker import Checker
 from kantor_worldsim.observers.metrics.base import RunMetrics
 from kantor_worldsim.observers.metrics.density import DensityMetrics
 from kantor_worldsim.observers.metrics.mapping import MapMetrics
-from kantor_worldsim.observers.metrics.result import Result
+from kantor_worldsim.observers.metrics.result import RefusedReports, Result
 from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.journal import Journal, file_digest
@@ -75,6 +75,8 @@ class Recording:
         """Messages that world-sim refused; set by the process that hosts the bus."""
         self.excess: dict[ParticipantId, Excess] = {}
         """Messages beyond each participant's quota; set likewise."""
+        self.refused_reports: dict[ParticipantId, RefusedReports] = {}
+        """Unsound reports of each participant that sent any; set likewise."""
         self.run = secrets.token_hex(8) if past is None else past.terms.run
         """Names the run."""
         self._scenario = scenario
@@ -137,6 +139,7 @@ class Recording:
             wall_s=self._monotonic() - self._started,
             refused_at_door=self.refused_at_door,
             excess=self.excess,
+            refused_reports=self.refused_reports,
             record=self.journal.cut or "whole",
             complaints=tuple(self.checker.violations),
         )

@@ -5,6 +5,7 @@ MCAP's own chunks would hold seconds back. A file cut anywhere can be read up to
 """
 
 import contextlib
+import dataclasses
 import hashlib
 import json
 import struct
@@ -12,10 +13,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
+import lz4.frame
 import msgspec
+import zstandard
 from mcap.exceptions import McapError
-from mcap.records import Channel, Message
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Chunk, McapRecord, Message
+from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
 from kantor_worldsim.record.columnar import DecodedRecord
@@ -24,6 +27,9 @@ from kantor_worldsim.record.records import Batch, Ending, Record, decode_record,
 RECORD_TOPIC = "/kantor/record"
 METRICS_TOPIC = "/kantor/metrics"
 _RESERVE_BYTES = 256 * 1024
+_RECORD_BYTES_MAX = 1 << 30
+_CHUNK_BYTES_MAX = 1 << 27
+"""Of an inflated chunk. The journal has none; other tools may have packed its messages into some, of a few MiB."""
 
 
 class Digest:
@@ -162,13 +168,40 @@ def _messages(path: Path) -> Iterator[tuple[str, Message]]:
     channels: dict[int, str] = {}
     with path.open("rb") as file:
         try:
-            for item in StreamReader(file, record_size_limit=1 << 30).records:
+            for item in _records_of_file(file):
                 if isinstance(item, Message):
                     yield channels.get(item.channel_id, ""), item
                 elif isinstance(item, Channel):
                     channels[item.id] = item.topic
-        except (McapError, ValueError, EOFError, OverflowError, struct.error):
+        except (McapError, ValueError, EOFError, OverflowError, RuntimeError, struct.error):
             return
+
+
+def _records_of_file(file: IO[bytes]) -> Iterator[McapRecord]:
+    """The records of an MCAP file, those in its chunks included. Raises what the reader and the codecs raise."""
+    reader = StreamReader(file, emit_chunks=True, record_size_limit=_RECORD_BYTES_MAX)
+    for item in reader.records:
+        if isinstance(item, Chunk):
+            yield from breakup_chunk(_inflated(item))
+        else:
+            yield item
+
+
+def _inflated(chunk: Chunk) -> Chunk:
+    """The same chunk without compression. Raises ValueError if it is larger than it may be, or than it says."""
+    size = chunk.uncompressed_size
+    if size > _CHUNK_BYTES_MAX:
+        raise ValueError(f"a chunk of {size} bytes")
+    if chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
+            content = stream.read(size + 1)
+    elif chunk.compression == "lz4":
+        content = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    else:
+        content = chunk.data
+    if len(content) > max(size, len(chunk.data)):
+        raise ValueError("a chunk that is larger than it says")
+    return dataclasses.replace(chunk, compression="", data=content)
 
 
 def file_digest(path: Path) -> str:

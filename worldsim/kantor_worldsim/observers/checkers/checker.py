@@ -164,7 +164,7 @@ class Checker:
         self._opening, self._scenario, self._units = opening, scenario, opening.units
         self._names = scenario.roster
         self._places = {name: i for i, name in enumerate(self._names)}
-        self._subscriber = WeightsSubscriber()
+        self._subscriber = WeightsSubscriber(opening.samples_m.shape[0])
         self._hostile = [fault for fault in scenario.faults if isinstance(fault, Hostile)]
         self._clocks = WrongClocks(scenario, virtual=self._virtual)
         self._links = Links(scenario, opening.seed)

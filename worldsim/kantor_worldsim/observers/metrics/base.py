@@ -16,6 +16,7 @@ from kantor_worldsim.observers.metrics.result import (
     LINK_COUNTERS,
     BytesPerRobotTick,
     FaultCounts,
+    RefusedReports,
     Rejoining,
     Result,
 )
@@ -259,6 +260,7 @@ class RunMetrics:
         wall_s: float,
         refused_at_door: int = 0,
         excess: Mapping[ParticipantId, Excess] = MappingProxyType({}),
+        refused_reports: Mapping[ParticipantId, RefusedReports] = MappingProxyType({}),
         record: str,
         complaints: tuple[str, ...],
     ) -> Result:
@@ -310,5 +312,6 @@ class RunMetrics:
             incarnations=sum(self._incarnations.values()),
             rejoin_s=Rejoining.of(self._rejoined_ns),
             excess=dict(excess),
+            refused_reports=dict(refused_reports),
             **self._measured(),
         )

@@ -135,6 +135,14 @@ class Rejoining(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
+class RefusedReports(msgspec.Struct, frozen=True):
+    """Reports of one participant that no honest one sends; none of them had an effect."""
+
+    count: int
+    reasons: tuple[str, ...]
+    """The first different ones."""
+
+
 class Result(msgspec.Struct, frozen=True, kw_only=True):
     """result.json. The names are stable."""
 
@@ -191,3 +199,5 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     excess: dict[ParticipantId, Excess] = {}
     """Participants that flooded the bus, and how much was refused beyond their quota. It counts in no other
     figure."""
+    refused_reports: dict[ParticipantId, RefusedReports] = {}
+    """Participants that sent unsound or impossible reports."""

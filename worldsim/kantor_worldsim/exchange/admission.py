@@ -1,0 +1,234 @@
+"""Admission of reports: what a participant may say is what it can have done, by the record so far. Pure.
+
+World-sim relays what participants send to each other. A report that is unsound, or of which an envelope claims what
+cannot be, is refused whole, before it touches anything: its participant is not acknowledged, and nobody else hears of
+it. An honest participant never sends such a report.
+
+1. Sizes are within what a mission of this scenario can need, and a move within what a vehicle drives in one period of
+   its clock, however long its robot was silent.
+2. Envelopes are the sender's own, numbered upwards, and no receiver would refuse one of them.
+3. An envelope speaks of incarnations that were there; of logs, claims and registers as far as their origins have
+   written them; and an entry of a log is the one that its origin has consumed (ledger) or has sent first (map).
+   With merge = "min" no weight is below what all spending leaves.
+"""
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from kantor_protocol.base.incarnations import INCARNATIONS_MAX
+from kantor_protocol.base.machine import EVERYBODY, Envelope, Outputs, ParticipantId, Pose
+from kantor_protocol.base.varint import Pairs, sum_pairs
+from kantor_protocol.replication.gossip import MessageCheck, log_length_max
+from kantor_protocol.replication.occupancy_log import entries
+from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import (
+    OUTBOX_MAX,
+    GossipMessage,
+    RefusedError,
+    check_outputs,
+    decode_gossip,
+)
+from kantor_protocol.wire.weights import weights_bytes_max
+from kantor_worldsim.exchange.admission_kernels import BARE, REASONS, judge, learn
+from kantor_worldsim.record.process_events import TAKE_OVER
+from kantor_worldsim.record.records import Batch, ProcessEvent, Record
+from kantor_worldsim.world.world import WorldSetup, units_of
+
+_ROUNDING = 1e-5
+_PAIR_BYTES_MAX = 20
+"""Of a sample and its units."""
+
+Entries = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
+"""Samples, and units of each."""
+
+
+class Admission:
+    """Judges reports by the records of a mission, all of which it observes."""
+
+    def __init__(self, scenario: Scenario, setup: WorldSetup) -> None:
+        """Nothing has happened yet."""
+        roster, self._samples = len(scenario.roster), setup.samples_m.shape[0]
+        units = None if setup.ground else units_of(scenario, self._samples)
+        indices = entries(setup.ground.frame) if setup.ground else self._samples
+        self._places = {name: place for place, name in enumerate(scenario.roster)}
+        self._targets = frozenset((*scenario.roster, EVERYBODY))
+        self._point_units = units.point if units else 0
+        self._budget = scenario.steps_per_robot
+        self._ledger = scenario.merge == "ledger" and not scenario.mapping
+        """Whether logs are what was spent, entry for entry."""
+        self._way_max_m = scenario.vehicle.speed_m_s * scenario.clock.period_s * (1.0 + _ROUNDING)
+        self._poses = setup.poses(scenario)
+        self._receivers = MessageCheck(scenario, units, indices)
+        self._settings = np.array(
+            [
+                roster,
+                self._ledger or scenario.mapping,
+                scenario.mapping,
+                scenario.claiming,
+                units.sample if units else 0,
+                log_length_max(scenario, units, indices),
+            ],
+            dtype=np.int64,
+        )
+        self._logs = np.zeros((roster, 256, 1 if scenario.mapping else 2), dtype=np.int32)
+        """(ids, rows, 2 or 1) the entries of each log as its origin wrote them; with merge = "min" nothing."""
+        self._written = np.zeros(roster, dtype=np.int64)
+        """(ids,) entries of each log."""
+        self._consumed = np.zeros(self._samples, dtype=np.int64)
+        """(N,) units shipped by all."""
+        self._stamps = np.zeros((2, roster), dtype=np.int64)
+        """(2, ids) of the newest claim and register of each origin."""
+        self._incarnations = dict.fromkeys(scenario.roster, 0)
+        self._points = dict.fromkeys(scenario.roster, 0)
+        """Points that each has shipped."""
+        self._sequences = dict.fromkeys(scenario.roster, 0)
+        """The number of the last envelope of each."""
+        self._pairs = Pairs()
+
+    def observe(self, record: Record) -> None:
+        """Follow one record."""
+        if isinstance(record, ProcessEvent):
+            self._follow_event(record)
+        elif isinstance(record, Batch):
+            for step_record in record.step_records:
+                if step_record.outputs is not None and step_record.name in self._places:
+                    self._follow(step_record.name, step_record.outputs)
+                    if step_record.verdict is not None:
+                        self._poses[step_record.name] = step_record.verdict.pose
+
+    def refusal_reason(self, name: ParticipantId, outputs: Outputs) -> str:
+        """Why the next step of a participant is refused; empty if it may be settled."""
+        try:
+            check_outputs(outputs)
+        except RefusedError as error:
+            return str(error)
+        return (
+            self._refusal_of_sizes(outputs)
+            or self._refusal_of_move(self._poses[name], outputs.pose)
+            or self._refusal_of_numbers(name, outputs)
+            or self._refusal_of_contents(name, outputs)
+        )
+
+    def _refusal_of_sizes(self, outputs: Outputs) -> str:
+        if max(len(outputs.spent), len(outputs.lowered)) > _PAIR_BYTES_MAX * self._samples:
+            return "more entries than there are samples"
+        if len(outputs.weights) > weights_bytes_max(self._samples):
+            return "a weights message that is longer than any"
+        if len(outputs.outbox) > OUTBOX_MAX:
+            return f"{len(outputs.outbox)} envelopes in one step"
+        return ""
+
+    def _refusal_of_move(self, start: Pose, end: Pose) -> str:
+        way_m = math.hypot(end.x_m - start.x_m, end.y_m - start.y_m)
+        return "" if way_m <= self._way_max_m else f"a move of {way_m:.6g} m in one step"
+
+    def _refusal_of_numbers(self, name: ParticipantId, outputs: Outputs) -> str:
+        before = self._sequences[name]
+        for envelope in outputs.outbox:
+            if envelope.source != name:
+                return "an envelope in the name of another"
+            if envelope.target not in self._targets:
+                return "an envelope for nobody in the team"
+            if not before < envelope.sequence <= OUTBOX_MAX * outputs.step:
+                return f"envelope {envelope.sequence} after {before}"
+            before = envelope.sequence
+        return ""
+
+    def _refusal_of_contents(self, name: ParticipantId, outputs: Outputs) -> str:
+        spent = self._spent_in(name, outputs)
+        if spent is None:
+            return "spending that does not decode"
+        own = self._id_of(name)
+        self._spend(own, spent)
+        reasons = (self._refusal_of(envelope, own, outputs.step) for envelope in outputs.outbox)
+        reason = next(filter(None, reasons), "")
+        self._spend(own, spent, back=True)
+        return reason
+
+    def _refusal_of(self, envelope: Envelope, own: int, step: int) -> str:
+        try:
+            message = decode_gossip(envelope.body)
+        except RefusedError as error:
+            return f"a malformed envelope ({error})"
+        if message.incarnation != own // len(self._places):
+            return f"an envelope of incarnation {message.incarnation}"
+        if not self._receivers.passes(own, message):
+            return "a malformed envelope"
+        arrays = (self._logs, self._written, self._consumed, self._stamps, self._settings)
+        return REASONS[int(judge(*arrays, *_parts(message), message.registers, own, step))]
+
+    def _follow_event(self, event: ProcessEvent) -> None:
+        if event.kind not in TAKE_OVER or event.who not in self._places:
+            return
+        if self._incarnations[event.who] < event.incarnation <= INCARNATIONS_MAX:
+            self._incarnations[event.who] = event.incarnation
+            ids = (event.incarnation + 1) * len(self._places)
+            more = ids - self._written.shape[0]
+            if more > 0:
+                self._logs = np.pad(self._logs, ((0, more), (0, 0), (0, 0)))
+                self._written = np.pad(self._written, (0, more))
+                self._stamps = np.pad(self._stamps, ((0, 0), (0, more)))
+
+    def _follow(self, name: ParticipantId, outputs: Outputs) -> None:
+        """Follow a step that was settled: an older version may have settled what is refused now."""
+        own = self._id_of(name)
+        spent = self._spent_in(name, outputs)
+        if spent is not None and spent[0].size:
+            self._points[name] += 1
+            self._spend(own, spent)
+        for envelope in outputs.outbox:
+            if envelope.source == name:
+                self._sequences[name] = max(self._sequences[name], envelope.sequence)
+                self._learn(envelope, own)
+
+    def _learn(self, envelope: Envelope, own: int) -> None:
+        try:
+            message = decode_gossip(envelope.body)
+        except RefusedError:
+            return
+        if message.incarnation == own // len(self._places) and self._receivers.passes(own, message):
+            if self._settings[BARE]:
+                self._make_room(int(self._written[own]) + len(message.logs))
+            vector, logs, _ = _parts(message)
+            arrays = (self._logs, self._written, self._stamps, self._settings)
+            learn(*arrays, vector, logs, message.registers, own)
+
+    def _id_of(self, name: ParticipantId) -> int:
+        """The incarnation id of a participant's newest incarnation."""
+        return self._incarnations[name] * len(self._places) + self._places[name]
+
+    def _spent_in(self, name: ParticipantId, outputs: Outputs) -> Entries | None:
+        """What a step ships, if the world lets it; None if it does not decode."""
+        nothing = np.zeros(0, dtype=np.int64)
+        entries = self._pairs.decode(outputs.spent, self._samples)
+        if entries is None:
+            return None
+        shipped = 0 < sum_pairs(outputs.spent, self._samples) <= self._point_units
+        if not shipped or self._points[name] >= self._budget:
+            return nothing, nothing
+        return entries[0].copy(), entries[1].copy()
+
+    def _spend(self, own: int, spent: Entries, *, back: bool = False) -> None:
+        """Count what a step ships; back: take it back, since the step is only judged."""
+        samples, units = spent
+        np.add.at(self._consumed, samples, -units if back else units)
+        if not self._ledger:
+            return
+        if not back:
+            length = int(self._written[own])
+            self._make_room(length + samples.size)
+            self._logs[own, length : length + samples.size, 0] = samples
+            self._logs[own, length : length + samples.size, 1] = units
+        self._written[own] += -samples.size if back else samples.size
+
+    def _make_room(self, needed: int) -> None:
+        """Make room for so many entries in every log."""
+        rows = self._logs.shape[1]
+        if needed > rows:
+            self._logs = np.pad(self._logs, ((0, 0), (0, 2 * needed - rows), (0, 0)))
+
+
+def _parts(message: GossipMessage) -> tuple[bytes, bytes, bytes]:
+    return message.version_vector, message.logs, message.claims
