@@ -65,7 +65,7 @@ class RealtimeExchange:
         """Restore what had been handed out, as participants may still report it; the time to go on from."""
         simulation = self._simulation
         for name, outbox in self._outboxes.items():
-            outbox.handed += simulation.inputs(name, DUE_MAX_NS).inbox
+            outbox.handed += simulation.inputs(name, DUE_MAX_NS).inbox[-2 * INBOX_MAX :]
         stopped_ns, restart_ns = simulation.now_ns, self._injector.world_starts_ns
         start_ns = max(stopped_ns, self._lobby.ready_ns, restart_ns or 0)
         if restart_ns is None:

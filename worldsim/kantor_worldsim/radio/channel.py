@@ -7,6 +7,7 @@ more robot changes no other draw.
 """
 
 import struct
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from heapq import heappop, heappush
 from typing import Any, NamedTuple
@@ -398,16 +399,22 @@ class Channel:
 
         Raises KeyError for an envelope that is not in flight.
         """
+        references = tuple(heard)
+        if not references:
+            return ()
         waiting = sorted(self._in_flight[name])
+        places: dict[tuple[ParticipantId, int], deque[int]] = {}
+        for place, item in enumerate(waiting):
+            places.setdefault((item[4].source, item[2]), deque()).append(place)
         collected = []
-        for reference in heard:
-            places = (i for i, item in enumerate(waiting) if (item[4].source, item[2]) == reference)
-            place = next(places, None)
-            if place is None:
+        for reference in references:
+            if not places.get(reference):
                 raise KeyError(reference)
-            collected.append(waiting.pop(place)[4])
-        self._in_flight[name][:] = waiting  # in order, it is a heap
-        return tuple(collected)
+            collected.append(places[reference].popleft())
+        gone = frozenset(collected)
+        # In order, it is a heap.
+        self._in_flight[name][:] = [item for i, item in enumerate(waiting) if i not in gone]
+        return tuple([waiting[place][4] for place in collected])
 
     def lose(self, name: ParticipantId, from_ns: int, until_ns: int) -> None:
         """Drop the envelopes that arrive at a participant within a window, its end excluded."""

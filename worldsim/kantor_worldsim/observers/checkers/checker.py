@@ -13,6 +13,7 @@ from kantor_protocol.scenario.faults.links import Hostile
 from kantor_protocol.scenario.faults.processes import Kill, Late
 from kantor_protocol.wire.weights import WeightsSubscriber
 from kantor_worldsim.observers.checkers.batch_pass import check_batch
+from kantor_worldsim.observers.checkers.delivery_index import index_deliveries
 from kantor_worldsim.observers.checkers.links import Links
 from kantor_worldsim.observers.checkers.mapping import MapChecker
 from kantor_worldsim.observers.checkers.outages import WrongClocks, caused_events
@@ -322,6 +323,7 @@ class Checker:
         kept = under_way[(due_ns < participant[STOPPED_NS]) | (due_ns >= now_ns) | handed_over]
         deliveries[: kept.shape[0]] = kept
         participant[UNDER_WAY] = kept.shape[0]
+        index_deliveries(deliveries, self._state.delivery_slots[place], kept.shape[0])
 
     def _begin_incarnation(self, process_event: ProcessEvent, place: int) -> None:
         """A new incarnation knows nothing: its vector is full, it holds no entry, its own log is empty."""

@@ -3,6 +3,12 @@
 import math
 
 from kantor_protocol.base.kernels import kernel
+from kantor_worldsim.observers.checkers.delivery_index import (
+    add_to_index,
+    first_slot,
+    next_slot,
+    remove_row,
+)
 from kantor_worldsim.observers.checkers.links import LinkTable
 from kantor_worldsim.observers.checkers.state import (
     ASKED,
@@ -33,11 +39,31 @@ from kantor_worldsim.record.columnar import ColumnarBatch
 @kernel
 def remove_delivery(state: CheckerState, who: int, row: int) -> None:
     """Take a row out of the deliveries that are under way to a participant."""
-    deliveries = state.deliveries[who]
     state.participants[who, UNDER_WAY] -= 1
     last = state.participants[who, UNDER_WAY]
-    for column in range(4):
-        deliveries[row, column] = deliveries[last, column]
+    remove_row(state.deliveries[who], state.delivery_slots[who], row, last)
+
+
+@kernel
+def _find_delivery(
+    state: CheckerState, who: int, source: int, sequence: int, by_ns: int, handed_over: bool
+) -> int:
+    """The delivery of an envelope that arrived first; negative if there is none.
+
+    handed_over: only what was marked as handed over counts; otherwise all that has arrived by by_ns.
+    """
+    deliveries, slots = state.deliveries[who], state.delivery_slots[who]
+    first = -1
+    slot = first_slot(source, sequence, slots)
+    while slots[slot] != 0:
+        row = slots[slot] - 1
+        slot = next_slot(slot, slots)
+        if deliveries[row, 0] != source or deliveries[row, 1] != sequence:
+            continue
+        there = deliveries[row, 3] != 0 if handed_over else deliveries[row, 2] <= by_ns
+        if there and (first < 0 or deliveries[row, 2] < deliveries[first, 2]):
+            first = row
+    return first
 
 
 @kernel
@@ -48,23 +74,16 @@ def check_inbox(
     step_record = columns.step_records[row]
     who = step_record[of.PLACE]
     deliveries = state.deliveries[who]
-    if state.participants[who, ASKED] == 0:
-        by_ns = step_record[of.NOW_NS] if limits.virtual else now_ns
+    if limits.virtual and state.participants[who, ASKED] == 0:
         for i in range(state.participants[who, UNDER_WAY]):
-            deliveries[i, 3] = deliveries[i, 2] <= by_ns
+            deliveries[i, 3] = deliveries[i, 2] <= step_record[of.NOW_NS]
     state.participants[who, ASKED] = limits.virtual and not step_record[of.PRESENT]
     before_ns, before_source, before_sequence = 0, 0, 0
     for item in range(step_record[of.HEARD_COUNT]):
         heard = columns.heard[step_record[of.HEARD] + item]
-        first = -1  # the copy that arrived first
-        for i in range(state.participants[who, UNDER_WAY]):
-            if (
-                deliveries[i, 0] == heard[of.SOURCE]
-                and deliveries[i, 1] == heard[of.SEQUENCE]
-                and deliveries[i, 3]
-                and (first < 0 or deliveries[i, 2] < deliveries[first, 2])
-            ):
-                first = i
+        first = _find_delivery(
+            state, who, heard[of.SOURCE], heard[of.SEQUENCE], now_ns, limits.virtual
+        )
         if first < 0:
             note_violation(state, UNHEARD, row, item, 0, 0, 0.0, 0.0)
             continue
@@ -97,9 +116,19 @@ def post(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
             if sequence <= participant[NUMBER] and find_posted(state, source, sequence) >= 0:
                 note_violation(state, NUMBER_REUSED, row, 0, sequence, 0, 0.0, 0.0)
             participant[NUMBER] = max(participant[NUMBER], sequence)
-            posted = state.posted[source, participant[POSTED]]
-            posted[0], posted[1] = sequence, columns.sent[sent, of.TARGET]
-            participant[POSTED] += 1
+            _insert_posted(state, source, sequence, columns.sent[sent, of.TARGET])
+
+
+@kernel
+def _insert_posted(state: CheckerState, source: int, sequence: int, target: int) -> None:
+    """Add an envelope behind those with the same or a lower number: at the end, unless its number is wrong."""
+    posted = state.posted[source]
+    row = state.participants[source, POSTED]
+    state.participants[source, POSTED] += 1
+    while row > 0 and posted[row - 1, 0] > sequence:
+        posted[row, 0], posted[row, 1] = posted[row - 1, 0], posted[row - 1, 1]
+        row -= 1
+    posted[row, 0], posted[row, 1] = sequence, target
 
 
 @kernel
@@ -115,11 +144,16 @@ def post_forged(state: CheckerState, columns: ColumnarBatch) -> None:
 @kernel
 def find_posted(state: CheckerState, source: int, sequence: int) -> int:
     """The row of the last envelope that a source has sent under a number; negative if there is none."""
-    if source >= 0:
-        for i in range(state.participants[source, POSTED] - 1, -1, -1):
-            if state.posted[source, i, 0] == sequence:
-                return i
-    return -1
+    if source < 0:
+        return -1
+    low, high = 0, state.participants[source, POSTED]
+    while low < high:
+        middle = (low + high) // 2
+        if state.posted[source, middle, 0] <= sequence:
+            low = middle + 1
+        else:
+            high = middle
+    return low - 1 if low > 0 and state.posted[source, low - 1, 0] == sequence else -1
 
 
 @kernel
@@ -163,6 +197,8 @@ def check_decision(state: CheckerState, links: LinkTable, columns: ColumnarBatch
         return
     if source >= 0:  # a stranger has no known pose
         check_link(state, links, row, source, receiver)
-    delivery = state.deliveries[receiver, state.participants[receiver, UNDER_WAY]]
+    row = state.participants[receiver, UNDER_WAY]
+    delivery = state.deliveries[receiver, row]
     delivery[0], delivery[1], delivery[2], delivery[3] = source, sequence, due_ns, 0
+    add_to_index(state.deliveries[receiver], state.delivery_slots[receiver], row)
     state.participants[receiver, UNDER_WAY] += 1

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.scenario.schema import Scenario
+from kantor_worldsim.observers.checkers.delivery_index import index_deliveries
 from kantor_worldsim.observers.checkers.links import LinkTable
 from kantor_worldsim.observers.checkers.violations import VIOLATIONS_MAX
 from kantor_worldsim.record import columnar as of
@@ -66,10 +67,13 @@ class CheckerState(NamedTuple):
     logs: npt.NDArray[np.int64]
     """(ids, rows, 2): sample and units of each entry that an incarnation has consumed."""
     posted: npt.NDArray[np.int64]
-    """(n, rows, 2): sequence and target of each envelope that a participant has sent."""
+    """(n, rows, 2): sequence and target of each envelope that a participant has sent, by rising sequence."""
     deliveries: npt.NDArray[np.int64]
     """(n, rows, 4): source, sequence, due_ns of each delivery under way to a participant; whether it was
     handed over with the step request that is open."""
+    delivery_slots: npt.NDArray[np.int64]
+    """(n, 2 rows): 1 + the row of each delivery under way, at the first free slot from the hash of its source and
+    sequence on, or 0; see `delivery_index.py`."""
     forged: npt.NDArray[np.int64]
     """(1, rows, 3): source, sequence, target of the envelopes that faults have put on the air."""
     version_vector: npt.NDArray[np.int64]
@@ -106,6 +110,7 @@ class CheckerState(NamedTuple):
             logs=np.zeros((count, 256, 2), dtype=np.int64),
             posted=np.zeros((count, 256, 2), dtype=np.int64),
             deliveries=np.zeros((count, 64, 4), dtype=np.int64),
+            delivery_slots=np.zeros((count, 128), dtype=np.int64),
             forged=np.zeros((1, 64, 3), dtype=np.int64),
             version_vector=np.zeros((count, count), dtype=np.int64),
             violations=np.zeros((VIOLATIONS_MAX, 5), dtype=np.int64),
@@ -127,7 +132,13 @@ class CheckerState(NamedTuple):
         """The same with twice the room where `missing_capacity` found too little."""
         name = _GROWING[missing]
         rows = getattr(self, name)
-        return self._replace(**{name: np.concatenate((rows, np.zeros_like(rows)), axis=1)})
+        longer = self._replace(**{name: np.concatenate((rows, np.zeros_like(rows)), axis=1)})
+        if missing == _NO_DELIVERIES:
+            slots = np.concatenate((self.delivery_slots, self.delivery_slots), axis=1)
+            for who, under_way in enumerate(self.participants[:, UNDER_WAY].tolist()):
+                index_deliveries(longer.deliveries[who], slots[who], under_way)
+            longer = longer._replace(delivery_slots=slots)
+        return longer
 
 
 class Limits(NamedTuple):
