@@ -345,7 +345,8 @@ def _be_world_sim(
     resume: bool,  # noqa: FBT001  a target of a process
     stopping: bool,  # noqa: FBT001
 ) -> None:
-    from kantor_worldsim.exchange.main import run  # noqa: PLC0415  the fork server has it
+    from kantor_worldsim.engine.simulation import ForeignRecordError  # noqa: PLC0415  the fork server has it
+    from kantor_worldsim.exchange.main import run  # noqa: PLC0415
     from kantor_worldsim.observers.recording import Recording  # noqa: PLC0415
     from kantor_worldsim.record.run_folder import OverError, Past, ResumeError  # noqa: PLC0415
     from kantor_worldsim.world.world import WorldSetup  # noqa: PLC0415
@@ -394,6 +395,9 @@ def _be_world_sim(
         except BusError as error:
             say(str(error))
             sys.exit(Exit.UNREACHABLE)
+        except ForeignRecordError as error:
+            say(f"cannot go on with its record: {error}")
+            sys.exit(Exit.USAGE)
     say(f"{result.ended}, digest {result.digest}")
 
 

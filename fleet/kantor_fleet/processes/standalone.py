@@ -85,6 +85,7 @@ def _go_on(folder: Path, past: "Past", listen: str, secrets: Path, fleet: str | 
     terms, opening = past.terms, past.opening
     scenario, seed, exchange = opening.scenario, opening.seed, terms.exchange
     _check_faults(scenario, exchange)
+    _check_resumable(folder, past)
     plan = MissionConfig(scenario, seed, opening.setup, exchange, terms.speed)
 
     def record() -> tuple[Path, "Recording"]:
@@ -92,6 +93,21 @@ def _go_on(folder: Path, past: "Past", listen: str, secrets: Path, fleet: str | 
         return folder, Recording(scenario, seed, exchange, folder, every, past=past)
 
     return _host(plan, listen, secrets, fleet, record, past)
+
+
+def _check_resumable(folder: Path, past: "Past") -> None:
+    """Fail with one line, before anything is written, unless the mission can be rebuilt from its records."""
+    from kantor_worldsim.engine.simulation import Simulation  # noqa: PLC0415
+
+    opening = past.opening
+    try:
+        Simulation.resumed(opening.scenario, opening.seed, opening.setup, past.records, ())
+    except ValueError as error:  # of another version, or not usable
+        problem = str(error).splitlines()[0]
+        fail(
+            Exit.USAGE,
+            f"{folder}: cannot go on with this version ({problem}); resume it with the one that wrote it, or start a new run",
+        )
 
 
 def go_on_standalone(state: Path, listen: str, secrets: Path, fleet: str | None) -> Exit | None:

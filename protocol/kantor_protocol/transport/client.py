@@ -10,7 +10,7 @@ import zenoh
 
 from kantor_protocol.transport import zenoh_config
 from kantor_protocol.transport.credentials import Certificate, Identity
-from kantor_protocol.transport.endpoint import await_endpoint, check_endpoint
+from kantor_protocol.transport.endpoint import await_endpoint, check_endpoint, is_crowded
 from kantor_protocol.transport.session import QUEUE_MAX, BusError, close_session, open_session
 from kantor_protocol.wire import keys
 
@@ -134,14 +134,9 @@ def observer_session(
 def client(connect: str, identity: Identity, connect_timeout_s: float) -> zenoh.Session:
     """Open the session of a client, once the router at the endpoint admits it. Raises BusError."""
     check_endpoint(connect, identity)
+    give_up = time.monotonic() + connect_timeout_s
     await_endpoint(connect, connect_timeout_s, identity)
-    try:
-        session = open_session("client", zenoh_config.client_config(identity), connect=connect)
-    except zenoh.ZError:
-        await_endpoint(connect, 0.0, identity)  # which may have changed since
-        raise BusError(
-            f"{connect}: refuses {identity.user}; its credentials are not this world-sim's"
-        ) from None
+    session = _opened(connect, identity, give_up)
     if isinstance(identity, Certificate):
         try:
             _check_admitted(connect, session, identity)
@@ -149,6 +144,27 @@ def client(connect: str, identity: Identity, connect_timeout_s: float) -> zenoh.
             close_session(session, [])
             raise
     return session
+
+
+def _opened(connect: str, identity: Identity, give_up: float) -> zenoh.Session:
+    """A session, as soon as the router has room for it. give_up: by the monotonic clock. Raises BusError."""
+    config = zenoh_config.client_config(identity)
+    while True:
+        with contextlib.suppress(zenoh.ZError):
+            return open_session("client", config, connect=connect)
+        late = time.monotonic() >= give_up
+        crowded = isinstance(identity, Certificate) or is_crowded(connect)
+        if crowded and not late:
+            continue
+        await_endpoint(connect, 0.0, identity)  # which may have changed since
+        if crowded:
+            raise BusError(
+                f"{connect}: has no room for {identity.user}: too many others are connecting; try again later"
+            )
+        raise BusError(
+            f"{connect}: refuses {identity.user}; its credentials are not this world-sim's, "
+            "or it is connected too often already"
+        )
 
 
 def _check_admitted(connect: str, session: zenoh.Session, identity: Certificate) -> None:

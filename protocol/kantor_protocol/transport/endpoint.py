@@ -57,6 +57,27 @@ def _probe(host: str, port: int, identity: Identity | None) -> str:
     return ""
 
 
+def is_crowded(connect: str) -> bool:
+    """Whether the router closes new connections at once, because too many are about to prove who they are.
+
+    False as well if nothing listens there.
+    """
+    _, host, port = parse_endpoint(connect)
+    try:
+        with socket.create_connection((host, port), timeout=1.0) as probe:
+            probe.settimeout(_CLOSES_WITHIN_S)
+            return probe.recv(1) == b""
+    except TimeoutError:
+        return False
+    except ConnectionResetError:
+        return True
+    except OSError:
+        return False
+
+
+_CLOSES_WITHIN_S = 0.2
+
+
 def parse_endpoint(endpoint: str) -> tuple[str, str, int]:
     """Protocol, host and port of an endpoint. Raises BusError."""
     protocol, _, place = endpoint.partition("/")

@@ -38,6 +38,11 @@ from kantor_protocol.transport.session import (
 )
 from kantor_protocol.wire import keys
 
+_SLOW_S = 0.1
+"""A participant whose queue was full for so long does not read."""
+_IMPATIENT_S = 10.0
+"""For so long messages to a participant that does not read are dropped at once."""
+
 
 class Router:
     """A router's session, which reports the events of the bus."""
@@ -103,6 +108,8 @@ class HubRouter(Router):
             ) from None
         self._block = zenoh.CongestionControl.BLOCK
         self._drop = zenoh.CongestionControl.DROP
+        self._patient_from_s: dict[ParticipantId, float] = {}
+        """Time from which on each participant that did not read is waited for again."""
         self._rx = {name: keys.rx(fleet, name) for name in roster}
         self._progress = keys.progress(fleet)
         if isinstance(identity, Certificate):
@@ -118,10 +125,15 @@ class HubRouter(Router):
     def send(self, name: ParticipantId, payload: bytes, *, blocking: bool) -> None:
         """Put a message on a participant's `rx`.
 
-        blocking: wait while the queue is full, up to 0.2 s, instead of dropping the message.
+        blocking: wait while the queue is full, up to 0.2 s, instead of dropping the message; not for one who has just
+        been waited for in vain.
         """
-        congestion = self._block if blocking else self._drop
+        started_s = time.monotonic()
+        waits = blocking and started_s >= self._patient_from_s.get(name, started_s)
+        congestion = self._block if waits else self._drop
         self._session.put(self._rx[name], payload, congestion_control=congestion, express=True)
+        if waits and time.monotonic() - started_s > _SLOW_S:
+            self._patient_from_s[name] = time.monotonic() + _IMPATIENT_S
 
     def grant_reply(self, name: ParticipantId) -> None:
         """Let a participant answer the request that is sent to it next."""

@@ -21,6 +21,12 @@ POSE_BYTES_MAX = 256
 SHOWN_PER_S = 1000
 """Messages on a pose key, and on a weights key, that reach observers. A pose is outdated by the next, and
 weights have keyframes."""
+ACCEPT_TIMEOUT_MS = 2000
+"""A connection that has not proved who it is by then is closed."""
+ACCEPT_PENDING = 500
+"""So many connections may be about to prove who they are; more are closed at once, and try again."""
+_SESSIONS_OF_EACH, _SESSIONS_MORE = 4, 64
+"""Sessions at one time: a few of each identity, and observers."""
 _RECEIVE_BYTES = 32 * 1024
 _FRAME_BYTES = 64 * 1024
 
@@ -86,6 +92,9 @@ def _router(
     return _proof(identity, users_file) | {
         "scouting/delay": 0,
         "open/return_conditions": {"connect_scouted": False, "declares": False},
+        "transport/unicast/accept_timeout": ACCEPT_TIMEOUT_MS,
+        "transport/unicast/accept_pending": ACCEPT_PENDING,
+        "transport/unicast/max_sessions": _SESSIONS_OF_EACH * len(grants) + _SESSIONS_MORE,
         # A frozen client must not hold the router for long (the unit is microseconds).
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 200_000,
         # A flood reaches the router in small portions, so that messages of others are read between them.
