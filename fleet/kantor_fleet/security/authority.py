@@ -106,6 +106,7 @@ def issue(folder: Path, wanted: Wanted, now: datetime) -> list[str]:
         authority = _updated(before or _new_authority(wanted.fleet, now), wanted)
         fresh = _fresh(before, authority, wanted)
         made = {user: _certify(authority, user, wanted.days, now) for user in fresh}
+        moved = _moved(folder, authority, made)
         issued = {user: Member(identity.name, identity.until) for user, identity in made.items()}
         members = dict(
             sorted((authority.members | issued).items(), key=lambda row: _sort_key(row[0]))
@@ -119,11 +120,27 @@ def issue(folder: Path, wanted: Wanted, now: datetime) -> list[str]:
             if user not in routers:
                 _save(folder / f"{user}.toml", identity)
         _save(folder / f"{AUTHORITY}.toml", authority)
-        for user, identity in routers.items():
+        for user, identity in (routers | moved).items():
             _save(folder / f"{user}.toml", identity)
-    return _changes(
-        folder, wanted, fresh, [] if before is None else list(routers), first=before is None
-    )
+    changed = [] if before is None else [*routers, *moved]
+    return _changes(folder, wanted, fresh, changed, first=before is None)
+
+
+def _moved(
+    folder: Path, authority: Authority, made: dict[ParticipantId, Certificate]
+) -> dict[ParticipantId, Certificate]:
+    """The identities of robots in the folder that are behind another site than their files say."""
+    changed = {}
+    for user in authority.members:
+        old = None if user in made else read(folder / f"{user}.toml", Certificate)
+        if old is not None and old.site is not None and old.site != _site_of(authority, user):
+            changed[user] = msgspec.structs.replace(old, site=_site_of(authority, user))
+    return changed
+
+
+def _site_of(authority: Authority, user: ParticipantId) -> ParticipantId:
+    """The site that a robot is behind; empty for all others."""
+    return next((site for site, there in authority.sites.items() if user in there), "")
 
 
 def _updated(authority: Authority, wanted: Wanted) -> Authority:
@@ -423,6 +440,7 @@ def _certify(authority: Authority, user: ParticipantId, days: int, now: datetime
         authority.certificate,
         _pem(certificate),
         _secret(key),
+        site=_site_of(authority, user),
     )
 
 

@@ -76,9 +76,11 @@ class ParticipantSession:
         """Check membership after a reconnection: it may be to a world-sim with another member list."""
         assert isinstance(self._identity, Certificate)
         with contextlib.suppress(zenoh.ZError):  # it was closed meanwhile
-            if event.kind == zenoh.SampleKind.PUT and (
-                reason := _reason_of_refusal(self._session, self._identity)
-            ):
+            if event.kind != zenoh.SampleKind.PUT:
+                return
+            if distrust := _distrust(self._session, self._identity):
+                self._received.put(BusError(distrust))
+            elif reason := _reason_of_refusal(self._session, self._identity):
                 self._received.put(BusError(f"refuses {self._identity.user}: {reason}"))
 
 
@@ -167,11 +169,19 @@ def _opened(connect: str, identity: Identity, give_up: float) -> zenoh.Session:
         )
 
 
+def _distrust(session: zenoh.Session, identity: Certificate) -> str:
+    """Why what this session is connected to is not trusted; empty if it is."""
+    names = [link.auth_identifier or "" for link in session.info.links()]
+    return next(filter(None, map(identity.distrust, names)), "")
+
+
 def _check_admitted(connect: str, session: zenoh.Session, identity: Certificate) -> None:
-    """Ask the router whether this identity is a member. Raises BusError.
+    """Check that this is a router to trust, and ask it whether this identity is a member. Raises BusError.
 
     A certificate may be valid and yet not in the member list.
     """
+    if distrust := _distrust(session, identity):
+        raise BusError(f"{connect}: {distrust}")
     reason = _reason_of_refusal(session, identity)
     if reason is None:
         raise BusError(

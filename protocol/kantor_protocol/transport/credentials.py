@@ -82,6 +82,8 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     and world-sim."""
     sites: dict[ParticipantId, tuple[ParticipantId, ...]] = {}
     """World-sim's: for each site its robots."""
+    site: ParticipantId | None = None
+    """The site whose router it may connect to as well as to world-sim; empty: none. None: an older file, any."""
 
     def __post_init__(self) -> None:
         """Check that an authority can have issued this. Raises ValueError."""
@@ -97,6 +99,20 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if any(len(part) > _PEM_MAX for part in (self.authority, self.certificate, self.key)):
             raise ValueError("no PEM")
 
+    def distrust(self, name: str) -> str:
+        """Why what answers, by the common name of its certificate, is no router to connect to; empty if it is one.
+
+        Every router of a fleet has a certificate for servers; its name says what it is.
+        """
+        user = name.partition(".")[0]
+        known = (HOST,) if self.site == "" else (HOST, self.site)
+        if user in known or (self.site is None and user.startswith("site-")):
+            return ""
+        return (
+            f"what answers is {user or 'nobody'}, not {' or '.join(map(str, known))}; do not trust it, "
+            f"or use the newest {self.user}.toml"
+        )
+
     def robots_by_site(self) -> dict[ParticipantId, tuple[ParticipantId, ...]]:
         """For each site the robots that it acts for: those that have not been revoked."""
         return {
@@ -111,7 +127,7 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         user = name.partition(".")[0]
         member = self.members.get(user)
-        renew = f"`kantor keys {self.fleet} --renew {user}` makes a new one"
+        renew = self._renewal(user)
         if name in self.revoked:
             return f"its certificate has been revoked; {renew}"
         if member is None:
@@ -119,10 +135,29 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 f"is not in the register; start {self.user} again with the newest {self.user}.toml"
             )
         if member.name != name:
-            return f"the register names another certificate; use the newest {user}.toml, or {renew}"
+            return self._another(user)
         if user not in wanted:
             return "is not in the team; choose another id"
         return ""
+
+    def answer(self, name: str, wanted: Iterable[ParticipantId]) -> str:
+        """What whoever asks is told about a certificate: as `refusal_reason`, if this certificate exists.
+
+        Anybody may ask about any name. Of names that were only guessed all are answered alike, so that nobody learns
+        who the members are.
+        """
+        known = {*self.revoked, *(member.name for member in self.members.values())}
+        return (
+            self.refusal_reason(name, wanted)
+            if name in known
+            else self._another(name.partition(".")[0])
+        )
+
+    def _another(self, user: str) -> str:
+        return f"the register names another certificate; use the newest {user}.toml, or {self._renewal(user)}"
+
+    def _renewal(self, user: str) -> str:
+        return f"`kantor keys {self.fleet} --renew {user}` makes a new one"
 
     def warnings(self, users: Iterable[ParticipantId], now: datetime) -> list[str]:
         """A line for each of those users' certificates, and the own, that expires soon or has expired."""
@@ -230,7 +265,8 @@ def _converted(tree: dict[str, Any], kind: type[T]) -> T | None:
 
 def to_toml(tree: Mapping[str, Any]) -> str:
     """Texts, times, lists of texts, and tables of tables of these, as TOML."""
-    flat = {key: value for key, value in tree.items() if not isinstance(value, Mapping)}
+    given = {key: value for key, value in tree.items() if value is not None}
+    flat = {key: value for key, value in given.items() if not isinstance(value, Mapping)}
     text = "".join(f"{key} = {_value(value)}\n" for key, value in flat.items())
     for key, table in tree.items():
         if isinstance(table, Mapping):

@@ -224,7 +224,8 @@ class RefusalResponder:
 
     def _on_query(self, query: zenoh.Query) -> None:
         name = str(query.key_expr).rpartition("/")[2]
-        query.reply(keys.door(self._identity.fleet, name), self._reason(name).encode())
+        answer = self._identity.answer(name, self._wanted)
+        query.reply(keys.door(self._identity.fleet, name), answer.encode())
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         name = event.link.auth_identifier
