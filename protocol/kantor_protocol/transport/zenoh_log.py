@@ -12,9 +12,16 @@ from kantor_protocol.transport import tls
 from kantor_protocol.transport.credentials import Identity, Password
 from kantor_protocol.transport.session import CLOSE_S
 
+_WITHOUT_SECRETS = "zenoh::api::session=info"
+
 
 def init_log() -> None:
-    """Silence Zenoh's own log, unless RUST_LOG is set: kantor reports the errors that a user can repair."""
+    """Silence Zenoh's own log, unless RUST_LOG is set: kantor reports the errors that a user can repair.
+
+    Whatever RUST_LOG asks for, the configuration of a session is not printed: it has the password or the key.
+    """
+    if wanted := os.environ.get("RUST_LOG"):
+        os.environ["RUST_LOG"] = f"{wanted},{_WITHOUT_SECRETS}"
     zenoh.init_log_from_env_or("off")
 
 
