@@ -95,3 +95,29 @@ def test_a_quota_follows_from_the_mission() -> None:
     assert wall["r1"] == RateLimit.of(4.0)
     assert wall["supervisor"] == RateLimit.of(16.0)
     assert set(turns.values()) == {RateLimit.of(0.0)}
+
+
+@examples(100)
+@given(st.lists(st.tuples(PAUSES_S, st.floats(0.0, 12.0)), max_size=300))
+def test_work_is_charged_as_messages_are(said: list[tuple[float, float]]) -> None:
+    """A report that causes as much as eight costs as much as eight; what is not admitted is counted."""
+    quota = RateLimit.of(10.0)
+    bucket = TokenBucket(quota)
+    now_s = taken = 0.0
+    refused = 0
+    for pause_s, work in said:
+        now_s += pause_s
+        if bucket.admit(100, now_s) and bucket.charge(work, now_s):
+            taken += max(1.0, work)
+        else:
+            refused += 1
+        assert taken <= BURST_MESSAGES + now_s * quota.messages_per_s + 1e-6
+        assert bucket.excess.messages == refused
+
+
+def test_one_envelope_to_the_whole_team_costs_nothing_more() -> None:
+    """So does a report without any: a full bucket is as empty as after as many messages."""
+    bucket = TokenBucket(RateLimit.of(0.0))
+    admitted = sum(bucket.admit(10, 0.0) and bucket.charge(1.0, 0.0) for _ in range(1000))
+
+    assert admitted == BURST_MESSAGES

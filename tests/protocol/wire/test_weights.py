@@ -237,3 +237,16 @@ def test_bomb_is_not_inflated() -> None:
     subscriber = WeightsSubscriber()
 
     assert not subscriber.apply(message(1, 0, 3, zlib.compress(bytes(50_000_000))))
+
+
+@pytest.mark.parametrize("size", [1, 2, 4, 50_000_000])
+def test_a_message_about_another_number_of_samples_is_not_inflated(
+    size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who knows the mission knows how many weights there are, before anything is inflated."""
+    subscriber = WeightsSubscriber(3)
+    assert subscriber.apply(message(1, 0, 3, keyframe(7, 8, 9)))
+    monkeypatch.delattr(zlib, "decompressobj")
+
+    assert not subscriber.apply(message(2, 0, size, zlib.compress(bytes(4 * min(size, 99)), 9)))
+    assert vector_of(subscriber) == [7, 8, 9]

@@ -516,3 +516,22 @@ def test_neighbours_in_the_order_are_neighbours_in_space() -> None:
         return float(np.hypot(*np.diff(places, axis=0).T).sum())
 
     assert way_m(points) < 0.15 * way_m(shuffled)
+
+
+def test_an_array_that_is_larger_than_its_file_is_not_made(tmp_path: Path) -> None:
+    """Room is made for what is in a file, not for what its header says."""
+    path = tmp_path / "huge.npy"
+    content = npy(np.zeros((2, 2)))
+    path.write_bytes(content.replace(b"(2, 2), }" + b" " * 9, b"(9999999999, 2), }"))
+
+    with pytest.raises(ScenarioError, match="too short"):
+        samples_of(mission(f"samples.file={path}"), 1)
+
+
+def test_an_image_of_too_many_pixels_is_not_decoded(tmp_path: Path) -> None:
+    """A small file may have a large image in it; its size is known before it is decoded."""
+    path = tmp_path / "huge.png"
+    Image.new("1", (4001, 4000)).save(path)
+
+    with pytest.raises(ScenarioError, match="more than 16000000 pixels"):
+        samples_of(mission("samples.count=5", f"samples.file={path}"), 1)

@@ -173,7 +173,9 @@ def _messages(path: Path) -> Iterator[tuple[str, Message]]:
                     yield channels.get(item.channel_id, ""), item
                 elif isinstance(item, Channel):
                     channels[item.id] = item.topic
-        except (McapError, ValueError, EOFError, OverflowError, RuntimeError, struct.error):
+        except (McapError, zstandard.ZstdError, ValueError, EOFError, OverflowError, struct.error):
+            return
+        except RuntimeError:  # of lz4
             return
 
 
