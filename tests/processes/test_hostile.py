@@ -3,15 +3,17 @@
 import signal
 import socket
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 import pytest
 
+from kantor_fleet.security.authority import Wanted, issue
 from kantor_protocol.base.machine import Envelope, Outputs, Pose
-from kantor_protocol.transport import credentials
-from kantor_protocol.transport.client import ParticipantSession, participant_session
+from kantor_protocol.transport import credentials, zenoh_config
+from kantor_protocol.transport.client import ParticipantSession, client, participant_session
 from kantor_protocol.transport.endpoint import free_endpoint, parse_endpoint
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import BusError
@@ -32,6 +34,7 @@ from kantor_worldsim.record.journal import Journal
 from kantor_worldsim.record.records import Batch
 from support.limits import EVENT_LIMIT_S
 from support.processes.fleets import await_act, await_line, records_of, result_of
+from support.processes.intruders import plain_session
 
 if TYPE_CHECKING:
     from support.processes.command import Kantor, Process
@@ -202,3 +205,35 @@ def test_no_password_is_in_zenoh_s_log(kantor: "Kantor") -> None:
     assert "DEBUG" in out + err
     assert identity.password not in out + err
     world.communicate(EVENT_LIMIT_S)
+
+
+def test_a_site_cannot_pose_as_world_sim(tmp_path: Path) -> None:
+    """To a robot of another place its certificate says what it is; its own robots may connect to it."""
+    issue(tmp_path / "keys", Wanted("demo", 2, sites=("north=r1",)), datetime.now(UTC))
+    site, r1, r2 = (credentials.find(tmp_path / "keys", f"{n}") for n in ("site-north", "r1", "r2"))
+    assert isinstance(site, credentials.Certificate)
+    proof = zenoh_config.client_config(site)
+    endpoint = free_endpoint("tls")
+    with plain_session("", proof, mode="router", listen=endpoint):
+        with pytest.raises(
+            BusError, match="what answers is site-north, not worldsim; do not trust"
+        ):
+            client(endpoint, r2, EVENT_LIMIT_S)
+        with pytest.raises(BusError, match="no world-sim of fleet demo answers"):
+            client(endpoint, r1, EVENT_LIMIT_S)
+
+
+def test_the_door_tells_nothing_of_other_members(tmp_path: Path) -> None:
+    """Whoever guesses a name is answered in the same words, whether there is such a member or not."""
+    issue(tmp_path / "keys", Wanted("demo", 2), datetime.now(UTC))
+    issue(tmp_path / "keys", Wanted("demo", revoke=("r2",)), datetime.now(UTC))
+    hub = credentials.find(tmp_path / "keys", "worldsim")
+    assert isinstance(hub, credentials.Certificate)
+    answers = {
+        user: hub.answer(f"{user}.{'0' * 16}", ROSTER).replace(user, "?")
+        for user in ("r1", "r2", "r9", "supervisor")
+    }
+
+    assert len(set(answers.values())) == 1
+    assert hub.answer(hub.members["r1"].name, ROSTER) == ""
+    assert "revoked" in hub.answer(hub.revoked[0], ROSTER)
