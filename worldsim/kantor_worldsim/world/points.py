@@ -12,7 +12,7 @@ from array import array
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from tokenize import TokenError
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -176,10 +176,28 @@ def _number(line: int, row: int, cells: list[str], column: int) -> float:
 # NPY.
 
 
+_NPY_HEADERS = {
+    1: np.lib.format.read_array_header_1_0,
+    2: np.lib.format.read_array_header_2_0,
+}
+"""Readers of headers by version; a third version is for names of fields, which points have not."""
+
+
+def _check_header(file: IO[bytes], file_bytes: int) -> None:
+    """Raise ValueError for an array that is larger than its file; room for it would be made before it is read."""
+    major, _ = np.lib.format.read_magic(file)
+    if major in _NPY_HEADERS:
+        shape, _, dtype = _NPY_HEADERS[major](file)
+        if not dtype.hasobject and math.prod(shape) * dtype.itemsize > file_bytes:
+            raise ValueError(f"the file is too short for an array of shape {shape}")
+    file.seek(0)
+
+
 def _npy(path: Path) -> Points:
     check(path, _NPY_BYTES_MAX)
     try:
         with path.open("rb") as file:  # np.load would also open archives
+            _check_header(file, path.stat().st_size)
             table = np.asarray(np.lib.format.read_array(file, allow_pickle=False))
     except (*UNREADABLE, TokenError) as error:
         raise _TableError(f"not a table of x, y: {str(error).splitlines()[0]}") from None
