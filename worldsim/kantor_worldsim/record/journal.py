@@ -1,27 +1,25 @@
 """The journal: the records of a run on disk (MCAP, msgpack) and their digest.
 
 Every message goes to the operating system at once, so a killed recorder loses no record that it accepted;
-MCAP's own chunks would hold seconds back. A file cut anywhere can be read up to the cut.
+MCAP's own chunks would hold seconds back. A file cut anywhere can be read up to the cut. The file of a run that has
+ended is written once more, with an index for readers that seek.
 """
 
 import contextlib
 import dataclasses
 import hashlib
 import json
-import struct
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
 import lz4.frame
 import msgspec
-import zstandard
-from mcap.exceptions import McapError
-from mcap.records import Channel, Chunk, McapRecord, Message
-from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, IndexType, Writer
 
 from kantor_worldsim.record.columnar import DecodedRecord
+from kantor_worldsim.record.mcap_file import PROFILE, messages, write_index
 from kantor_worldsim.record.records import Batch, Ending, Record, decode_record, encode_record
 
 RECORD_TOPIC = "/kantor/record"
@@ -80,10 +78,13 @@ class Journal:
                 compression=CompressionType.NONE,
                 index_types=IndexType.NONE,
                 use_chunking=False,
-                use_statistics=True,
+                # Without a summary readers know that there is no index, and read from the start.
+                use_statistics=False,
                 use_summary_offsets=False,
+                repeat_channels=False,
+                repeat_schemas=False,
             )
-            self._writer.start(profile="kantor", library="kantor")
+            self._writer.start(profile=PROFILE, library=PROFILE)
             self._channels = {
                 RECORD_TOPIC: self._writer.register_channel(RECORD_TOPIC, "msgpack", 0),
                 METRICS_TOPIC: self._writer.register_channel(METRICS_TOPIC, "json", 0),
@@ -108,7 +109,7 @@ class Journal:
     def append_row(self, row: Any) -> None:
         """Write one row of metrics, for viewers; it is not part of the digest."""
         if self._file is not None:
-            self._write(METRICS_TOPIC, json.dumps(row._asdict()).encode())
+            self._write(METRICS_TOPIC, json.dumps(_finite(row._asdict())).encode())
 
     def replace(self) -> None:
         """Replace the old file, once all its records have been written again."""
@@ -117,7 +118,7 @@ class Journal:
             draft.replace(self._path)
 
     def close(self) -> None:
-        """Finish the file, and delete the reserve, so that the result has room on the disk."""
+        """Finish the file, index it, and delete the reserve, so that the result has room on the disk."""
         if self._file is not None:
             try:
                 self._writer.finish()  # type: ignore[no-untyped-call]
@@ -125,6 +126,9 @@ class Journal:
             except OSError as error:
                 self._give_up(error)
         self._drop_file()
+        if self._path is not None and self._draft is None and self.cut is None:
+            with contextlib.suppress(OSError):  # no room for a second copy: the file stays without
+                write_index(self._path)
         if self._path is not None:
             self._reserve.unlink(missing_ok=True)
 
@@ -154,56 +158,22 @@ class Journal:
                 file.close()
 
 
+def _finite(row: dict[str, Any]) -> dict[str, Any]:
+    """A row with None for numbers that JSON does not have."""
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in row.items()
+    }
+
+
 def read(path: Path) -> Iterator[tuple[bytes, Record]]:
     """The records of a journal with their bytes, up to where it ends or is cut."""
-    for topic, message in _messages(path):
-        if topic == RECORD_TOPIC:
+    for message in messages(path):
+        if message.topic.name == RECORD_TOPIC:
             try:
                 yield message.data, decode_record(message.data)
             except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
                 return
-
-
-def _messages(path: Path) -> Iterator[tuple[str, Message]]:
-    channels: dict[int, str] = {}
-    with path.open("rb") as file:
-        try:
-            for item in _records_of_file(file):
-                if isinstance(item, Message):
-                    yield channels.get(item.channel_id, ""), item
-                elif isinstance(item, Channel):
-                    channels[item.id] = item.topic
-        except (McapError, zstandard.ZstdError, ValueError, EOFError, OverflowError, struct.error):
-            return
-        except RuntimeError:  # of lz4
-            return
-
-
-def _records_of_file(file: IO[bytes]) -> Iterator[McapRecord]:
-    """The records of an MCAP file, those in its chunks included. Raises what the reader and the codecs raise."""
-    reader = StreamReader(file, emit_chunks=True, record_size_limit=_RECORD_BYTES_MAX)
-    for item in reader.records:
-        if isinstance(item, Chunk):
-            yield from breakup_chunk(_inflated(item))
-        else:
-            yield item
-
-
-def _inflated(chunk: Chunk) -> Chunk:
-    """The same chunk without compression. Raises ValueError if it is larger than it may be, or than it says."""
-    size = chunk.uncompressed_size
-    if size > _CHUNK_BYTES_MAX:
-        raise ValueError(f"a chunk of {size} bytes")
-    if chunk.compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
-            content = stream.read(size + 1)
-    elif chunk.compression == "lz4":
-        content = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
-    else:
-        content = chunk.data
-    if len(content) > max(size, len(chunk.data)):
-        raise ValueError("a chunk that is larger than it says")
-    return dataclasses.replace(chunk, compression="", data=content)
 
 
 def file_digest(path: Path) -> str:
