@@ -1,12 +1,14 @@
 """`kantor verify`: check a recorded run, execute it again and compare."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from kantor_fleet.execution.experiment import reason
 from kantor_fleet.execution.in_process_team import participant, play
 from kantor_fleet.exits import Exit, fail
 from kantor_protocol.base.machine import WORLD_SIM, Outputs, ParticipantId, StateMachine
@@ -16,6 +18,7 @@ from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError
 from kantor_worldsim.engine.process_faults import ProcessFaults
 from kantor_worldsim.observers.checkers.checker import check
+from kantor_worldsim.record import behaviour
 from kantor_worldsim.record.journal import Digest, file_digest, read
 from kantor_worldsim.record.process_events import TAKE_OVER
 from kantor_worldsim.record.records import (
@@ -28,7 +31,7 @@ from kantor_worldsim.record.records import (
     StepRecord,
     encode_record,
 )
-from kantor_worldsim.record.run_folder import JOURNAL, MANIFEST
+from kantor_worldsim.record.run_folder import JOURNAL, MANIFEST, Manifest
 from kantor_worldsim.world.inputs import InputFile, changes_since, inputs_of
 from kantor_worldsim.world.world import World, WorldSetup
 
@@ -50,27 +53,28 @@ def print_findings(found: "list[Finding]") -> Exit:
 
 def findings(folder: Path, records: list[tuple[bytes, Record]] | None = None) -> "list[Finding]":
     """A finding on the file, on the rules and on the execution. records: the journal, if it has been read."""
-    manifest = read_manifest(folder)
+    tree = read_manifest(folder)
+    manifest = _settings(folder, tree)
     records = _journal(folder) if records is None else records
-    if not records or not isinstance(records[0][1], Opening):
+    opening = records[0][1] if records else None
+    if not isinstance(opening, Opening):
         return [(False, f"{JOURNAL}: no opening record in it")]
     found = list(_findings_on_file(folder, manifest, records))
-    inputs = inputs_in(manifest)
+    try:
+        opening.check()
+    except (RefusedError, ScenarioError, ValueError) as error:
+        problem = str(error).splitlines()[0]
+        return [*found, (False, f"{JOURNAL}: no run can start from its opening: {problem}")]
+    inputs = inputs_in(tree)
     changes = list(changes_since(inputs))
     if changes:
         found.append(
             (True, f"inputs: {', '.join(changes)} since the run; the record has what it read")
         )
-    drawn_anew = not changes and (bool(inputs) or not _names_files(records[0][1].scenario))
-    try:
-        found += [
-            _finding_of_checker(manifest, records),
-            _finding_of_execution(manifest, records, drawn_anew=drawn_anew),
-        ]
-    except (RefusedError, ScenarioError, ValueError) as error:
-        problem = str(error).splitlines()[0]
-        found.append((False, f"{JOURNAL}: no run can start from its opening: {problem}"))
-    return found
+    drawn_anew = not changes and (bool(inputs) or not _names_files(opening.scenario))
+    execution = partial(_finding_of_execution, drawn_anew=drawn_anew)
+    judges = (_finding_of_checker, execution)
+    return [*found, *(_judged(judge, manifest, records) for judge in judges)]
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -88,6 +92,18 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
+def _settings(folder: Path, tree: dict[str, Any]) -> Manifest:
+    """What a manifest says of how a run is verified; ends the command if that is not usable."""
+    path = folder / MANIFEST
+    try:
+        manifest = msgspec.convert(tree, Manifest)
+    except (msgspec.ValidationError, UnicodeEncodeError) as error:
+        fail(Exit.USAGE, f"{path}: written by another version ({error}); verify it with that one")
+    if manifest.behaviour > behaviour.current():
+        fail(Exit.USAGE, f"{path}: written by a newer version; verify it with that one")
+    return manifest
+
+
 def inputs_in(manifest: dict[str, Any]) -> tuple[InputFile, ...]:
     """The files that a run was read from; none if its manifest does not say."""
     try:
@@ -101,10 +117,10 @@ def _names_files(scenario: Scenario) -> bool:
 
 
 def _journal(folder: Path) -> list[tuple[bytes, Record]]:
-    try:
-        return list(read(folder / JOURNAL))
-    except FileNotFoundError:
-        fail(Exit.USAGE, f"{folder / JOURNAL}: no such file; give a folder that a run left")
+    path = folder / JOURNAL
+    if not path.is_file():
+        fail(Exit.USAGE, f"{path}: no such file; give a folder that a run left")
+    return list(read(path))
 
 
 Finding = tuple[bool, str]
@@ -112,25 +128,37 @@ Finding = tuple[bool, str]
 
 
 def _findings_on_file(
-    folder: Path, manifest: dict[str, Any], records: list[tuple[bytes, Record]]
+    folder: Path, manifest: Manifest, records: list[tuple[bytes, Record]]
 ) -> Iterator[Finding]:
-    if "digest" not in manifest:
+    if manifest.digest is None:
         yield True, f"{JOURNAL}: the run was killed; {len(records)} records up to then"
         return
-    same = file_digest(folder / JOURNAL) == manifest.get("journal_blake2b")
+    same = file_digest(folder / JOURNAL) == manifest.journal_blake2b
     yield same, f"{JOURNAL}: {'as it was written' if same else 'changed since it was written'}"
-    if manifest.get("record") != "whole":
-        yield True, f"{JOURNAL}: {manifest.get('record')}; {len(records)} records up to then"
+    if manifest.record != "whole":
+        yield True, f"{JOURNAL}: {manifest.record}; {len(records)} records up to then"
         return
     digest = Digest()
     for payload, _ in records:
         digest.add(payload)
-    same = digest.hex == manifest["digest"] and digest.records == manifest.get("records")
+    same = digest.hex == manifest.digest and digest.records == manifest.records
     yield same, f"digest of {digest.records} records: {digest.hex}"
 
 
-def _finding_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Record]]) -> Finding:
-    virtual = manifest.get("exchange") != _REALTIME
+def _judged(
+    judge: Callable[[Manifest, list[tuple[bytes, Record]]], Finding],
+    manifest: Manifest,
+    records: list[tuple[bytes, Record]],
+) -> Finding:
+    """A finding; if the record is such that there can be none, that is the finding."""
+    try:
+        return judge(manifest, records)
+    except Exception as error:  # noqa: BLE001  a forged record may provoke any
+        return False, f"{JOURNAL}: no run goes on as it says: {reason(error)}"
+
+
+def _finding_of_checker(manifest: Manifest, records: list[tuple[bytes, Record]]) -> Finding:
+    virtual = manifest.exchange != _REALTIME
     checker = check((record for _, record in records), virtual=virtual)
     if not checker.count:
         return True, "checker: all rules held"
@@ -138,13 +166,22 @@ def _finding_of_checker(manifest: dict[str, Any], records: list[tuple[bytes, Rec
 
 
 def _finding_of_execution(
-    manifest: dict[str, Any], records: list[tuple[bytes, Record]], *, drawn_anew: bool
+    manifest: Manifest, records: list[tuple[bytes, Record]], *, drawn_anew: bool
 ) -> Finding:
+    """The run executed again. What has changed since it was recorded may be why it differs, and then it says so."""
     opening = records[0][1]
     assert isinstance(opening, Opening)
-    if manifest.get("exchange") == _REALTIME or any(_unscheduled(opening.scenario, records)):
-        return _replayed(opening, records)
-    return _executed(opening, records, drawn_anew=drawn_anew)
+    if manifest.exchange == _REALTIME or any(_unscheduled(opening.scenario, records)):
+        passed, line = _replayed(opening, records)
+    else:
+        passed, line = _executed(opening, records, drawn_anew=drawn_anew)
+    changes = behaviour.changes_since(manifest.behaviour, opening.scenario)
+    if passed or not changes:
+        return passed, line
+    return True, (
+        f"{line}, which proves nothing: recorded under behaviour {manifest.behaviour}, "
+        f"this is {behaviour.current()}; changed since: {changes}"
+    )
 
 
 def _unscheduled(scenario: Scenario, records: list[tuple[bytes, Record]]) -> Iterator[bool]:

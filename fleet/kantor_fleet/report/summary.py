@@ -7,9 +7,13 @@ from pathlib import Path
 import msgspec
 
 from kantor_fleet.exits import Exit
+from kantor_protocol.files.reading import read_bytes
 from kantor_worldsim.observers.metrics.result import MapResult, Result
 from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.run_folder import JOURNAL, METRICS, REPORT, RESULT
+
+
+_RESULT_BYTES_MAX = 1 << 24
 
 
 def conclude(folder: Path) -> None:
@@ -36,8 +40,8 @@ def _exact_of(folder: Path) -> list[tuple[float, float]]:
 def read_result(folder: Path) -> Result | None:
     """The result of a run folder, if it has one."""
     try:
-        return msgspec.json.decode((folder / RESULT).read_bytes(), type=Result)
-    except (OSError, msgspec.MsgspecError):
+        return msgspec.json.decode(read_bytes(folder / RESULT, _RESULT_BYTES_MAX), type=Result)
+    except (ValueError, msgspec.MsgspecError, RecursionError):
         return None
 
 

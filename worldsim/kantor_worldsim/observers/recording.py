@@ -101,8 +101,7 @@ class Recording:
         if folder is None:
             return None
         if past is not None:
-            resumed = past.manifest.get("resumed", 0) + 1
-            self._manifest = past.manifest | {"resumed": resumed}
+            self._manifest = past.manifest | {"resumed": past.terms.resumed + 1}
         else:
             write_text(folder / SCENARIO, to_toml(self._scenario))
             self._manifest = new_manifest(self._scenario, self._seed, self._exchange)

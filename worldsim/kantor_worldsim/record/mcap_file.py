@@ -58,8 +58,9 @@ def messages(path: Path) -> Iterator[McapMessage]:
                     number, topic = _channel(content)
                     channels[number] = topic
                 else:
-                    number, *head = _MESSAGE_HEAD.unpack_from(content)
-                    yield McapMessage(channels[number], *head, content[_MESSAGE_HEAD.size :])
+                    number, sequence, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(content)
+                    data = content[_MESSAGE_HEAD.size :]
+                    yield McapMessage(channels[number], sequence, log_ns, publish_ns, data)
             except (struct.error, UnicodeDecodeError, KeyError):
                 return
 

@@ -9,7 +9,9 @@ import msgspec
 
 from kantor_protocol.base.grid import Frame
 from kantor_protocol.base.machine import Envelope, Inputs, Observation, Outputs, ParticipantId
+from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.scenario.validate import complaints
 from kantor_protocol.wire.messages import Array, RefusedError
 from kantor_protocol.wire.weights import Units
 from kantor_worldsim.radio.channel import DeliveryDecision
@@ -37,6 +39,27 @@ class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
     frame: Frame | None = None
     """Frame of the map: position of its cells in the world."""
 
+    def check(self) -> None:
+        """Check that a run can start from this, and that its scenario orders no more than what it holds.
+
+        Raises RefusedError, ScenarioError.
+        """
+        scenario, counted = self.scenario, _counts_in(self.scenario)
+        arrays = {"starts": self.starts_m, "samples": self.samples_m, "targets": self.targets_m}
+        for name, count in counted.items():
+            if arrays[name].shape[:1] != (count,):
+                raise RefusedError(f"{arrays[name].shape} {name}, and {count} in the scenario")
+        if scenario.mapping != (self.ground is not None):
+            raise RefusedError("a map in the scenario or in the opening, and not in both")
+        if (problem := next(iter(complaints(scenario)), None)) is not None:
+            raise ScenarioError(problem)
+        targets = self.setup.targets_m.shape[0]
+        for name, found in self.first_look.items():
+            if name not in scenario.robot_ids:
+                raise RefusedError(f"{name} looks around and is not in the team")
+            if any(not 0 <= target < targets for target, _, _ in found):
+                raise RefusedError(f"{name} sees a target that there is not")
+
     @property
     def setup(self) -> WorldSetup:
         """The arrays of the opening. Raises RefusedError."""
@@ -60,6 +83,16 @@ class Opening(msgspec.Struct, frozen=True, array_like=True, tag="opening"):
     def units(self) -> Units:
         """Units of mass of the run."""
         return units_of(self.scenario, self.samples_m.shape[0])
+
+
+def _counts_in(scenario: Scenario) -> dict[str, int]:
+    """Numbers of points that a scenario itself decides, and no file."""
+    counts = {"starts": scenario.robots.count}
+    if scenario.samples.file is None and scenario.samples.count is not None:
+        counts["samples"] = scenario.samples.count
+    if scenario.targets.file is None:
+        counts["targets"] = scenario.targets.count
+    return counts
 
 
 class StepRecord(msgspec.Struct, frozen=True, array_like=True, gc=False):

@@ -2,17 +2,25 @@
 
 import contextlib
 import csv
+import errno
+import fcntl
 import json
+import os
 import platform
+import shutil
 from datetime import UTC, datetime
 from importlib.metadata import version
+from multiprocessing import reduction
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import IO, Annotated, Any, Literal, NamedTuple, Self
 
 import msgspec
 
 from kantor_protocol.files.reading import read_text
+from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.messages import RefusedError
+from kantor_worldsim.record import behaviour
 from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.records import Ending, Opening, Record
 
@@ -22,6 +30,8 @@ RESULT = "result.json"
 SCENARIO = "scenario.toml"
 METRICS = "metrics.csv"
 REPORT = "report.png"
+_FORMAT = 1
+"""Of the folder, in its manifest."""
 
 
 def folder_for(scenario: Scenario, seed: int, below: Path) -> Path:
@@ -45,14 +55,101 @@ class OverError(ResumeError):
     """The mission has come to its end, and its files are whole."""
 
 
+class InUseError(ResumeError):
+    """A run folder that another process writes."""
+
+
+class FolderLock:
+    """The right to write a run folder: of one process at a time, and of those that it starts with this.
+
+    It ends with the last process that has it, however that ends. Where a file system has no locks it excludes no one.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Raises InUseError, and ResumeError if there is no such folder."""
+        try:
+            self._descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        except OSError as error:
+            raise ResumeError(
+                f"{folder}: no run to go on with ({error.strerror}); give its folder"
+            ) from None
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.release()
+            raise InUseError(
+                f"{folder}: another process runs this mission; wait for its end, or end it"
+            ) from None
+        except OSError as error:
+            if error.errno not in {errno.EBADF, errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}:
+                raise
+
+    @classmethod
+    def _inherited(cls, descriptor: Any) -> "FolderLock":
+        lock = cls.__new__(cls)
+        lock._descriptor = descriptor.detach()  # noqa: SLF001
+        return lock
+
+    def __reduce__(self) -> Any:
+        """For a process that is being started."""
+        return FolderLock._inherited, (reduction.DupFd(self._descriptor),)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.release()
+
+    def release(self) -> None:
+        """Give it up."""
+        descriptor, self._descriptor = self._descriptor, -1
+        if descriptor >= 0:
+            os.close(descriptor)
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether nothing has happened in the run of a folder: not even its opening is on record."""
+    try:
+        return next(read(folder / JOURNAL), None) is None
+    except OSError:
+        return True
+
+
+def remove_if_empty(folder: Path) -> bool:
+    """Remove the folder of a run in which nothing has happened; whether it has been removed."""
+    if not is_empty(folder):
+        return False
+    shutil.rmtree(folder, ignore_errors=True)
+    return not folder.exists()
+
+
+Exchange = Literal["in-process", "lockstep", "wall"]
+
+
 class Terms(msgspec.Struct, frozen=True):
     """Settings of a run, as in its manifest."""
 
-    run: str
+    run: Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
     """Name of the run."""
-    exchange: str
-    speed: float
-    exact_every: int | None = None
+    exchange: Exchange
+    speed: Annotated[float, msgspec.Meta(gt=0.0, le=1000.0)]
+    exact_every: Annotated[int, msgspec.Meta(ge=0)] | None = None
+    resumed: Annotated[int, msgspec.Meta(ge=0, le=1 << 30)] = 0
+    """Number of times that it was resumed."""
+
+
+class Manifest(msgspec.Struct, frozen=True):
+    """A manifest, as far as it is needed to verify a run."""
+
+    format: Literal[1]
+    exchange: Exchange
+    behaviour: Annotated[int, msgspec.Meta(ge=1)] = behaviour.FIRST
+    digest: str | None = None
+    """None while the run goes on, and when it was killed."""
+    records: int | None = None
+    record: str | None = None
+    """`whole`, or where it was cut."""
+    journal_blake2b: str | None = None
 
 
 class Past(NamedTuple):
@@ -73,13 +170,17 @@ class Past(NamedTuple):
             terms = msgspec.convert(manifest, Terms)
         except msgspec.ValidationError as error:
             raise ResumeError(f"{folder / MANIFEST}: of another version: {error}") from None
-        except (OSError, ValueError) as error:  # no file, no text, or no JSON
+        except (OSError, ValueError, RecursionError) as error:
             reason = error.strerror if isinstance(error, OSError) else str(error)
             raise ResumeError(
                 f"{folder}: no run to go on with ({reason}); give its folder"
             ) from None
         if not records or not isinstance(records[0], Opening):
             raise ResumeError(f"{folder / JOURNAL}: nothing has happened in it; start the run anew")
+        try:
+            records[0].check()
+        except (RefusedError, ScenarioError) as error:
+            raise ResumeError(f"{folder / JOURNAL}: no run can start from it: {error}") from None
         last = records[-1]
         if isinstance(last, Ending):
             if "digest" in manifest and last.reason != "interrupted":
@@ -121,7 +222,8 @@ def new_manifest(scenario: Scenario, seed: int, exchange: str) -> dict[str, Any]
     """Manifest of a run that begins now."""
     libraries = ("kantor", "eclipse-zenoh", "numpy", "scipy", "numba", "msgspec", "mcap")
     return {
-        "format": 1,
+        "format": _FORMAT,
+        "behaviour": behaviour.current(),
         "scenario": scenario.name,
         "seed": seed,
         "exchange": exchange,
