@@ -22,6 +22,7 @@ from kantor_fleet.cli.tap import tap
 from kantor_fleet.cli.verify import verify
 from kantor_fleet.cli.worldsim import worldsim
 from kantor_fleet.exits import Exit, fail
+from kantor_fleet.interrupts import Interrupted
 
 VERBS: dict[str, Callable[..., int]] = {
     "run": run,
@@ -43,6 +44,7 @@ VERBS: dict[str, Callable[..., int]] = {
 
 def main() -> None:
     """Entry point: one verb, one exit code, and one line instead of a traceback for a user's mistake."""
+    from kantor_fleet.execution.fork_server import StartError  # noqa: PLC0415
     from kantor_protocol.scenario.errors import ScenarioError  # noqa: PLC0415
     from kantor_protocol.transport.credentials import CredentialsError  # noqa: PLC0415
     from kantor_protocol.transport.session import BusError  # noqa: PLC0415
@@ -56,11 +58,15 @@ def main() -> None:
         fail(Exit.USAGE, str(error))
     except BusError as error:
         fail(Exit.UNREACHABLE, str(error))
+    except StartError as error:
+        fail(Exit.PROCESS_FAILED, str(error))
     except BrokenPipeError:
         sys.stderr.close()
         code = Exit.DONE
     except OSError as error:
         fail(Exit.USAGE, f"{error.filename or 'file'}: {error.strerror or error}")
+    except Interrupted as interrupted:
+        code = interrupted.code
     except KeyboardInterrupt:
         code = Exit.INTERRUPTED
     sys.exit(code)

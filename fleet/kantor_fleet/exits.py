@@ -17,6 +17,8 @@ class Exit(enum.IntEnum):
     PROCESS_FAILED = 3
     UNREACHABLE = 4
     """The bus cannot be reached, or it refuses this process."""
+    HUNG_UP = 129
+    """Its terminal is gone."""
     INTERRUPTED = 130
     TERMINATED = 143
 

@@ -5,7 +5,6 @@ slowed and impersonated, world-sim too, and every mission has to come to its end
 and read again from its file alone.
 """
 
-import multiprocessing
 import os
 import shutil
 import tempfile
@@ -30,7 +29,10 @@ from kantor_fleet.campaign.rss_monitor import (
 )
 from kantor_fleet.campaign.run import commit
 from kantor_fleet.execution.experiment import code
+from kantor_fleet.execution.fork_server import fork_server
 from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.execution.leftovers import Leftovers
+from kantor_fleet.execution.parent_death import die_with_parent
 from kantor_fleet.execution.preload import warm_up
 from kantor_fleet.execution.verify import findings
 from kantor_fleet.exits import Exit
@@ -205,8 +207,8 @@ def _orphans() -> list[int]:
 
 def _check_apart(config: FleetConfig, failures: list[str]) -> ProcessMission:
     """Check a mission in another process, since a whole record in memory would make this one larger for good."""
-    context = multiprocessing.get_context("forkserver")
-    with ProcessPoolExecutor(1, mp_context=context) as pool:
+    context = fork_server()
+    with ProcessPoolExecutor(1, mp_context=context, initializer=die_with_parent) as pool:
         return pool.submit(_check, config, failures).result()
 
 
@@ -463,7 +465,8 @@ def _own_temporary_folder() -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="kantor-") as folder:
         tempfile.tempdir = os.environ["TMPDIR"] = folder
         try:
-            yield Path(folder)
+            with Leftovers(Path(folder)):
+                yield Path(folder)
         finally:
             tempfile.tempdir = before[0]
             os.environ.pop("TMPDIR")

@@ -1,11 +1,27 @@
-"""The fork server from which the processes of this machine come: it has imported and compiled everything."""
+"""The fork server from which the processes of this machine come: it has imported and compiled everything.
+
+No process outlives the command that started it: the fork server ends with the command, and they end with the fork
+server, by the kernel's doing. So do those that are stopped, and none needs to be asked.
+"""
 
 import contextlib
 import multiprocessing
 import os
-from multiprocessing.context import ForkServerContext
+import signal
+from collections.abc import Callable
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import ForkServerContext, ForkServerProcess
+from typing import Any
 
-_PRELOADED = "kantor_fleet.execution.preloaded"
+from kantor_fleet.execution.parent_death import die_with_parent
+
+_DESCRIPTORS = 12
+"""More than the start of a process takes."""
+_PRELOADED = ["kantor_fleet.execution.tied", "kantor_fleet.execution.preloaded"]
+
+
+class StartError(Exception):
+    """A process that cannot be started; the message is one line with the remedy."""
 
 
 def fork_server() -> ForkServerContext:
@@ -13,8 +29,54 @@ def fork_server() -> ForkServerContext:
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([_PRELOADED])
+    context.set_forkserver_preload(_PRELOADED)
     return context
+
+
+def start_process(name: str, target: Callable[..., Any], *arguments: Any) -> ForkServerProcess:
+    """Start a process that ends with this one. Raises StartError."""
+    # A daemon: one that is left when the command ends is ended, and not waited for.
+    process = fork_server().Process(
+        target=be_tied, args=(target, *arguments), name=name, daemon=True
+    )
+    try:
+        _check_room()
+        process.start()
+    except (OSError, EOFError) as error:
+        raise _start_error(name, error) from None
+    return process
+
+
+def pipe(name: str) -> tuple[Connection, Connection]:
+    """A pipe to the process of this name. Raises StartError."""
+    try:
+        return fork_server().Pipe()
+    except OSError as error:
+        raise _start_error(name, error) from None
+
+
+def _start_error(name: str, error: OSError | EOFError) -> StartError:
+    reason = getattr(error, "strerror", None) or "the fork server has ended"
+    return StartError(
+        f"{name}: its process cannot be started ({reason}); "
+        "see the limits on processes and open files (`ulimit -a`)"
+    )
+
+
+def _check_room() -> None:
+    """Check that a process can be started whole; half a start leaves one that waits. Raises OSError."""
+    with contextlib.ExitStack() as stack:
+        for _ in range(_DESCRIPTORS):
+            stack.callback(os.close, os.open(os.devnull, os.O_RDONLY))
+
+
+def be_tied(target: Callable[..., Any], *arguments: Any) -> None:
+    """Run a target in a process of the fork server's that ends with the command."""
+    die_with_parent()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    command = multiprocessing.parent_process()
+    if command is not None and not wait([command.sentinel], 0.0):
+        target(*arguments)
 
 
 def await_fork_server() -> None:

@@ -18,12 +18,15 @@ from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from itertools import islice
 from multiprocessing.connection import Connection, wait
+from multiprocessing.util import get_temp_dir
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import urlsplit
 
 from kantor_fleet.execution.experiment import Case, Outcome, code, reason, run_case
-from kantor_fleet.execution.fork_server import await_fork_server, fork_server
+from kantor_fleet.execution.fork_server import await_fork_server, pipe, start_process
+from kantor_fleet.execution.leftovers import Leftovers
 from kantor_fleet.exits import Exit, fail
 
 if TYPE_CHECKING:
@@ -105,18 +108,19 @@ def local(cases: Iterable[Case], jobs: int, work: Work = run_case) -> Pool:
     A worker that dies, such as one killed for its use of memory, affects only its own case. That case is tried
     once more at the end, with no other beside it; if that worker dies too, the case has failed.
     """
-    await_fork_server()
-    yield None  # a caller that was interrupted meanwhile leaves here
-    suspects: list[Case] = []
-    with closing(_in_processes(cases, jobs, work)) as running:
-        for done in running:
-            if done is not None and done.died:
-                suspects.append(done.case)
-            else:
+    with Leftovers(Path(get_temp_dir())):
+        await_fork_server()
+        yield None  # a caller that was interrupted meanwhile leaves here
+        suspects: list[Case] = []
+        with closing(_in_processes(cases, jobs, work)) as running:
+            for done in running:
+                if done is not None and done.died:
+                    suspects.append(done.case)
+                else:
+                    yield done and (done.case, done.outcome)
+        with closing(_in_processes(suspects, 1, work)) as running:
+            for done in running:
                 yield done and (done.case, done.outcome)
-    with closing(_in_processes(suspects, 1, work)) as running:
-        for done in running:
-            yield done and (done.case, done.outcome)
 
 
 def cluster(
@@ -158,11 +162,9 @@ class _WorkerProcess:
     """A process that runs one case after another."""
 
     def __init__(self, work: Work) -> None:
-        context = fork_server()
-        self.pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, work), daemon=True)
-        self._process.start()
-        theirs.close()  # so that the pipe ends when the process does
+        self.pipe, theirs = pipe("worker")
+        with theirs:  # so that the pipe ends when the process does
+            self._process = start_process("worker", _serve, theirs, work)
 
     def finish(self, case: Case) -> _Completed:
         """The outcome of the case that it was given; call it when the pipe is ready."""
@@ -194,8 +196,8 @@ def _in_processes(cases: Iterable[Case], jobs: int, work: Work) -> Generator[_Co
             if not busy:
                 return
             ready = wait([worker.pipe for worker, _ in busy.values()], _POLL_S)
-            for pipe in ready:
-                worker, case = busy.pop(pipe)
+            for its_pipe in ready:
+                worker, case = busy.pop(its_pipe)
                 done = worker.finish(case)
                 if done.died:
                     worker.kill()

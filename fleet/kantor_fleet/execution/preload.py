@@ -9,6 +9,7 @@ from multiprocessing.process import BaseProcess
 
 import kantor_worldsim.exchange.main  # noqa: F401
 from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.execution.parent_death import die_with_parent
 from kantor_protocol.compilation import kernel_store
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import MAP_PLANNERS
@@ -66,9 +67,14 @@ def _compile_beside() -> BaseProcess:
         file=sys.stderr,
         flush=True,
     )
-    process = multiprocessing.get_context("fork").Process(target=_play_on_maps, daemon=True)
+    process = multiprocessing.get_context("fork").Process(target=_be_beside, daemon=True)
     process.start()
     return process
+
+
+def _be_beside() -> None:
+    die_with_parent()
+    _play_on_maps()
 
 
 def _play_on_maps() -> None:

@@ -1,37 +1,36 @@
 """A fleet on this machine: world-sim and every participant as a process of its own.
 
-All children come from one fork server that has imported and compiled everything and opened nothing. This
-process also carries out world-sim's commands for a scenario's faults of processes: it kills, stops and starts
+All children come from one fork server that has imported and compiled everything and opened nothing, and none of them
+outlives this process. Their passwords are in memory only. This process also carries out world-sim's commands for a scenario's faults of processes: it kills, stops and starts
 participants and world-sim itself, and restarts world-sim from its journal after any kill.
 """
 
 import contextlib
-import multiprocessing
 import os
 import resource
 import shutil
 import signal
 import sys
-import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import NamedTuple
 
+from kantor_fleet.execution.fork_server import StartError, pipe, start_process
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.processes.log import log_to
-from kantor_protocol.base.machine import SUPERVISOR, ParticipantId
+from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM, ParticipantId
 from kantor_protocol.node import wal
 from kantor_protocol.node.runner import RejectedError, StateError
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.transport import credentials
 from kantor_protocol.transport.client import observer_session
-from kantor_protocol.transport.credentials import Identity
+from kantor_protocol.transport.credentials import Identity, Password
 from kantor_protocol.transport.endpoint import free_endpoint
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import BusError
@@ -40,7 +39,7 @@ from kantor_protocol.wire import keys
 from kantor_protocol.wire.messages import Progress, RefusedError, decode_progress
 from kantor_worldsim.exchange.config import MissionConfig, late_participants
 from kantor_worldsim.exchange.process_control import CommandKind, ProcessCommand, ProcessController
-from kantor_worldsim.record.run_folder import RESULT
+from kantor_worldsim.record.run_folder import RESULT, FolderLock
 
 FLEET = "kantor"
 _START_S = 60.0
@@ -76,16 +75,20 @@ class FleetConfig(NamedTuple):
 class Fleet:
     """The processes of a local fleet."""
 
-    def __init__(self, config: FleetConfig, connect: str, secrets: Path) -> None:
-        """Use `local_fleet` to start one."""
+    def __init__(
+        self,
+        config: FleetConfig,
+        connect: str,
+        identities: Mapping[str, Password],
+        lock: FolderLock | None = None,
+    ) -> None:
+        """Use `local_fleet` to start one. lock: of the run folder."""
         self.connect = connect
-        self.observer = credentials.find(secrets, credentials.OBSERVER)
+        self.observer: Identity = identities[credentials.OBSERVER]
         self._config = config
-        self._secrets = secrets
-        self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["kantor_fleet.execution.preloaded"])
+        self._identities = dict(identities)
+        self._folder_lock = lock
         self._logs, self._state = config.folder / "logs", config.folder / STATE
-        self._logs.mkdir()
         self._lock = threading.RLock()
         """Guards every start and every check of an exit code, which can be read only once."""
         self._stopping = threading.Event()
@@ -97,47 +100,51 @@ class Fleet:
         """Participants that were killed or stopped by command: their end is no failure."""
         self._frozen: set[ParticipantId] = set()
         self._impostors: dict[ParticipantId, tuple[ForkServerProcess, float]] = {}
-        self.world_sim = self._start_world_sim(resume=False)
-        absent = set(late_participants(config.scenario))
-        self.participants: dict[ParticipantId, ForkServerProcess] = {
-            name: self._start_participant(name, name)
-            for name in config.scenario.roster
-            if name not in absent
-        }
+        self.world_sim: ForkServerProcess
+        self.participants: dict[ParticipantId, ForkServerProcess] = {}
 
-    def _start(self, name: str, target: object, *arguments: object) -> ForkServerProcess:
-        process = self._context.Process(target=target, args=arguments, name=f"kantor-{name}")  # type: ignore[arg-type]
-        with self._lock:
-            process.start()
-        return process
+    @property
+    def world_sim_log(self) -> Path:
+        """What world-sim has to say."""
+        return self._logs / "worldsim.log"
+
+    def start(self) -> None:
+        """Start world-sim and all participants that are there from the start. Raises StartError."""
+        self._logs.mkdir()
+        self.world_sim = self._start_world_sim(resume=False)
+        absent = set(late_participants(self._config.scenario))
+        for name in self._config.scenario.roster:
+            if name not in absent:
+                self.participants[name] = self._start_participant(name, name)
 
     def _start_world_sim(self, *, resume: bool) -> ForkServerProcess:
-        ours, theirs = self._context.Pipe()
-        process = self._start(
-            "worldsim",
-            _be_world_sim,
-            self._config,
-            self.connect,
-            self._secrets,
-            self._logs / "worldsim.log",
-            theirs,
-            resume,
-            self._stopping.is_set(),
-        )
-        theirs.close()
+        ours, theirs = pipe(WORLD_SIM)
+        with self._lock, theirs:
+            process = start_process(
+                WORLD_SIM,
+                _be_world_sim,
+                self._config,
+                self.connect,
+                self._identities,
+                self.world_sim_log,
+                theirs,
+                resume,
+                self._stopping.is_set(),
+                self._folder_lock,
+            )
         threading.Thread(target=self._serve, args=(ours, process), daemon=True).start()
         return process
 
     def _start_participant(self, name: ParticipantId, log: str) -> ForkServerProcess:
-        return self._start(
-            log,
-            _be_participant,
-            self.connect,
-            self._secrets,
-            name,
-            self._logs / f"{log}.log",
-            self._state,
-        )
+        with self._lock:
+            return start_process(
+                log,
+                _be_participant,
+                self.connect,
+                self._identities[name],
+                self._logs / f"{log}.log",
+                self._state,
+            )
 
     def newly_failed(self) -> list[tuple[ParticipantId, int]]:
         """Participants that have failed without a command since the last call, with their exit codes."""
@@ -188,13 +195,27 @@ class Fleet:
                 os.kill(self.world_sim.pid or 0, signal.SIGCONT)
                 os.kill(self.world_sim.pid or 0, signal.SIGINT)
 
+    def _processes(self) -> list[ForkServerProcess]:
+        """All that have been started and not replaced."""
+        impostors = (process for process, _ in self._impostors.values())
+        started = [*self.participants.values(), *impostors]
+        return [self.world_sim, *started] if hasattr(self, "world_sim") else started
+
+    def kill(self) -> None:
+        """End all processes at once, and give their descriptors back."""
+        self._stopping.set()
+        with self._lock:
+            for process in self._processes():
+                process.kill()
+                process.join()
+                process.close()
+
     def end(self) -> None:
         """Wait for all processes to end, then terminate, then kill those that are left."""
         with self._lock:
             for name in self._frozen:
                 self.participants[name].kill()
-            processes = [self.world_sim, *self.participants.values()]
-            processes += [process for process, _ in self._impostors.values()]
+            processes = self._processes()
             for act in (None, "terminate", "kill"):
                 for process in processes:
                     if act is not None and process.exitcode is None:
@@ -209,7 +230,7 @@ class Fleet:
 
     def _serve(self, pipe: Connection, process: ForkServerProcess) -> None:
         """Carry out the commands of a world-sim process, as long as it lives."""
-        with contextlib.suppress(EOFError, OSError), pipe:
+        with contextlib.suppress(EOFError, OSError, StartError), pipe:
             while True:
                 command: ProcessCommand = pipe.recv()
                 if command.kind is CommandKind.RESTART_WORLD_SIM:
@@ -228,8 +249,8 @@ class Fleet:
             process.join()
         self._stopping.wait(after_s)
         with self._lock:
-            self.world_sim = self._start_world_sim(resume=True)
             self._down = False
+            self.world_sim = self._start_world_sim(resume=True)
 
     def _rest(self, process: ForkServerProcess, after_s: float) -> None:
         os.kill(process.pid or 0, signal.SIGSTOP)
@@ -307,18 +328,20 @@ class Fleet:
 
 
 @contextmanager
-def local_fleet(config: FleetConfig) -> Iterator[Fleet]:
-    """Start a fleet; on leaving, no process of it is left."""
-    with tempfile.TemporaryDirectory(prefix="kantor-") as folder:
-        secrets = Path(folder)
-        credentials.issue(secrets, FLEET, config.scenario.roster)
-        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        fleet = Fleet(config, free_endpoint(), secrets)
-        try:
-            yield fleet
-        finally:
-            fleet.stop()
-            fleet.end()
+def local_fleet(config: FleetConfig, lock: FolderLock | None = None) -> Iterator[Fleet]:
+    """Start a fleet; on leaving, no process of it is left. lock: of the run folder. Raises StartError."""
+    identities = credentials.draw(FLEET, config.scenario.roster)
+    fleet = Fleet(config, free_endpoint(), identities, lock)
+    try:
+        fleet.start()
+    except BaseException:
+        fleet.kill()
+        raise
+    try:
+        yield fleet
+    finally:
+        fleet.stop()
+        fleet.end()
 
 
 def watch_progress(fleet: Fleet) -> Iterator[Progress | None]:
@@ -339,11 +362,12 @@ def watch_progress(fleet: Fleet) -> Iterator[Progress | None]:
 def _be_world_sim(
     config: FleetConfig,
     listen: str,
-    secrets: Path,
+    identities: Mapping[str, Password],
     log: Path,
     pipe: Connection,
     resume: bool,  # noqa: FBT001  a target of a process
     stopping: bool,  # noqa: FBT001
+    _lock: FolderLock | None = None,  # held as long as this process lives
 ) -> None:
     from kantor_worldsim.engine.simulation import ForeignRecordError  # noqa: PLC0415  the fork server has it
     from kantor_worldsim.exchange.main import run  # noqa: PLC0415
@@ -365,14 +389,12 @@ def _be_world_sim(
             past = None
     setup = WorldSetup.of(scenario, seed) if past is None else past.opening.setup
     mission = MissionConfig(scenario, seed, setup, config.exchange, config.speed)
-    identity = credentials.find(secrets, credentials.HOST)
-    users = credentials.users_file(secrets)
     # The terminal and the parent may both send the signal: one Ctrl-C must not count as two.
     with Interrupts(patient=True) as interrupts:
         if stopping:
             interrupts.code = Exit.INTERRUPTED
         try:
-            with _host(identity, listen, users, scenario) as host:
+            with _host(identities, listen, scenario) as host:
                 recording = Recording(
                     scenario,
                     seed,
@@ -401,16 +423,18 @@ def _be_world_sim(
     say(f"{result.ended}, digest {result.digest}")
 
 
-def _host(identity: Identity, listen: str, users: Path, scenario: Scenario) -> HubRouter:
+def _host(identities: Mapping[str, Password], listen: str, scenario: Scenario) -> HubRouter:
     """The router, once its endpoint is free. Raises BusError."""
+    identity = identities[credentials.HOST]
     give_up = time.monotonic() + _LISTEN_S
-    while True:
-        try:
-            return HubRouter(identity, listen, users, scenario.roster)
-        except BusError:
-            if time.monotonic() >= give_up:
-                raise
-            time.sleep(0.02)
+    with credentials.users_in_memory(identities) as users:
+        while True:
+            try:
+                return HubRouter(identity, listen, users, scenario.roster)
+            except BusError:
+                if time.monotonic() >= give_up:
+                    raise
+                time.sleep(0.02)
 
 
 def _controller(pipe: Connection) -> ProcessController:
@@ -424,20 +448,18 @@ def _controller(pipe: Connection) -> ProcessController:
     return carry_out
 
 
-def _be_participant(
-    connect: str, secrets: Path, name: ParticipantId, log: Path, state: Path
-) -> None:
+def _be_participant(connect: str, identity: Identity, log: Path, state: Path) -> None:
     from kantor_agent.process import run as run_agent  # noqa: PLC0415  the fork server has it
     from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
 
     # The terminal's Ctrl-C reaches every process; a participant ends when world-sim stops the mission.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
-    say = log_to(log, name)
+    say = log_to(log, identity.user)
     init_log()
-    run = run_supervisor if name == SUPERVISOR else run_agent
+    run = run_supervisor if identity.user == SUPERVISOR else run_agent
     try:
-        say(run(connect, credentials.find(secrets, name), _START_S, say, state))
+        say(run(connect, identity, _START_S, say, state))
     except BusError as error:
         say(str(error))
         sys.exit(Exit.UNREACHABLE)

@@ -1,14 +1,20 @@
 """`kantor run`: a mission from its start to its picture."""
 
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from multiprocessing.util import get_temp_dir
 from pathlib import Path
+from typing import NamedTuple
 
 from kantor_fleet.execution.fork_server import await_fork_server
 from kantor_fleet.execution.in_process_team import play
+from kantor_fleet.execution.leftovers import Leftovers
 from kantor_fleet.execution.preload import warm_up
 from kantor_fleet.exits import Exit, warn
 from kantor_fleet.interrupts import Interrupts
-from kantor_fleet.processes.local import FleetConfig, local_fleet, watch_progress
+from kantor_fleet.processes.local import Fleet, FleetConfig, local_fleet, watch_progress
 from kantor_fleet.report.progress import ProgressView
 from kantor_fleet.report.summary import conclude, exit_code_of, read_result
 from kantor_protocol.scenario.schema import Scenario
@@ -16,7 +22,7 @@ from kantor_protocol.transport.session import BusError
 from kantor_worldsim.observers.progress import progress
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.record.records import Record
-from kantor_worldsim.record.run_folder import folder_for
+from kantor_worldsim.record.run_folder import FolderLock, folder_for, is_empty, remove_if_empty
 from kantor_worldsim.world.world import WorldSetup
 
 _SHOW_S = 0.2
@@ -31,66 +37,111 @@ def run(
     """
     setup = WorldSetup.of(scenario, seed)
     warn(setup.warnings)
-    folder = folder_for(scenario, seed, out)
+    terms = _Terms(scenario, seed, exchange, speed, out, exact_every)
     with Interrupts() as interrupts:
         if exchange == "in-process":
-            recording = Recording(scenario, seed, exchange, folder, exact_every)
-            code = _run_in_process(scenario, seed, setup, recording, interrupts)
-        else:
-            config = FleetConfig(scenario, seed, exchange, speed, folder, exact_every)
-            code = _run_processes(config, interrupts)
-        conclude(folder)
-        return interrupts.code or code
+            return _run_in_process(terms, setup, interrupts)
+        return _run_processes(terms, interrupts)
 
 
-def _run_in_process(
-    scenario: Scenario, seed: int, setup: WorldSetup, recording: Recording, interrupts: Interrupts
-) -> Exit:
-    with ProgressView(scenario.name) as view:
-        warm_up()
-        shown_s = time.monotonic()
+class _Terms(NamedTuple):
+    """A mission, and where its folder is made."""
 
-        def show(_record: Record) -> None:
-            nonlocal shown_s
-            if time.monotonic() - shown_s >= _SHOW_S:
-                shown_s = time.monotonic()
-                view.show(progress(recording.metrics, scenario, "running", ""))
-
-        reason = play(scenario, seed, setup, [recording.observe, show], stopped=interrupts)
-        view.show(progress(recording.metrics, scenario, "over", reason))
-    return exit_code_of(recording.finish())
+    scenario: Scenario
+    seed: int
+    exchange: str
+    speed: float
+    out: Path
+    exact_every: int | None
 
 
-def _run_processes(config: FleetConfig, interrupts: Interrupts) -> Exit:
-    with ProgressView(config.scenario.name) as view:
-        view.note("starting the fleet (the first time, kernels are compiled: about half a minute)")
-        await_fork_server()
+@contextmanager
+def _run_folder(terms: _Terms, interrupts: Interrupts) -> Iterator[tuple[Path, FolderLock]]:
+    """A new run folder, which is removed if nothing has happened in its run when a signal or an error ends it."""
+    folder = folder_for(terms.scenario, terms.seed, terms.out)
+    with FolderLock(folder) as lock:
+        try:
+            yield folder, lock
+        except BaseException:
+            remove_if_empty(folder)
+            raise
         if interrupts():
-            return Exit.INTERRUPTED
-        with local_fleet(config) as fleet:
-            stopping = False
-            try:
-                for message in watch_progress(fleet):
-                    if message is not None:
-                        view.show(message)
-                    for name, failure in fleet.newly_failed():
-                        view.note(f"{name} ended with {_cause(failure)}; the others go on")
-                    if (ended := fleet.restart_killed()) is not None:
-                        view.note(f"world-sim ended with {ended}; it goes on from its record")
-                    waiting = message is not None and message.phase == "waiting"
-                    if not stopping and (interrupts() or (waiting and fleet.deserted)):
-                        stopping = True
-                        view.note("ending the mission")
-                        fleet.stop()
-            except BusError:
-                view.note(f"world-sim is not there; see {config.folder / 'logs' / 'worldsim.log'}")
+            remove_if_empty(folder)
+
+
+def _run_in_process(terms: _Terms, setup: WorldSetup, interrupts: Interrupts) -> Exit:
+    scenario, seed = terms.scenario, terms.seed
+    with interrupts.at_once():
+        warm_up()
+    with _run_folder(terms, interrupts) as (folder, _):
+        with ProgressView(scenario.name) as view:
+            recording = Recording(scenario, seed, terms.exchange, folder, terms.exact_every)
+            shown_s = time.monotonic()
+
+            def show(_record: Record) -> None:
+                nonlocal shown_s
+                if time.monotonic() - shown_s >= _SHOW_S:
+                    shown_s = time.monotonic()
+                    view.show(progress(recording.metrics, scenario, "running", ""))
+
+            reason = play(scenario, seed, setup, [recording.observe, show], stopped=interrupts)
+            view.show(progress(recording.metrics, scenario, "over", reason))
+        code = exit_code_of(recording.finish())
+        conclude(folder)
+    return interrupts.code or code
+
+
+def _run_processes(terms: _Terms, interrupts: Interrupts) -> Exit:
+    with ExitStack() as stack:
+        leftovers = stack.enter_context(Leftovers(Path(get_temp_dir())))
+        view = stack.enter_context(ProgressView(terms.scenario.name))
+        view.note("starting the fleet (the first time, kernels are compiled: about half a minute)")
+        with interrupts.at_once():
+            await_fork_server()
+        folder, lock = stack.enter_context(_run_folder(terms, interrupts))
+        leftovers.add_run(folder)
+        scenario, seed, exchange, speed, _, exact_every = terms
+        config = FleetConfig(scenario, seed, exchange, speed, folder, exact_every)
+        with local_fleet(config, lock) as fleet:
+            _watch(fleet, view, interrupts)
             fleet.end()
-            code = fleet.world_sim.exitcode
-            failed = fleet.any_failed
-    result = read_result(config.folder)
+            code = _code_of(fleet, folder)
+        view.close()
+        if not is_empty(folder):
+            conclude(folder)
+    return interrupts.code or code
+
+
+def _watch(fleet: Fleet, view: ProgressView, interrupts: Interrupts) -> None:
+    """Show how the mission goes and see to it that it ends."""
+    stopping = False
+    try:
+        for message in watch_progress(fleet):
+            if message is not None:
+                view.show(message)
+            for name, failure in fleet.newly_failed():
+                view.note(f"{name} ended with {_cause(failure)}; the others go on")
+            if (ended := fleet.restart_killed()) is not None:
+                view.note(f"world-sim ended with {ended}; it goes on from its record")
+            waiting = message is not None and message.phase == "waiting"
+            if not stopping and (interrupts() or (waiting and fleet.deserted)):
+                stopping = True
+                view.note("ending the mission")
+                fleet.stop()
+    except BusError:
+        view.note(f"world-sim is not there; see {fleet.world_sim_log}")
+
+
+def _code_of(fleet: Fleet, folder: Path) -> Exit:
+    """The exit code of a fleet that has ended."""
+    code, result = fleet.world_sim.exitcode, read_result(folder)
+    if code == Exit.UNREACHABLE:
+        return Exit.UNREACHABLE
     if code or result is None:
-        return Exit(code) if code in set(Exit) else Exit.PROCESS_FAILED
-    return Exit.PROCESS_FAILED if failed else exit_code_of(result)
+        cause = _cause(code or 0)
+        print(f"kantor: world-sim ended with {cause}; see {fleet.world_sim_log}", file=sys.stderr)
+        return Exit.PROCESS_FAILED
+    return Exit.PROCESS_FAILED if fleet.any_failed else exit_code_of(result)
 
 
 def _cause(code: int) -> str:

@@ -1,6 +1,7 @@
 """Processes started one by one, each in its own terminal or on its own machine."""
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,7 +51,7 @@ def host_standalone(
     """
     from kantor_worldsim.exchange.config import MissionConfig  # noqa: PLC0415  standalone robots do not need these
     from kantor_worldsim.observers.recording import Recording  # noqa: PLC0415
-    from kantor_worldsim.record.run_folder import folder_for  # noqa: PLC0415
+    from kantor_worldsim.record.run_folder import FolderLock, folder_for  # noqa: PLC0415
     from kantor_worldsim.world.world import WorldSetup  # noqa: PLC0415
 
     _check_faults(scenario, exchange)
@@ -58,24 +59,27 @@ def host_standalone(
     warn(setup.warnings)
     plan = MissionConfig(scenario, seed, setup, exchange, speed, start_after_s)
 
-    def record() -> tuple[Path, "Recording"]:
-        folder = folder_for(scenario, seed, out)
-        if state is not None:
-            resume_pointer.note(state, folder)
-        return folder, Recording(scenario, seed, exchange, folder, exact_every, speed=speed)
+    with ExitStack() as stack:
 
-    return _host(plan, listen, secrets, fleet, record)
+        def record() -> tuple[Path, "Recording"]:
+            folder = folder_for(scenario, seed, out)
+            stack.enter_context(FolderLock(folder))
+            if state is not None:
+                resume_pointer.note(state, folder)
+            return folder, Recording(scenario, seed, exchange, folder, exact_every, speed=speed)
+
+        return _host(plan, listen, secrets, fleet, record)
 
 
 def resume_standalone(folder: Path, listen: str, secrets: Path, fleet: str | None) -> Exit:
     """Run world-sim in this terminal, for a run that was cut short. Raises BusError, OSError."""
-    from kantor_worldsim.record.run_folder import Past, ResumeError  # noqa: PLC0415
+    from kantor_worldsim.record.run_folder import FolderLock, Past, ResumeError  # noqa: PLC0415
 
     try:
-        past = Past.of(folder)
+        with FolderLock(folder):
+            return _go_on(folder, Past.of(folder), listen, secrets, fleet)
     except ResumeError as error:
         fail(Exit.USAGE, str(error))
-    return _go_on(folder, past, listen, secrets, fleet)
 
 
 def _go_on(folder: Path, past: "Past", listen: str, secrets: Path, fleet: str | None) -> Exit:
@@ -115,12 +119,25 @@ def go_on_standalone(state: Path, listen: str, secrets: Path, fleet: str | None)
 
     A mission that was not met is not run again: a container engine would restart it for ever.
     """
-    from kantor_fleet.report.summary import conclude, exit_code_of, read_result  # noqa: PLC0415
-    from kantor_worldsim.record.run_folder import REPORT, OverError, Past, ResumeError  # noqa: PLC0415
+    from kantor_worldsim.record.run_folder import FolderLock, InUseError, ResumeError  # noqa: PLC0415
 
     folder = resume_pointer.run_in(state)
     if folder is None:
         return None
+    try:
+        with FolderLock(folder):
+            return _go_on_pointed(folder, listen, secrets, fleet)
+    except InUseError as error:
+        fail(Exit.USAGE, str(error))
+    except ResumeError:  # there is no folder, or no step was recorded in it
+        return None
+
+
+def _go_on_pointed(folder: Path, listen: str, secrets: Path, fleet: str | None) -> Exit | None:
+    """See `go_on_standalone`. Raises ResumeError."""
+    from kantor_fleet.report.summary import conclude, exit_code_of, read_result  # noqa: PLC0415
+    from kantor_worldsim.record.run_folder import REPORT, OverError, Past  # noqa: PLC0415
+
     try:
         past = Past.of(folder)
     except OverError as over:
@@ -132,8 +149,6 @@ def go_on_standalone(state: Path, listen: str, secrets: Path, fleet: str | None)
         if code is not Exit.DONE:
             warn([f"{over}, and was not met; a new container begins another run"])
         return code or None
-    except ResumeError:  # no step was recorded
-        return None
     return _go_on(folder, past, listen, secrets, fleet)
 
 
@@ -168,7 +183,8 @@ def _host(
         Interrupts() as interrupts,
         ProgressView(scenario.name) as view,
     ):
-        warm_up()
+        with interrupts.at_once():
+            warm_up()
         users = credentials.users_file(secrets)
         with HubRouter(identity, listen, users, scenario.roster, view.note) as host:
             folder, recording = record()

@@ -60,6 +60,10 @@ class ProgressView:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Show what is pending, and leave the terminal to others."""
         self._show_pending()
         if self._live is not None:
             self._live.stop()

@@ -12,7 +12,6 @@ from kantor_worldsim.observers.metrics.result import MapResult, Result
 from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.run_folder import JOURNAL, METRICS, REPORT, RESULT
 
-
 _RESULT_BYTES_MAX = 1 << 24
 
 

@@ -9,7 +9,8 @@ with the list of the members that it admits.
 import os
 import re
 import secrets
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any, TypeVar
@@ -180,17 +181,35 @@ def issue(folder: Path, fleet: str, users: Iterable[ParticipantId]) -> dict[str,
     Raises CredentialsError if the folder holds something else: nothing is overwritten.
     """
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    names = (HOST, OBSERVER, *users)
-    kept = {user: _kept(folder / f"{user}.toml", fleet, user) for user in names}
-    identities = {}
-    for user, password in kept.items():
-        identity = password or Password(fleet, user, secrets.token_urlsafe(24))
-        if password is None:
-            write(folder / f"{user}.toml", to_toml(msgspec.to_builtins(identity)))
-        identities[user] = identity
-    lines = (f"{identity.user}:{identity.password}\n" for identity in identities.values())
-    write(folder / _USERS, "".join(lines))
+    identities = draw(fleet, users)
+    for user in identities:
+        kept = _kept(folder / f"{user}.toml", fleet, user)
+        if kept is None:
+            write(folder / f"{user}.toml", to_toml(msgspec.to_builtins(identities[user])))
+        else:
+            identities[user] = kept
+    write(folder / _USERS, _dictionary(identities))
     return identities
+
+
+def draw(fleet: str, users: Iterable[ParticipantId]) -> dict[str, Password]:
+    """New passwords for the given users, for world-sim and for observers; they are in memory only."""
+    names = (HOST, OBSERVER, *users)
+    return {user: Password(fleet, user, secrets.token_urlsafe(24)) for user in names}
+
+
+def _dictionary(identities: Mapping[str, Password]) -> str:
+    """Passwords as the router reads them."""
+    return "".join(f"{each.user}:{each.password}\n" for each in identities.values())
+
+
+@contextmanager
+def users_in_memory(identities: Mapping[str, Password]) -> Iterator[Path]:
+    """The file of passwords that the router reads, on no disk and for this process only."""
+    with os.fdopen(os.memfd_create(_USERS), "w", encoding="utf-8") as file:
+        file.write(_dictionary(identities))
+        file.flush()
+        yield Path(f"/proc/self/fd/{file.fileno()}")
 
 
 def _kept(path: Path, fleet: str, user: ParticipantId) -> Password | None:
