@@ -4,6 +4,7 @@ import json
 import os
 import resource
 import signal
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,11 +30,11 @@ FLEET = ("run", "fleet", "--set", "limit_s=100000", "energy.points=50000", "ener
 @pytest.fixture
 def temporary(kantor: "Kantor") -> Iterator[Path]:
     """A temporary folder of the commands' own, by which everything of theirs is found."""
-    folder = kantor.folder / "temporary"
-    folder.mkdir()
-    yield folder
-    for process in started_with(folder):
-        process.kill()
+    with tempfile.TemporaryDirectory() as folder:  # the path of a socket must be short
+        yield Path(folder)
+        kantor.stop_all()
+        for process in started_with(Path(folder)):
+            process.kill()
 
 
 def started_with(temporary: Path) -> list[psutil.Process]:

@@ -56,7 +56,7 @@ def pipe(name: str) -> tuple[Connection, Connection]:
 
 
 def _start_error(name: str, error: OSError | EOFError) -> StartError:
-    reason = getattr(error, "strerror", None) or "the fork server has ended"
+    reason = getattr(error, "strerror", None) or str(error) or "the fork server has ended"
     return StartError(
         f"{name}: its process cannot be started ({reason}); "
         "see the limits on processes and open files (`ulimit -a`)"
