@@ -3,7 +3,9 @@
 import contextlib
 import io
 import sys
+import traceback
 from collections.abc import Callable
+from pathlib import Path
 
 import tyro
 
@@ -21,8 +23,9 @@ from kantor_fleet.cli.sweep import sweep
 from kantor_fleet.cli.tap import tap
 from kantor_fleet.cli.verify import verify
 from kantor_fleet.cli.worldsim import worldsim
-from kantor_fleet.exits import Exit, fail
+from kantor_fleet.exits import Exit, fail, warn
 from kantor_fleet.interrupts import Interrupted
+from kantor_fleet.output import Output
 
 VERBS: dict[str, Callable[..., int]] = {
     "run": run,
@@ -42,8 +45,34 @@ VERBS: dict[str, Callable[..., int]] = {
 }
 
 
+_TEXT_MAX = 200
+"""Characters of an exception that no one expected."""
+MISSIONS = frozenset(
+    {"run", "worldsim", "agent", "supervisor", "site", "sweep", "campaign", "reproduce"}
+)
+"""Verbs whose outcome is elsewhere than in what they print."""
+
+
 def main() -> None:
     """Entry point: one verb, one exit code, and one line instead of a traceback for a user's mistake."""
+    output = Output()
+    arguments = _spread_repeated(sys.argv[1:])
+    try:
+        code = _code(arguments)
+        printed = arguments[:1] == [] or arguments[0] not in MISSIONS
+    except SystemExit as ended:  # with its one line, or after help
+        if ended.code:
+            raise
+        code, printed = Exit.DONE, True
+    sys.stdout.flush()
+    if output.error is not None and not output.unread:
+        warn([f"standard output: {output.error}; what was printed is lost"])
+        code = code or (Exit.USAGE if printed else Exit.DONE)
+    sys.exit(code)
+
+
+def _code(arguments: list[str]) -> int:
+    """Run a command line; the exit code. Raises SystemExit."""
     from kantor_fleet.execution.fork_server import StartError  # noqa: PLC0415
     from kantor_protocol.scenario.errors import ScenarioError  # noqa: PLC0415
     from kantor_protocol.transport.credentials import CredentialsError  # noqa: PLC0415
@@ -53,23 +82,29 @@ def main() -> None:
         with contextlib.suppress(OSError):  # another stream may have taken its place
             sys.stdout.reconfigure(errors="surrogateescape")  # names of files may be any bytes
     try:
-        code = _run(_spread_repeated(sys.argv[1:]))
+        return _run(arguments)
     except (ScenarioError, CredentialsError) as error:
         fail(Exit.USAGE, str(error))
     except BusError as error:
         fail(Exit.UNREACHABLE, str(error))
     except StartError as error:
         fail(Exit.PROCESS_FAILED, str(error))
-    except BrokenPipeError:
-        sys.stderr.close()
-        code = Exit.DONE
     except OSError as error:
         fail(Exit.USAGE, f"{error.filename or 'file'}: {error.strerror or error}")
     except Interrupted as interrupted:
-        code = interrupted.code
+        return interrupted.code
     except KeyboardInterrupt:
-        code = Exit.INTERRUPTED
-    sys.exit(code)
+        return Exit.INTERRUPTED
+    except Exception as error:  # noqa: BLE001  whatever it is, it is one line
+        fail(Exit.PROCESS_FAILED, _crash(error))
+
+
+def _crash(error: Exception) -> str:
+    """An exception that no one expected, with its place."""
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    text = " ".join(str(error).split())[:_TEXT_MAX]
+    place = f"{Path(frame.filename).name}:{frame.lineno}"
+    return f"crashed at {place}: {type(error).__name__}: {text}; please report this"
 
 
 def _run(arguments: list[str]) -> int:
@@ -89,17 +124,20 @@ def _run(arguments: list[str]) -> int:
 
 
 _REPEATED = ("--set", "--vary")
+_REPEATED_WORDS = ("--only",)
+"""Likewise; `kantor tap` alone has it, and takes no other words."""
 
 
 def _spread_repeated(arguments: list[str]) -> list[str]:
-    """`--set a=1 b=2` as `--set a=1 --set b=2`, and `--vary` likewise."""
+    """`--set a=1 b=2` as `--set a=1 --set b=2`, and `--vary` and `--only` likewise."""
     spread: list[str] = []
     flag = None
     for argument in arguments:
-        if flag and "=" in argument and not argument.startswith("-") and spread[-1] != flag:
+        goes_on = "=" in argument or flag in _REPEATED_WORDS
+        if flag and goes_on and not argument.startswith("-") and spread[-1] != flag:
             spread.append(flag)
         elif argument.startswith("-") or spread[-1:] != [flag]:
-            flag = argument if argument in _REPEATED else None
+            flag = argument if argument in _REPEATED + _REPEATED_WORDS else None
         spread.append(argument)
     return spread
 

@@ -1,5 +1,6 @@
 """Exit codes, the same for every verb."""
 
+import contextlib
 import enum
 import sys
 from collections.abc import Iterable
@@ -25,11 +26,17 @@ class Exit(enum.IntEnum):
 
 def fail(code: Exit, message: str) -> NoReturn:
     """Print one line to standard error and exit."""
-    print(f"kantor: {message}", file=sys.stderr)
+    _tell(message)
     sys.exit(code)
 
 
 def warn(messages: Iterable[str]) -> None:
     """Print a line for each warning to standard error."""
     for message in messages:
-        print(f"kantor: warning: {message}", file=sys.stderr)
+        _tell(f"warning: {message}")
+
+
+def _tell(message: str) -> None:
+    """Print a line to standard error, as far as that can be written."""
+    with contextlib.suppress(OSError):
+        print(f"kantor: {message}", file=sys.stderr, flush=True)

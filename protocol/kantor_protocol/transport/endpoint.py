@@ -83,8 +83,11 @@ def parse_endpoint(endpoint: str) -> tuple[str, str, int]:
     protocol, _, place = endpoint.partition("/")
     host, _, port = place.rpartition(":")
     sound = protocol in {"tcp", "tls"} and host and port.isdecimal() and port.isascii()
-    if not sound or int(port) > 65535:
-        raise BusError(f"{endpoint}: not an endpoint; write it as tcp/HOST:PORT or tls/HOST:PORT")
+    if not sound or not 0 < int(port[:6]) <= 65535:
+        raise BusError(
+            f"{endpoint}: not an endpoint; write it as tcp/HOST:PORT or tls/HOST:PORT, "
+            "with a port from 1 to 65535"
+        )
     return protocol, host.strip("[]"), int(port)
 
 
