@@ -109,7 +109,7 @@ def test_a_signal_ends_a_run_at_any_moment(
     assert_nothing_left(temporary)
     for folder in kantor.runs():
         assert result_of(folder)["ended"] == "interrupted"
-        assert kantor("verify", folder).code == 0
+        assert kantor("verify", folder).code == 0, moment
     if moment == "a mission":
         assert len(kantor.runs()) == 1
 

@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Callable
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from typing import Any
@@ -28,6 +29,11 @@ def fork_server() -> ForkServerContext:
     """The context of processes that start warm and use one core each."""
     for library in ("OMP", "OPENBLAS", "MKL"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+    try:  # the tracker ignores the other signals of a terminal by itself
+        resource_tracker.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(_PRELOADED)
     return context
@@ -73,7 +79,8 @@ def _check_room() -> None:
 def be_tied(target: Callable[..., Any], *arguments: Any) -> None:
     """Run a target in a process of the fork server's that ends with the command."""
     die_with_parent()
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    # What a terminal or a service manager sends to all is for the command, and for those that ask for it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     command = multiprocessing.parent_process()
     if command is not None and not wait([command.sentinel], 0.0):
         target(*arguments)

@@ -213,8 +213,6 @@ def _in_processes(cases: Iterable[Case], jobs: int, work: Work) -> Generator[_Co
 
 def _serve(pipe: Connection, work: Work) -> None:
     """Run cases until the other end of the pipe is closed."""
-    # Ctrl-C in a terminal reaches all processes; the parent ends this one.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     while True:
         try:
             pipe.send(work(pipe.recv()))

@@ -211,18 +211,18 @@ class Fleet:
                 process.close()
 
     def end(self) -> None:
-        """Wait for all processes to end, then terminate, then kill those that are left."""
+        """Wait for all processes to end, then kill those that are left."""
         with self._lock:
             for name in self._frozen:
                 self.participants[name].kill()
             processes = self._processes()
-            for act in (None, "terminate", "kill"):
-                for process in processes:
-                    if act is not None and process.exitcode is None:
-                        getattr(process, act)()
-                give_up = time.monotonic() + _END_S
-                for process in processes:
-                    process.join(max(0.0, give_up - time.monotonic()))
+            give_up = time.monotonic() + _END_S
+            for process in processes:
+                process.join(max(0.0, give_up - time.monotonic()))
+            for process in processes:
+                if process.exitcode is None:
+                    process.kill()
+                    process.join()
         if (self._config.folder / RESULT).exists():
             shutil.rmtree(self._state, ignore_errors=True)
 
@@ -338,10 +338,14 @@ def local_fleet(config: FleetConfig, lock: FolderLock | None = None) -> Iterator
         fleet.kill()
         raise
     try:
-        yield fleet
-    finally:
-        fleet.stop()
-        fleet.end()
+        try:
+            yield fleet
+        finally:
+            fleet.stop()
+            fleet.end()
+    except KeyboardInterrupt:
+        fleet.kill()
+        raise
 
 
 def watch_progress(fleet: Fleet) -> Iterator[Progress | None]:
@@ -452,8 +456,6 @@ def _be_participant(connect: str, identity: Identity, log: Path, state: Path) ->
     from kantor_agent.process import run as run_agent  # noqa: PLC0415  the fork server has it
     from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
 
-    # The terminal's Ctrl-C reaches every process; a participant ends when world-sim stops the mission.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
     say = log_to(log, identity.user)
     init_log()

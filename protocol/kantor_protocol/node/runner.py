@@ -18,6 +18,7 @@ from functools import partial
 from pathlib import Path
 
 from kantor_protocol.base.machine import Body, Inputs, Outputs, StateMachine
+from kantor_protocol.files import private
 from kantor_protocol.node import memory_trim
 from kantor_protocol.node.recovery import RecoverableNode
 from kantor_protocol.node.wal import WalFile
@@ -78,7 +79,7 @@ def participate(
 
 def _check_writable(state: Path) -> None:
     try:
-        state.mkdir(parents=True, exist_ok=True)
+        private.make_folder(state)
         tempfile.TemporaryFile(dir=state).close()
     except OSError as error:
         reason = error.strerror or error

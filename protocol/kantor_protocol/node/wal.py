@@ -11,6 +11,7 @@ more.
 """
 
 import contextlib
+import errno
 import fcntl
 import os
 import struct
@@ -23,12 +24,15 @@ from typing import NamedTuple
 import msgspec
 
 from kantor_protocol.base.machine import Body
+from kantor_protocol.files import private
 from kantor_protocol.node.recovery import WalContents
-from kantor_protocol.wire.messages import MESSAGE_BYTES_MAX, RefusedError, decode_inputs
+from kantor_protocol.wire.messages import INPUTS_BYTES_MAX, RefusedError, decode_inputs
 
 _MAGIC = b"kantor diary 1\n"
 _HEAD = struct.Struct("<II")
 _SKEW = struct.Struct("<q")
+_ENTRY_BYTES_MAX = _SKEW.size + INPUTS_BYTES_MAX
+"""The longest content of a frame."""
 _LOCK_S = 0.5
 """Time to wait for the lock: a process that was killed a moment ago may still hold it."""
 
@@ -68,7 +72,7 @@ class WalFile:
         """The sound beginning of the log; None if there is none, or another process holds it. Raises OSError."""
         self.close()
         try:
-            self._file = os.open(self._path, os.O_RDWR)
+            self._file = os.open(self._path, os.O_RDWR | os.O_NOFOLLOW)
         except FileNotFoundError:
             return None
         if not _acquired(self._file):
@@ -85,8 +89,8 @@ class WalFile:
 
     def reset(self, initial_state: Body) -> None:
         """Discard all entries and begin a new log. Raises OSError, and then the old file is still there."""
-        draft = self._path.with_name(f".{self._path.name}.{os.getpid()}")
-        file = os.open(draft, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o644)
+        draft = private.draft_of(self._path)
+        file = private.open_draft(self._path)
         try:
             _acquired(file)
             content = msgspec.msgpack.encode(_Header(self._run, initial_state))
@@ -103,6 +107,8 @@ class WalFile:
 
     def append(self, inputs: bytes) -> None:
         """Add an entry that outlives the process. Raises OSError, and then the entry is not there."""
+        if len(inputs) > INPUTS_BYTES_MAX:
+            raise OSError(errno.EFBIG, f"inputs of {len(inputs)} bytes, and {INPUTS_BYTES_MAX} fit")
         frame, crc = _frame(_SKEW.pack(self.skew_ns) + inputs, self._crc)
         _write(self._file, frame, self._end)
         self._end += len(frame)
@@ -188,7 +194,7 @@ def _frames(content: bytes) -> Iterator[tuple[bytes, int, int]]:
     while place + _HEAD.size <= len(content):
         length, expected = _HEAD.unpack_from(content, place)
         end = place + _HEAD.size + length
-        if length > MESSAGE_BYTES_MAX or end > len(content):
+        if length > _ENTRY_BYTES_MAX or end > len(content):
             return
         frame = content[place + _HEAD.size : end]
         crc = zlib.crc32(frame, zlib.crc32(length.to_bytes(4, "little"), crc))

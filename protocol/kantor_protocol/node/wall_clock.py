@@ -5,7 +5,13 @@ from collections import deque
 
 from kantor_protocol.base.machine import Envelope, Inputs
 from kantor_protocol.scenario.clocks import step_clocks
-from kantor_protocol.wire.messages import INBOX_MAX, Mission, StartClock
+from kantor_protocol.wire.messages import (
+    INBOX_BYTES_MAX,
+    INBOX_MAX,
+    Mission,
+    StartClock,
+    envelope_bytes,
+)
 
 
 class WallClock:
@@ -58,8 +64,11 @@ class WallClock:
             self._ordinal += 1
 
     def enqueue(self, inputs: Inputs) -> None:
-        """Add envelopes and the observation that have arrived."""
+        """Add envelopes and the observation that have arrived. Of too many, the oldest are dropped."""
         self.inbox += inputs.inbox
+        excess = sum(map(envelope_bytes, self.inbox)) - INBOX_BYTES_MAX
+        while excess > 0:
+            excess -= envelope_bytes(self.inbox.popleft())
         if inputs.observation.step >= self._observation.step:
             self._observation = inputs.observation
 

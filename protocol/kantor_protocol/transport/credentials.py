@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
+from kantor_protocol.files import private
 from kantor_protocol.files.reading import UnreadableError, read_text
 from kantor_protocol.files.toml import TomlError, parse_toml
 
@@ -180,7 +181,7 @@ def issue(folder: Path, fleet: str, users: Iterable[ParticipantId]) -> dict[str,
 
     Raises CredentialsError if the folder holds something else: nothing is overwritten.
     """
-    folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+    private.make_folder(folder)
     identities = draw(fleet, users)
     for user in identities:
         kept = _kept(folder / f"{user}.toml", fleet, user)
@@ -323,11 +324,4 @@ def expiry(until: datetime, now: datetime) -> str:
 
 def write(path: Path, text: str) -> None:
     """Write a file that its owner alone can read, whole or not at all."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    with os.fdopen(
-        os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8"
-    ) as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    draft.replace(path)
+    private.replace(path, text.encode())

@@ -15,7 +15,15 @@ from msgspec import Meta, Raw
 
 from kantor_protocol.base.grid import Frame
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX
-from kantor_protocol.base.machine import Body, Inputs, Observation, Outputs, ParticipantId, Pose
+from kantor_protocol.base.machine import (
+    Body,
+    Envelope,
+    Inputs,
+    Observation,
+    Outputs,
+    ParticipantId,
+    Pose,
+)
 from kantor_protocol.scenario.schema import Scenario
 
 VERSION = 1
@@ -29,6 +37,10 @@ INBOX_MAX = 4096
 """Envelopes in one inbox, at most; so many wait for the next step of a participant that holds."""
 NONCE_MAX = 64
 """Characters of a nonce, at most."""
+INBOX_BYTES_MAX = 16 * 1024 * 1024
+"""Content of the envelopes in an inbox, at most."""
+INPUTS_BYTES_MAX = 2 * INBOX_BYTES_MAX
+"""The longest encoded Inputs: an inbox, and whatever else is in them."""
 
 
 class RefusedError(ValueError):
@@ -201,6 +213,7 @@ class Progress(_Message, frozen=True, array_like=True, tag=22):
     """On a map: the distance that all robots have driven."""
 
 
+_ENVELOPE_BYTES = 256
 _NIL = Raw(b"\xc0")
 
 
@@ -246,6 +259,11 @@ encode = _ENCODER.encode
 _decode_gossip = msgspec.msgpack.Decoder(GossipMessage).decode
 _decode_inputs = msgspec.msgpack.Decoder(Inputs).decode
 _NO_INCARNATION, _NO_REGISTERS = encode(0), encode(b"") + encode(0)
+
+
+def envelope_bytes(envelope: Envelope) -> int:
+    """What an envelope counts in an inbox: its body, and something for the rest."""
+    return len(envelope.body) + _ENVELOPE_BYTES
 
 
 def encode_gossip(message: GossipMessage) -> bytes:

@@ -14,10 +14,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol.base.machine import Body, Inputs, Observation, Outputs, Pose
+from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Outputs, Pose
+from kantor_protocol.files import private
 from kantor_protocol.node.recovery import RecoverableNode, WalContents
 from kantor_protocol.node.wal import _MAGIC, WalFile, _frame, tear
-from kantor_protocol.wire.messages import encode
+from kantor_protocol.wire.messages import INPUTS_BYTES_MAX, encode
 from support.strategies import INPUTS, examples
 
 INITIAL_STATE = Body(Pose(1.0, 2.0), step=3, energy_spent=2, incarnation=1)
@@ -240,3 +241,63 @@ def test_two_writers_never_share_a_log(tmp_path: Path) -> None:
     finally:
         frozen.kill()
         frozen.join()
+
+
+# Bounds, and who may read it.
+
+
+@given(excess=st.integers(-3, 3))
+@examples(7)
+def test_what_cannot_be_read_is_not_written(excess: int) -> None:
+    """One limit for both: an entry of that length is found again, and a longer one is refused, and the log goes on."""
+    small = ENTRIES[0]
+    envelope = Envelope("r2", 1, "", b"")
+    bare = len(encode(Inputs(1, Observation(3, Pose(0.0, 0.0)), (envelope,))))
+    # A longer body has a longer head: 3 bytes more than that of an empty one.
+    body = bytes(INPUTS_BYTES_MAX - bare - 3 + excess)
+    long = encode(Inputs(1, Observation(3, Pose(0.0, 0.0)), (Envelope("r2", 1, "", body),)))
+    assert len(long) == INPUTS_BYTES_MAX + excess
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "r1.diary"
+        wal = WalFile(path, "run")
+        wal.reset(INITIAL_STATE)
+        wal.append(small)
+        if excess > 0:
+            with pytest.raises(OSError, match="bytes, and"):
+                wal.append(long)
+        else:
+            wal.append(long)
+        wal.append(small)
+        wal.close()
+
+        kept = [small] if excess > 0 else [small, long]
+        assert found(path) == WalContents(INITIAL_STATE, [*kept, small])
+
+
+def test_a_log_is_for_its_owner_only(tmp_path: Path) -> None:
+    """Whatever the mask of the process is; and a link in the place of the draft is not written through."""
+    path, other = tmp_path / "r1.diary", tmp_path / "other"
+    other.write_bytes(b"someone else's")
+    private.draft_of(path).symlink_to(other)
+    before = os.umask(0)
+    try:
+        written(path, ENTRIES)
+    finally:
+        os.umask(before)
+
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert not path.is_symlink()
+    assert other.read_bytes() == b"someone else's"
+    assert found(path) == WalContents(INITIAL_STATE, ENTRIES)
+
+
+def test_a_log_that_is_a_link_is_not_followed(tmp_path: Path) -> None:
+    """The log of another place is neither read nor cut."""
+    path, other = tmp_path / "r1.diary", tmp_path / "other"
+    written(other, ENTRIES)
+    path.symlink_to(other)
+    before = other.read_bytes()
+
+    with pytest.raises(OSError, match="symbolic links"):
+        found(path)
+    assert other.read_bytes() == before
