@@ -362,6 +362,40 @@ def journals() -> Mutations:
     return files(contents)
 
 
+def short_journal() -> bytes:
+    """A journal of a run that was cut short."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "run.mcap"
+        journal = Journal(path)
+        for record in played("ledger").records[:2]:
+            journal.append(record)
+        journal.close()
+        return path.read_bytes()
+
+
+MANIFEST_OF_A_RUN = (
+    b'{"format": 1, "behaviour": 1, "run": "a26750e94c8a2561", "exchange": "wall", "speed": 2.0, '
+    b'"exact_every": null, "resumed": 1, "digest": "00", "records": 2, "record": "whole"}'
+)
+
+
+def manifests_of_runs() -> Mutations:
+    """manifest.json of a run."""
+    return texts((MANIFEST_OF_A_RUN, MANIFEST_OF_A_RUN.replace(b"null", b"5")), JSON_TOKENS)
+
+
+def results() -> Mutations:
+    """result.json of a run."""
+    result = (Path(__file__).parents[1] / "baseline" / "in-process" / "result.json").read_bytes()
+    return texts((result, result.replace(b" ", b"")), JSON_TOKENS)
+
+
+JSON_TOKENS = (
+    *(b"[" * 9, b"{" * 9, b'{"a":' * 9, b"]", b"}", b'"', b",", b":", b"null", b"NaN", b"Infinity"),
+    *(b"-1", b"1e999", b"9" * 400, b"0.5", b"true", b"\\ud800", b"\x00", b"\xff"),
+)
+
+
 def wal_files() -> Mutations:
     """Write-ahead logs on disk."""
     given = played("ledger").inputs

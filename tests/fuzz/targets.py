@@ -9,6 +9,7 @@ from fuzz.toml_trees import Trees
 from kantor_protocol.files.toml import TomlError
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.wire.messages import RefusedError, decode_inputs, decode_progress
+from kantor_worldsim.record.run_folder import JOURNAL, MANIFEST
 
 TARGETS: dict[str, Target] = {
     "news": Target(corpora.gossip, stateless(refuses(RefusedError, messages.gossip))),
@@ -79,6 +80,10 @@ TARGETS: dict[str, Target] = {
     "keys": Target(corpora.keys, stateless(files.key_expression)),
     "credentials": Target(corpora.identities, files.identity_file),
     "journal": Target(corpora.journals, stateless(records.journal)),
+    "indexed-journal": Target(corpora.journals, records.indexed_journal),
+    "opening": Target(corpora.journals, records.run_folder(JOURNAL)),
+    "manifest-of-a-run": Target(corpora.manifests_of_runs, records.run_folder(MANIFEST)),
+    "result": Target(corpora.results, records.result_file),
     "runs-of-sweep": Target(corpora.logs_of_runs, files.runs_of_sweep),
     "map-nav2": Target(corpora.nav2, files.map_file(".yaml")),
     "inputs-of-map": Target(corpora.nav2, files.inputs_of_map),

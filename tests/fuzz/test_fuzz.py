@@ -24,6 +24,7 @@ SLOW = {
     *("runs-of-sweep", "map-nav2", "map-movingai", "map-pgm", "map-png", "map-tiff"),
     *("points-csv", "points-npy", "points-image", "mapper", "allocation", "journal"),
     *("scenario-file", "toml", "manifest", "inputs-of-map", "points-tiff"),
+    *("indexed-journal", "opening", "manifest-of-a-run", "result"),
 }
 """Tens of microseconds for an input, or hundreds."""
 

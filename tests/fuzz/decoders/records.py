@@ -1,12 +1,15 @@
 """Decoders of records: records, the parts that checkers read of them, and journals."""
 
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 from typing import cast
 
 import msgspec
 
-from fuzz.decoding import Decode
+from fuzz import corpora
+from fuzz.decoding import Decode, refuses
+from kantor_fleet.report.summary import read_result
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
 from kantor_worldsim.record import columnar
 from kantor_worldsim.record.columnar import (
@@ -18,7 +21,15 @@ from kantor_worldsim.record.columnar import (
     STEP_RECORDS,
 )
 from kantor_worldsim.record.journal import read as read_journal
+from kantor_worldsim.record.mcap_file import messages, write_index
 from kantor_worldsim.record.records import decode_record, encode_record
+from kantor_worldsim.record.run_folder import (
+    JOURNAL,
+    MANIFEST,
+    RESULT,
+    Past,
+    ResumeError,
+)
 
 
 def record(content: bytes) -> bool:
@@ -89,6 +100,54 @@ class _InMemory:
     def open(self, _mode: str) -> BytesIO:
         """Open the bytes for reading."""
         return BytesIO(self._content)
+
+
+def indexed_journal(folder: Path) -> Decode:
+    """A journal with its index: what is read of it is in it whole, and written again it is the same."""
+    path, again = folder / "run.mcap", folder / "again.mcap"
+
+    def decode(content: bytes) -> bool:
+        path.write_bytes(content)
+        found = list(messages(path))
+        assert all(message.data in content for message in found)
+        again.write_bytes(content)
+        write_index(again)
+        assert list(messages(again)) == found, "messages that change when they are indexed"
+        return len(found) > 0
+
+    return decode
+
+
+def run_folder(name: str) -> Callable[[Path], Decode]:
+    """A file of a run folder beside a good journal: its run goes on, or there is one line why not."""
+
+    def start(folder: Path) -> Decode:
+        path = folder / name
+        if name == MANIFEST:
+            (folder / JOURNAL).write_bytes(corpora.short_journal())
+        else:
+            (folder / MANIFEST).write_bytes(corpora.MANIFEST_OF_A_RUN)
+
+        def read(content: bytes) -> None:
+            path.write_bytes(content)
+            past = Past.of(folder)
+            assert past.opening.setup is not None
+
+        return refuses(ResumeError, read)
+
+    return start
+
+
+def result_file(folder: Path) -> Decode:
+    """result.json of a run: a result that stays as it is, or none."""
+    path = folder / RESULT
+
+    def decode(content: bytes) -> bool:
+        path.write_bytes(content)
+        result = read_result(folder)
+        return result is not None
+
+    return decode
 
 
 def journal(content: bytes) -> bool:
