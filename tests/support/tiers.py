@@ -17,6 +17,7 @@ TIER_OF_PLACE = {
     "fleet/test_reproduce_resilience.py": "papers",
     "test_architecture.py": "unit",
     "test_digests.py": "processes",
+    "test_documented_commands.py": "processes",
     "test_readme.py": "processes",
     "test_tiers.py": "unit",
 }
