@@ -18,7 +18,7 @@ from kantor_fleet.execution.parent_death import die_with_parent
 
 _DESCRIPTORS = 12
 """More than the start of a process takes."""
-_PRELOADED = ["kantor_fleet.execution.tied", "kantor_fleet.execution.preloaded"]
+_PRELOADED = [f"kantor_fleet.execution.{name}" for name in ("tied", "preloaded", "shielded")]
 
 
 class StartError(Exception):
@@ -79,8 +79,6 @@ def _check_room() -> None:
 def be_tied(target: Callable[..., Any], *arguments: Any) -> None:
     """Run a target in a process of the fork server's that ends with the command."""
     die_with_parent()
-    # What a terminal or a service manager sends to all is for the command, and for those that ask for it.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     command = multiprocessing.parent_process()
     if command is not None and not wait([command.sentinel], 0.0):
         target(*arguments)

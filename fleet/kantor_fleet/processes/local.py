@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
@@ -29,7 +29,7 @@ from kantor_protocol.node import wal
 from kantor_protocol.node.runner import RejectedError, StateError
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.transport import credentials
-from kantor_protocol.transport.client import observer_session
+from kantor_protocol.transport.client import ObserverSession, observer_session
 from kantor_protocol.transport.credentials import Identity, Password
 from kantor_protocol.transport.endpoint import free_endpoint
 from kantor_protocol.transport.router import HubRouter
@@ -44,6 +44,9 @@ from kantor_worldsim.record.run_folder import RESULT, FolderLock
 FLEET = "kantor"
 _START_S = 60.0
 _END_S = 5.0
+_ORDER_S = 0.5
+_CONNECT_S = 3.0
+"""A world-sim that has ended meanwhile is noticed after so long."""
 _LISTEN_S = 5.0
 """Longest wait for the endpoint of a world-sim that was killed to become free."""
 _IMPOSTOR_S = 15.0
@@ -190,6 +193,9 @@ class Fleet:
     def stop(self) -> None:
         """Ask world-sim to end the mission and close the record."""
         self._stopping.set()
+        self._order_stop()
+
+    def _order_stop(self) -> None:
         with self._lock:
             if not self._down and self.world_sim.exitcode is None:
                 os.kill(self.world_sim.pid or 0, signal.SIGCONT)
@@ -217,6 +223,11 @@ class Fleet:
                 self.participants[name].kill()
             processes = self._processes()
             give_up = time.monotonic() + _END_S
+            while self._stopping.is_set() and self.world_sim.exitcode is None:
+                self._order_stop()  # again: it may just have been started
+                self.world_sim.join(_ORDER_S)
+                if time.monotonic() >= give_up:
+                    break
             for process in processes:
                 process.join(max(0.0, give_up - time.monotonic()))
             for process in processes:
@@ -353,14 +364,27 @@ def watch_progress(fleet: Fleet) -> Iterator[Progress | None]:
 
     Raises BusError if world-sim does not come up.
     """
-    key = keys.progress(FLEET)
-    with observer_session(fleet.connect, fleet.observer, key, _START_S) as watch:
+    with ExitStack() as stack:
+        watch, give_up = None, time.monotonic() + _START_S
         while fleet.runs:
-            message = watch.next(0.1)
+            if watch is None:
+                watch = _observer(fleet, stack, give_up)
+            message = watch.next(0.1) if watch is not None else None
             try:
                 yield decode_progress(message[1]) if message is not None else None
             except RefusedError:
                 yield None
+
+
+def _observer(fleet: Fleet, stack: ExitStack, give_up_s: float) -> ObserverSession | None:
+    """An observer of world-sim's progress; None if it is not up yet. Raises BusError if that is too late."""
+    key = keys.progress(FLEET)
+    try:
+        return stack.enter_context(observer_session(fleet.connect, fleet.observer, key, _CONNECT_S))
+    except BusError:
+        if time.monotonic() >= give_up_s:
+            raise
+        return None
 
 
 def _be_world_sim(
