@@ -108,8 +108,10 @@ def test_a_signal_ends_a_run_at_any_moment(
     assert (process.returncode, err) == (128 + number, "")
     assert_nothing_left(temporary)
     for folder in kantor.runs():
-        assert result_of(folder)["ended"] == "interrupted"
-        assert kantor("verify", folder).code == 0, moment
+        # It is deserted if no robot was there yet.
+        early = {"deserted"} if moment != "a mission" else set()
+        assert result_of(folder)["ended"] in {"interrupted"} | early
+        assert kantor("verify", folder).code == 0
     if moment == "a mission":
         assert len(kantor.runs()) == 1
 

@@ -127,7 +127,8 @@ def _watch(fleet: Fleet, view: ProgressView, interrupts: Interrupts) -> None:
             if not stopping and (interrupts() or (waiting and fleet.deserted)):
                 stopping = True
                 view.note("ending the mission")
-                fleet.stop()
+            if stopping:
+                fleet.stop()  # again and again: world-sim may just have been started
     except BusError:
         view.note(f"world-sim is not there; see {fleet.world_sim_log}")
 
