@@ -17,8 +17,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from kantor_protocol import private_files
 from kantor_protocol.base.machine import Body, Inputs, Outputs, StateMachine
-from kantor_protocol.files import private
 from kantor_protocol.node import memory_trim
 from kantor_protocol.node.recovery import RecoverableNode
 from kantor_protocol.node.wal import WalFile
@@ -79,7 +79,7 @@ def participate(
 
 def _check_writable(state: Path) -> None:
     try:
-        private.make_folder(state)
+        private_files.make_folder(state)
         tempfile.TemporaryFile(dir=state).close()
     except OSError as error:
         reason = error.strerror or error

@@ -23,8 +23,8 @@ from typing import NamedTuple
 
 import msgspec
 
+from kantor_protocol import private_files
 from kantor_protocol.base.machine import Body
-from kantor_protocol.files import private
 from kantor_protocol.node.recovery import WalContents
 from kantor_protocol.wire.messages import INPUTS_BYTES_MAX, RefusedError, decode_inputs
 
@@ -89,8 +89,8 @@ class WalFile:
 
     def reset(self, initial_state: Body) -> None:
         """Discard all entries and begin a new log. Raises OSError, and then the old file is still there."""
-        draft = private.draft_of(self._path)
-        file = private.open_draft(self._path)
+        draft = private_files.draft_of(self._path)
+        file = private_files.open_draft(self._path)
         try:
             _acquired(file)
             content = msgspec.msgpack.encode(_Header(self._run, initial_state))

@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from kantor_protocol import private_files
 from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
-from kantor_protocol.files import private
 from kantor_protocol.files.reading import UnreadableError, read_text
 from kantor_protocol.files.toml import TomlError, parse_toml
 
@@ -181,7 +181,7 @@ def issue(folder: Path, fleet: str, users: Iterable[ParticipantId]) -> dict[str,
 
     Raises CredentialsError if the folder holds something else: nothing is overwritten.
     """
-    private.make_folder(folder)
+    private_files.make_folder(folder)
     identities = draw(fleet, users)
     for user in identities:
         kept = _kept(folder / f"{user}.toml", fleet, user)
@@ -324,4 +324,4 @@ def expiry(until: datetime, now: datetime) -> str:
 
 def write(path: Path, text: str) -> None:
     """Write a file that its owner alone can read, whole or not at all."""
-    private.replace(path, text.encode())
+    private_files.replace(path, text.encode())

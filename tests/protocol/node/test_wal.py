@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kantor_protocol import private_files
 from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Outputs, Pose
-from kantor_protocol.files import private
 from kantor_protocol.node.recovery import RecoverableNode, WalContents
 from kantor_protocol.node.wal import _MAGIC, WalFile, _frame, tear
 from kantor_protocol.wire.messages import INPUTS_BYTES_MAX, encode
@@ -278,7 +278,7 @@ def test_a_log_is_for_its_owner_only(tmp_path: Path) -> None:
     """Whatever the mask of the process is; and a link in the place of the draft is not written through."""
     path, other = tmp_path / "r1.diary", tmp_path / "other"
     other.write_bytes(b"someone else's")
-    private.draft_of(path).symlink_to(other)
+    private_files.draft_of(path).symlink_to(other)
     before = os.umask(0)
     try:
         written(path, ENTRIES)

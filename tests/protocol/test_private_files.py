@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from kantor_protocol.files import private
+from kantor_protocol import private_files
 from kantor_protocol.transport import credentials
 
 
@@ -38,8 +38,8 @@ def test_a_draft_is_never_what_stood_in_its_place(tmp_path: Path, target: str) -
     path, other = tmp_path / "secret", tmp_path / "other"
     other.write_bytes(b"theirs")
     other.chmod(0o666)
-    private.draft_of(path).symlink_to(tmp_path / target)
-    private.replace(path, b"ours")
+    private_files.draft_of(path).symlink_to(tmp_path / target)
+    private_files.replace(path, b"ours")
 
     assert (path.read_bytes(), mode(path), path.is_symlink()) == (b"ours", 0o600, False)
     assert other.read_bytes() == b"theirs"
@@ -51,6 +51,6 @@ def test_a_file_with_more_rights_is_replaced_by_a_private_one(tmp_path: Path) ->
     path = tmp_path / "secret"
     path.write_bytes(b"old")
     path.chmod(0o644)
-    private.replace(path, b"new")
+    private_files.replace(path, b"new")
 
     assert (path.read_bytes(), mode(path)) == (b"new", 0o600)
