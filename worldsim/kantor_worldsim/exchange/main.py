@@ -68,7 +68,8 @@ def run(
         relay = RealtimeExchange(lobby, simulation, config, controller, stopped, resumed=resumed)
         reason = relay.run()
     else:
-        lobby.open(lambda: simulation.done_ns)
+        if not stopped():  # who is not there yet has not left an interrupted mission
+            lobby.open(lambda: simulation.done_ns)
         lockstep = LockstepExchange(lobby, controller)
         reason = simulate(simulation, lockstep, seed, stopped, lockstep)
     lobby.dismiss(reason, 0.0 if past is None else COME_BACK_S)
