@@ -214,6 +214,7 @@ class Progress(_Message, frozen=True, array_like=True, tag=22):
 
 
 _ENVELOPE_BYTES = 256
+"""Of an envelope in an inbox without its body, at most."""
 _NIL = Raw(b"\xc0")
 
 

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.writer import CompressionType, Writer
 
 from kantor_worldsim.record.journal import METRICS_TOPIC, RECORD_TOPIC, Journal, read
 from kantor_worldsim.record.mcap_file import messages, write_index
@@ -176,17 +175,3 @@ def test_a_hostile_file_is_read_within_bounds(tmp_path: Path) -> None:
         paths.append(tmp_path / name)
         paths[-1].write_bytes(HEAD + content)
     subprocess.run([sys.executable, "-c", BOUNDED, *map(str, paths)], check=True)
-
-
-def test_a_file_that_another_program_compressed_has_no_records(whole: Path, tmp_path: Path) -> None:
-    """Kantor writes none: it is like a file that is cut there."""
-    path = tmp_path / "run.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.ZSTD)
-        writer.start()
-        channel = writer.register_channel(RECORD_TOPIC, "msgpack", 0)
-        for payload, _ in read(whole):
-            writer.add_message(channel, 0, payload, 0)
-        writer.finish()  # type: ignore[no-untyped-call]
-
-    assert list(read(path)) == []

@@ -13,7 +13,7 @@ from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk
 from mcap.writer import CompressionType, Writer
 
-from kantor_worldsim.record import journal
+from kantor_worldsim.record import mcap_file
 from kantor_worldsim.record.journal import RECORD_TOPIC, read
 from kantor_worldsim.record.records import Record, encode_record
 from support.strategies import examples
@@ -51,7 +51,7 @@ def with_chunk(path: Path, compression: str, data: bytes, size: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["zstd", "lz4"])
-@pytest.mark.parametrize("size", [10, journal._CHUNK_BYTES_MAX + 1, 2**63])
+@pytest.mark.parametrize("size", [10, mcap_file.CHUNK_BYTES_MAX + 1, 2**63])
 def test_a_bomb_is_not_inflated(kind: str, size: int, tmp_path: Path) -> None:
     """A chunk is inflated up to what it says, and not at all if that is more than any may be."""
     path = tmp_path / "bomb.mcap"

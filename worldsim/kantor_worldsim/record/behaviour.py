@@ -29,7 +29,12 @@ class Change(NamedTuple):
     """Whether it can show in a mission."""
 
 
-CHANGES: dict[int, Change] = {}
+CHANGES: dict[int, Change] = {
+    2: Change(
+        "robots on a map give targets up by distance instead of steps, log bumps, and with noisy ranges look longer",
+        lambda scenario: scenario.mapping,
+    ),
+}
 """By the version that came with it."""
 
 

@@ -6,7 +6,6 @@ ended is written once more, with an index for readers that seek.
 """
 
 import contextlib
-import dataclasses
 import hashlib
 import json
 import math
@@ -14,7 +13,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
-import lz4.frame
 import msgspec
 from mcap.writer import CompressionType, IndexType, Writer
 
