@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from kantor_fleet.execution.in_process_team import team
 from kantor_protocol.base.machine import Envelope, Inputs, Outputs, ParticipantId, Pose
+from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import (
     OUTBOX_MAX,
@@ -31,8 +32,21 @@ KILLS = (
     'faults=[{kind="kill", who=["r2"], disk="lost", from_s=0.3, until_s=0.5},'
     ' {kind="kill", who=["r1"], disk="torn", mid_step=true, from_s=0.4, until_s=0.7}]'
 )
+FAR = """
+name = "far"
+domain = { min_m = [500000, 4649776], max_m = [500002, 4649778] }
+robots = { count = 3 }
+starts = { random = true }
+vehicle = { speed_m_s = 0.01 }
+clock = { period_s = 0.01 }
+energy = { points = 90 }
+samples = { count = 30 }
+density = [{ mean_m = [500001.0, 4649777.0], variance_m2 = [0.1, 0.1] }]
+"""
+"""UTM coordinates, of which the rounding is as long as a hundred thousandth of a move."""
 MISSIONS = {
     "ledger": mission(),
+    "far": parse(FAR, "far"),
     "min": mission(*MINIMUM),
     "spectral": mission("planner=spectral", "planner.modes=4"),
     "centralized": mission("coordination=centralized"),

@@ -34,7 +34,7 @@ from kantor_protocol.wire.weights import weights_bytes_max
 from kantor_worldsim.exchange.admission_kernels import BARE, REASONS, judge, learn
 from kantor_worldsim.record.process_events import TAKE_OVER
 from kantor_worldsim.record.records import Batch, ProcessEvent, Record
-from kantor_worldsim.world.world import WorldSetup, units_of
+from kantor_worldsim.world.world import WorldSetup, rounding_m, units_of
 
 _ROUNDING = 1e-5
 _PAIR_BYTES_MAX = 20
@@ -122,7 +122,8 @@ class Admission:
 
     def _refusal_of_move(self, start: Pose, end: Pose) -> str:
         way_m = math.hypot(end.x_m - start.x_m, end.y_m - start.y_m)
-        return "" if way_m <= self._way_max_m else f"a move of {way_m:.6g} m in one step"
+        possible_m = self._way_max_m + rounding_m(start)
+        return "" if way_m <= possible_m else f"a move of {way_m:.6g} m in one step"
 
     def _refusal_of_numbers(self, name: ParticipantId, outputs: Outputs) -> str:
         before = self._sequences[name]

@@ -222,10 +222,9 @@ class World:
         limit_m = 0.0 if name == SUPERVISOR else self._speed_m_s * (now_ns - body.moved_ns) * 1e-9
         start = body.pose
         way_m = math.hypot(pose.x_m - start.x_m, pose.y_m - start.y_m)
-        farthest_m = max(abs(start.x_m), abs(start.y_m))
-        rounding_m = _ROUNDINGS * math.ulp(farthest_m) if limit_m > 0.0 else 0.0
-        # Also false for a pose that is not finite.
-        if not way_m <= limit_m * (1.0 + SPEED_TOLERANCE) + rounding_m:
+        if limit_m > 0.0:
+            limit_m = limit_m * (1.0 + SPEED_TOLERANCE) + rounding_m(start)
+        if not way_m <= limit_m:  # also for a pose that is not finite
             return False
         body.pose = pose
         if self._ground is not None and name != SUPERVISOR:
@@ -261,6 +260,11 @@ class World:
         indices = self._room[:count].tolist()
         body.found += tuple(indices)
         return tuple((i, float(targets_m[i, 0]), float(targets_m[i, 1])) for i in indices)
+
+
+def rounding_m(pose: Pose) -> float:
+    """What the rounding of coordinates may add to the length of a move from a pose."""
+    return _ROUNDINGS * math.ulp(max(abs(pose.x_m), abs(pose.y_m)))
 
 
 def is_free(ground: Ground, x_m: float, y_m: float) -> bool:
