@@ -37,13 +37,13 @@ name = "far"
 domain = { min_m = [500000, 4649776], max_m = [500002, 4649778] }
 robots = { count = 3 }
 starts = { random = true }
-vehicle = { speed_m_s = 0.01 }
+vehicle = { speed_m_s = 0.001 }
 clock = { period_s = 0.01 }
 energy = { points = 90 }
 samples = { count = 30 }
 density = [{ mean_m = [500001.0, 4649777.0], variance_m2 = [0.1, 0.1] }]
 """
-"""UTM coordinates, of which the rounding is as long as a hundred thousandth of a move."""
+"""UTM coordinates, of which the rounding is a ten thousandth of a move."""
 MISSIONS = {
     "ledger": mission(),
     "far": parse(FAR, "far"),
