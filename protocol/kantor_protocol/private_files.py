@@ -5,6 +5,7 @@ what stands in its place, a link of someone else's for example, is neither follo
 """
 
 import os
+from errno import ENOTDIR
 from pathlib import Path
 
 _FOLDER_MODE = 0o700
@@ -16,9 +17,13 @@ def make_folder(folder: Path) -> None:
 
     Raises OSError.
     """
-    if not folder.is_dir():
+    if folder.is_dir():
+        return
+    try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        folder.mkdir(mode=_FOLDER_MODE, exist_ok=True)
+    except FileExistsError:
+        raise NotADirectoryError(ENOTDIR, os.strerror(ENOTDIR), str(folder.parent)) from None
+    folder.mkdir(mode=_FOLDER_MODE, exist_ok=True)
 
 
 def draft_of(path: Path) -> Path:

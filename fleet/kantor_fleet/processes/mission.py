@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing.util import get_temp_dir
 from pathlib import Path
@@ -56,9 +56,13 @@ class _Terms(NamedTuple):
 
 
 @contextmanager
-def _run_folder(terms: _Terms, interrupts: Interrupts) -> Iterator[tuple[Path, FolderLock]]:
+def _run_folder(
+    terms: _Terms,
+    interrupts: Interrupts,
+    announce: Callable[[Path], None] = lambda _folder: None,
+) -> Iterator[tuple[Path, FolderLock]]:
     """A new run folder, which is removed if nothing has happened in its run when a signal or an error ends it."""
-    folder = folder_for(terms.scenario, terms.seed, terms.out)
+    folder = folder_for(terms.scenario, terms.seed, terms.out, announce)
     with FolderLock(folder) as lock:
         try:
             yield folder, lock
@@ -98,8 +102,7 @@ def _run_processes(terms: _Terms, interrupts: Interrupts) -> Exit:
         view.note("starting the fleet (the first time, kernels are compiled: about half a minute)")
         with interrupts.at_once():
             await_fork_server()
-        folder, lock = stack.enter_context(_run_folder(terms, interrupts))
-        leftovers.add_run(folder)
+        folder, lock = stack.enter_context(_run_folder(terms, interrupts, leftovers.add_run))
         scenario, seed, exchange, speed, _, exact_every = terms
         config = FleetConfig(scenario, seed, exchange, speed, folder, exact_every)
         with local_fleet(config, lock) as fleet:

@@ -2,8 +2,9 @@
 
 import math
 
+import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_agent.mapping.pursuit import Pursuit, wall_met
@@ -93,16 +94,17 @@ def test_another_target_begins_anew() -> None:
 
 @examples(400)
 @given(
-    x_m=st.floats(0.0, 7.0), y_m=st.floats(0.0, 5.0),
-    angle_rad=st.floats(-math.pi, math.pi), way_m=st.floats(1e-3, 5.0),
-)  # fmt: skip
+    cell=st.sampled_from(np.flatnonzero(ROOM.cells == FREE).tolist()),
+    within=st.tuples(st.floats(0.0, 0.999), st.floats(0.0, 0.999)),
+    angle_rad=st.floats(-math.pi, math.pi),
+    way_m=st.floats(1e-3, 5.0),
+)
 def test_the_wall_that_a_robot_met_is_a_wall(
-    x_m: float, y_m: float, angle_rad: float, way_m: float
+    cell: int, within: tuple[float, float], angle_rad: float, way_m: float
 ) -> None:
     """Wherever it drives; where it is unclear which of two cells it was, none is named."""
     frame, cells = ROOM
-    cell = frame.cell_of(x_m, y_m)
-    assume(cell != NOWHERE and cells.flat[cell] == FREE)
+    x_m, y_m = cell % frame.columns + within[0], cell // frame.columns + within[1]
     start = Pose(x_m, y_m)
     end = Pose(x_m + way_m * math.cos(angle_rad), y_m + way_m * math.sin(angle_rad), angle_rad)
     stop, bumped = stopped(ROOM, start, end)

@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import shutil
+from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.metadata import version
 from multiprocessing import reduction
@@ -34,11 +35,20 @@ _FORMAT = 1
 """Of the folder, in its manifest."""
 
 
-def folder_for(scenario: Scenario, seed: int, below: Path) -> Path:
-    """Create `<UTC>_<scenario>_s<seed>` below a folder; a number is added if it exists."""
+def folder_for(
+    scenario: Scenario,
+    seed: int,
+    below: Path,
+    announce: Callable[[Path], None] = lambda _folder: None,
+) -> Path:
+    """Create `<UTC>_<scenario>_s<seed>` below a folder; a number is added if it exists.
+
+    announce: called with the folder before it is there, so that its maker can be killed at any moment.
+    """
     stem = f"{datetime.now(UTC):%Y%m%dT%H%M%SZ}_{scenario.name}_s{seed}"
     for attempt in range(1000):
         folder = below / (stem if not attempt else f"{stem}_{attempt}")
+        announce(folder)
         try:
             folder.mkdir(parents=True)
         except FileExistsError:

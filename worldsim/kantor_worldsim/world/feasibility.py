@@ -29,7 +29,7 @@ def doubts_of_map(scenario: Scenario, ground: Ground, seen: npt.NDArray[np.bool_
 
 
 def _complaints_of_map(scenario: Scenario, resolution_m: float) -> Iterator[str]:
-    range_m, speed_m_s = scenario.sensor.range_m, scenario.vehicle.speed_m_s
+    range_m = scenario.sensor.range_m
     if range_m <= resolution_m / 2.0:
         yield (
             f"sensor.range_m: {range_m:g} m, and a cell is {resolution_m:g} m wide: a robot sees no cell beside "
@@ -39,12 +39,6 @@ def _complaints_of_map(scenario: Scenario, resolution_m: float) -> Iterator[str]
         yield (
             f"sensor.range_m: {range_m:g} m is measured in steps of {range_m / CODES:g} m, and a cell is "
             f"{resolution_m:g} m wide; give at most {CODES * resolution_m / 2.0:g} m, or a larger map.resolution_m"
-        )
-    way_m = math.inf if scenario.limit_s is None else speed_m_s * scenario.limit_s
-    if way_m < resolution_m:
-        yield (
-            f"vehicle.speed_m_s: until limit_s = {scenario.limit_s:g} s a robot drives {way_m:g} m, less than a "
-            f"cell of {resolution_m:g} m; raise one of them"
         )
 
 
@@ -69,6 +63,12 @@ def _doubts_of_map(
             f"vehicle.speed_m_s: a robot drives {step_m:g} m in a period and sees {sensor.range_m:g} m far; "
             "it decides too rarely to explore well"
         )
+    limit_s = math.inf if scenario.limit_s is None else scenario.limit_s
+    if scenario.vehicle.speed_m_s * limit_s < resolution_m:
+        yield (
+            f"vehicle.speed_m_s: until limit_s = {limit_s:g} s a robot drives "
+            f"{scenario.vehicle.speed_m_s * limit_s:g} m, less than a cell of {resolution_m:g} m"
+        )
     if not _fits(ground, seen, scenario.vehicle.radius_m / resolution_m):
         yield (
             f"vehicle.radius_m: a body {2.0 * scenario.vehicle.radius_m:g} m wide does not fit through every "
@@ -88,13 +88,11 @@ def _fits(ground: Ground, seen: npt.NDArray[np.bool_], radius_cells: float) -> b
 
 
 def doubts_of_density(scenario: Scenario, samples_m: npt.NDArray[np.float64]) -> list[str]:
-    """Reasons why a mission on a density may search in vain, one line each. Raises ScenarioError if it must."""
+    """Reasons why a mission on a density may search in vain, one line each."""
     low, high = scenario.domain.min_m, scenario.domain.max_m
     inside = ((samples_m >= low) & (samples_m <= high)).all(axis=1)
     outside = int((~inside).sum())
     place = f"[{low[0]:g}, {high[0]:g}] x [{low[1]:g}, {high[1]:g}]"
-    if outside == samples_m.shape[0]:
-        raise ScenarioError(f"samples: all lie outside the domain {place}; move one or the other")
     from_file = scenario.samples.file is not None
     if outside and (from_file or outside > _OUTSIDE * samples_m.shape[0]):
         return [f"samples: {outside} of {samples_m.shape[0]} lie outside the domain {place}"]
