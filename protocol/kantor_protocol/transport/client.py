@@ -109,6 +109,10 @@ class ObserverSession:
             self._received.put((str(sample.key_expr), sample.payload.to_bytes()))
 
 
+_REFUSALS = 2
+"""Attempts in a row that fail where there is room, after which the credentials are wrong."""
+
+
 @contextlib.contextmanager
 def participant_session(
     connect: str, identity: Identity, nonce: str, connect_timeout_s: float
@@ -151,12 +155,15 @@ def client(connect: str, identity: Identity, connect_timeout_s: float) -> zenoh.
 def _opened(connect: str, identity: Identity, give_up: float) -> zenoh.Session:
     """A session, as soon as the router has room for it. give_up: by the monotonic clock. Raises BusError."""
     config = zenoh_config.client_config(identity)
+    refusals = 0
     while True:
         with contextlib.suppress(zenoh.ZError):
             return open_session("client", config, connect=connect)
         late = time.monotonic() >= give_up
         crowded = isinstance(identity, Certificate) or is_crowded(connect)
-        if crowded and not late:
+        # Room may have become free just after an attempt failed for want of it: one refusal proves nothing.
+        refusals = 0 if crowded else refusals + 1
+        if (crowded or refusals < _REFUSALS) and not late:
             continue
         await_endpoint(connect, 0.0, identity)  # which may have changed since
         if crowded:
