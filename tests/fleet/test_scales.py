@@ -13,7 +13,7 @@ from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.world.maps import Ground
 from kantor_worldsim.world.starts import starts_on
 from kantor_worldsim.world.world import WorldSetup
-from support.grounds import drawn
+from support.grounds import SMALL
 from support.strategies import examples
 
 MISSION = """
@@ -37,13 +37,6 @@ MAP = """
 map = {{ layout = "blank" }}
 planner = {{ name = "burgard" }}
 """
-SMALL = drawn(
-    "########",
-    "#..#...#",
-    "#..#.#.#",
-    "#....#.#",
-    "########",
-)
 
 
 def checked(scenario: Scenario, setup: WorldSetup) -> list[str]:

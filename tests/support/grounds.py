@@ -44,6 +44,16 @@ def drawn(
     return Ground(Frame(resolution_m, origin_m, *cells.shape), cells)
 
 
+SMALL = drawn(
+    "########",
+    "#..#...#",
+    "#..#.#.#",
+    "#....#.#",
+    "########",
+)
+"""Two corridors round a wall, in which robots have to turn back."""
+
+
 class Place(NamedTuple):
     """A map and a pose in one of its free cells."""
 

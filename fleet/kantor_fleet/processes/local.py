@@ -1,8 +1,9 @@
 """A fleet on this machine: world-sim and every participant as a process of its own.
 
 All children come from one fork server that has imported and compiled everything and opened nothing, and none of them
-outlives this process. Their passwords are in memory only. This process also carries out world-sim's commands for a scenario's faults of processes: it kills, stops and starts
-participants and world-sim itself, and restarts world-sim from its journal after any kill.
+outlives this process. Their passwords are in memory only. This process also carries out world-sim's commands for a
+scenario's faults of processes: it kills, stops and starts participants and world-sim itself, and restarts world-sim
+from its journal after any kill.
 """
 
 import contextlib

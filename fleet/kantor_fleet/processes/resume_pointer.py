@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 
 from kantor_protocol.scenario.file_names import name_of, path_of
+from kantor_worldsim.record.drafts import replace
 
 _FILE = "worldsim.json"
 
@@ -22,11 +23,8 @@ class _ResumePointer(msgspec.Struct, frozen=True):
 def note(state: Path, run: Path) -> None:
     """Point to the run that this machine is in. Raises OSError."""
     state.mkdir(parents=True, exist_ok=True)
-    draft = state / f".{_FILE}"
-    draft.write_bytes(
-        msgspec.json.encode(_ResumePointer(socket.gethostname(), name_of(run.absolute())))
-    )
-    draft.replace(state / _FILE)
+    pointer = _ResumePointer(socket.gethostname(), name_of(run.absolute()))
+    replace(state / _FILE, lambda draft: draft.write_bytes(msgspec.json.encode(pointer)))
 
 
 def run_in(state: Path) -> Path | None:

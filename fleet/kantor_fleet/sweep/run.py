@@ -22,6 +22,7 @@ from kantor_fleet.sweep.journal import RunsJournal
 from kantor_fleet.sweep.plan import RunKey, SweepError, SweepPlan
 from kantor_fleet.sweep.table import SweepRun
 from kantor_protocol.scenario.dump import to_tree
+from kantor_worldsim.record.drafts import replace
 
 RUNS = "runs.jsonl"
 PLAN = "sweep.json"
@@ -158,7 +159,7 @@ def _write_plan(config: SweepConfig) -> None:
         ],
     }
     text = msgspec.json.format(msgspec.json.encode(tree), indent=2)
-    table.replace(config.folder / PLAN, lambda draft: draft.write_bytes(text + b"\n"))
+    replace(config.folder / PLAN, lambda draft: draft.write_bytes(text + b"\n"))
 
 
 def _print_failures(runs: Iterable[SweepRun]) -> None:

@@ -5,7 +5,7 @@ It depends on the runs alone, not on the workers or the time: these are in a tab
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import NoneType
 from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
@@ -15,6 +15,7 @@ import msgspec
 from kantor_fleet.execution.experiment import Outcome
 from kantor_fleet.sweep.plan import RunKey, SweepPlan, Value, Variant, text_of
 from kantor_worldsim.observers.metrics.result import Result
+from kantor_worldsim.record.drafts import replace
 
 Row = dict[str, Any]
 """A value for each column, None where there is none."""
@@ -127,16 +128,6 @@ def write_parquet(path: Path, plan: SweepPlan, table: list[Row]) -> None:
         for name, kind in columns(plan).items()
     }
     replace(path, lambda draft: parquet.write_table(pa.table(arrays), draft))
-
-
-def replace(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file whole or not at all."""
-    draft = path.with_name(f".{path.name}.draft")
-    try:
-        write(draft)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def _kind(values: Iterable[Value]) -> type:

@@ -12,7 +12,7 @@ from kantor_protocol.scenario.schema import MAP_PLANNERS
 from kantor_worldsim.observers.checkers.checker import Checker
 from kantor_worldsim.observers.metrics.mapping import MapMetrics
 from kantor_worldsim.observers.pipeline import Pipeline
-from support.grounds import drawn
+from support.grounds import SMALL, drawn
 from support.strategies import examples
 from support.teams.exploring_team import ROOMS, Played, mission
 
@@ -20,13 +20,6 @@ CORRIDOR = drawn(
     "##############",
     "#............#",
     "##############",
-)
-SMALL = drawn(
-    "########",
-    "#..#...#",
-    "#..#.#.#",
-    "#....#.#",
-    "########",
 )
 
 

@@ -32,6 +32,12 @@ OF_CLAIMS, OF_REGISTERS = 0, 1
 
 
 @kernel
+def _is_ahead(reached: np.ndarray, origin: int, stamp: int, own: int, step: int) -> bool:
+    """Whether an origin has not reached a stamp; the sender may have, in this step. reached: (ids,)."""
+    return bool(stamp > (step if origin == own else reached[origin]))
+
+
+@kernel
 def _check_version_vector(
     written: np.ndarray,
     stamps: np.ndarray,
@@ -55,7 +61,7 @@ def _check_version_vector(
             return HELD
     for origin in range(covered if parts == 2 else 0):
         stamp, at = read_uint(version_vector, at)
-        if stamp > (step if origin == own else stamps[OF_CLAIMS, origin]):
+        if _is_ahead(stamps[OF_CLAIMS], origin, stamp, own, step):
             return STAMP
     return POSSIBLE
 
@@ -126,7 +132,7 @@ def _check_claims(stamps: np.ndarray, claimed: bytes, own: int, step: int) -> in
         stamp, at = read_uint(claimed, at)
         _sample, at = read_uint(claimed, at)
         _since_ns, at = read_uint(claimed, at)
-        if stamp > (step if origin == own else stamps[OF_CLAIMS, origin]):
+        if _is_ahead(stamps[OF_CLAIMS], origin, stamp, own, step):
             return STAMP
     return POSSIBLE
 
@@ -138,7 +144,7 @@ def _check_registers(
     at = 0
     for origin in range(covered if len(registers) else 0):
         stamp, at = read_uint(registers, at)
-        if stamp > (step if origin == own else stamps[OF_REGISTERS, origin]):
+        if _is_ahead(stamps[OF_REGISTERS], origin, stamp, own, step):
             return STAMP
     while at < len(registers):
         origin, at = read_uint(registers, at)
@@ -146,7 +152,7 @@ def _check_registers(
         numbers, at = read_uint(registers, at)
         for _ in range(numbers):
             _number, at = read_int(registers, at)
-        if stamp > (step if origin == own else stamps[OF_REGISTERS, origin]):
+        if _is_ahead(stamps[OF_REGISTERS], origin, stamp, own, step):
             return STAMP
     return POSSIBLE
 

@@ -23,9 +23,6 @@ from kantor_worldsim.record.records import Batch, Ending, Record, decode_record,
 RECORD_TOPIC = "/kantor/record"
 METRICS_TOPIC = "/kantor/metrics"
 _RESERVE_BYTES = 256 * 1024
-_RECORD_BYTES_MAX = 1 << 30
-_CHUNK_BYTES_MAX = 1 << 27
-"""Of an inflated chunk. The journal has none; other tools may have packed its messages into some, of a few MiB."""
 
 
 class Digest:

@@ -17,6 +17,8 @@ import lz4.frame
 import zstandard
 from mcap.writer import CompressionType, Writer
 
+from kantor_worldsim.record.drafts import replace
+
 PROFILE = "kantor"
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD_HEAD = struct.Struct("<BQ")
@@ -136,16 +138,14 @@ def write_index(path: Path) -> None:
 
     Raises OSError, and then the file is as it was.
     """
-    draft = path.with_name(f".{path.name}.draft")
-    try:
+
+    def write(draft: Path) -> None:
         with draft.open("wb") as file:
             _write_chunks(messages(path), file)
             file.flush()
             os.fsync(file.fileno())
-        draft.replace(path)
-    except OSError:
-        draft.unlink(missing_ok=True)
-        raise
+
+    replace(path, write)
 
 
 def _write_chunks(source: Iterator[McapMessage], file: IO[bytes]) -> None:

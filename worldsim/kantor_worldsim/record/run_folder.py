@@ -22,6 +22,7 @@ from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError
 from kantor_worldsim.record import behaviour
+from kantor_worldsim.record.drafts import replace
 from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.records import Ending, Opening, Record
 
@@ -253,9 +254,5 @@ def write_json(path: Path, tree: dict[str, Any]) -> None:
 
 def write_text(path: Path, text: str) -> None:
     """Replace a file atomically, so that no reader gets half of it; a full disk leaves the old one."""
-    draft = path.with_name(f".{path.name}.draft")
-    try:
-        draft.write_text(text, encoding="utf-8")
-        draft.replace(path)
-    except OSError:
-        draft.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        replace(path, lambda draft: draft.write_text(text, encoding="utf-8"))

@@ -18,14 +18,16 @@ _OUTSIDE = 0.2
 """The share of samples outside the domain from which on it is no longer the tail of a density."""
 
 
-def doubts_of_map(scenario: Scenario, ground: Ground, seen: npt.NDArray[np.bool_]) -> list[str]:
+def doubts_of_map(
+    scenario: Scenario, ground: Ground, starts_m: npt.NDArray[np.float64]
+) -> list[str]:
     """Reasons why a mission on a map may leave ground unseen, one line each.
 
-    seen: (rows, columns) cells that can ever be seen. Raises ScenarioError if no robot can explore anything.
+    starts_m: (n, 2) of the robots. Raises ScenarioError if no robot can explore anything.
     """
     for complaint in _complaints_of_map(scenario, ground.frame.resolution_m):
         raise ScenarioError(complaint)
-    return list(_doubts_of_map(scenario, ground, seen))
+    return list(_doubts_of_map(scenario, ground, starts_m))
 
 
 def _complaints_of_map(scenario: Scenario, resolution_m: float) -> Iterator[str]:
@@ -43,7 +45,7 @@ def _complaints_of_map(scenario: Scenario, resolution_m: float) -> Iterator[str]
 
 
 def _doubts_of_map(
-    scenario: Scenario, ground: Ground, seen: npt.NDArray[np.bool_]
+    scenario: Scenario, ground: Ground, starts_m: npt.NDArray[np.float64]
 ) -> Iterator[str]:
     sensor, resolution_m = scenario.sensor, ground.frame.resolution_m
     step_m = scenario.vehicle.speed_m_s * scenario.clock.period_s
@@ -69,20 +71,22 @@ def _doubts_of_map(
             f"vehicle.speed_m_s: until limit_s = {limit_s:g} s a robot drives "
             f"{scenario.vehicle.speed_m_s * limit_s:g} m, less than a cell of {resolution_m:g} m"
         )
-    if not _fits(ground, seen, scenario.vehicle.radius_m / resolution_m):
+    if not _fits(ground, starts_m, scenario.vehicle.radius_m / resolution_m):
         yield (
             f"vehicle.radius_m: a body {2.0 * scenario.vehicle.radius_m:g} m wide does not fit through every "
             "passage of the map; walls stop its centre alone, so that it passes nevertheless"
         )
 
 
-def _fits(ground: Ground, seen: npt.NDArray[np.bool_], radius_cells: float) -> bool:
+def _fits(ground: Ground, starts_m: npt.NDArray[np.float64], radius_cells: float) -> bool:
     """Whether a round body gets from anywhere where it has room to all other such places."""
     if radius_cells <= 0.5:
         return True  # the narrowest passage is a cell wide
     from scipy.ndimage import distance_transform_edt, label  # noqa: PLC0415  slow to import
 
-    free = seen & (ground.cells == FREE)
+    from kantor_worldsim.world.starts import observable  # noqa: PLC0415  likewise
+
+    free = observable(ground, starts_m) & (ground.cells == FREE)
     room_cells = distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] - 0.5
     return bool(label(room_cells >= radius_cells)[1] == 1)
 

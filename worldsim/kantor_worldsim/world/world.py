@@ -61,7 +61,7 @@ class WorldSetup(NamedTuple):
 
     @classmethod
     def _of_map(cls, scenario: Scenario, seed: int) -> "WorldSetup":
-        from kantor_worldsim.world.starts import observable, starts_on  # noqa: PLC0415  only where there is a map
+        from kantor_worldsim.world.starts import starts_on  # noqa: PLC0415  only where there is a map
 
         ground, warnings = ground_of(scenario)
         starts = scenario.starts
@@ -78,7 +78,7 @@ class WorldSetup(NamedTuple):
         over_map = Domain(min_m=(left_m, bottom_m), max_m=(right_m, top_m))
         targets_m = targets_of(msgspec.structs.replace(scenario, domain=over_map), seed)
         warnings += doubts_about_images(scenario)
-        warnings += doubts_of_map(scenario, ground, observable(ground, starts_m))
+        warnings += doubts_of_map(scenario, ground, starts_m)
         return cls(np.zeros((0, 2)), targets_m, starts_m, ground, tuple(warnings))
 
     def poses(self, scenario: Scenario) -> dict[ParticipantId, Pose]:
