@@ -96,12 +96,12 @@ until_s = 46
 kind = "pause"
 who = ["r2"]
 from_s = 8
-until_s = 18
+until_s = 44
 [[faults]]
 kind = "kill"
 who = ["r3"]
 from_s = 12
-until_s = 20
+until_s = 44
 """
 
 

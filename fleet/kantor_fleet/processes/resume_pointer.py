@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 
 from kantor_protocol.scenario.file_names import name_of, path_of
-from kantor_worldsim.record.drafts import replace
+from kantor_protocol.storage.drafts import replace
 
 _FILE = "worldsim.json"
 

@@ -18,7 +18,7 @@ from kantor_fleet.report.style import FAINT, INK, TEXT_PT, TITLE_PT, add_caption
 from kantor_fleet.sweep.plan import SweepPlan, Variant
 from kantor_fleet.sweep.summary import SummaryRow
 from kantor_fleet.sweep.table import SweepRun, measures
-from kantor_worldsim.record.drafts import replace
+from kantor_protocol.storage.drafts import replace
 
 SIZE_IN = (8.0, 5.0)
 DPI = 110

@@ -22,7 +22,7 @@ from kantor_fleet.sweep.journal import RunsJournal
 from kantor_fleet.sweep.plan import RunKey, SweepError, SweepPlan
 from kantor_fleet.sweep.table import SweepRun
 from kantor_protocol.scenario.dump import to_tree
-from kantor_worldsim.record.drafts import replace
+from kantor_protocol.storage.drafts import replace
 
 RUNS = "runs.jsonl"
 PLAN = "sweep.json"

@@ -14,8 +14,8 @@ import msgspec
 
 from kantor_fleet.execution.experiment import Outcome
 from kantor_fleet.sweep.plan import RunKey, SweepPlan, Value, Variant, text_of
+from kantor_protocol.storage.drafts import replace
 from kantor_worldsim.observers.metrics.result import Result
-from kantor_worldsim.record.drafts import replace
 
 Row = dict[str, Any]
 """A value for each column, None where there is none."""

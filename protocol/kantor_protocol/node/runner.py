@@ -17,12 +17,12 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from kantor_protocol import private_files
 from kantor_protocol.base.machine import Body, Inputs, Outputs, StateMachine
 from kantor_protocol.node import memory_trim
 from kantor_protocol.node.recovery import RecoverableNode
 from kantor_protocol.node.wal import WalFile
 from kantor_protocol.node.wall_clock import WallClock
+from kantor_protocol.storage import private_files
 from kantor_protocol.transport.client import ParticipantSession, participant_session
 from kantor_protocol.transport.credentials import Identity
 from kantor_protocol.wire.messages import (

@@ -23,9 +23,9 @@ from typing import NamedTuple
 
 import msgspec
 
-from kantor_protocol import private_files
 from kantor_protocol.base.machine import Body
 from kantor_protocol.node.recovery import WalContents
+from kantor_protocol.storage import private_files
 from kantor_protocol.wire.messages import INPUTS_BYTES_MAX, RefusedError, decode_inputs
 
 _MAGIC = b"kantor diary 1\n"

@@ -17,10 +17,10 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from kantor_protocol import private_files
 from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.files.reading import UnreadableError, read_text
 from kantor_protocol.files.toml import TomlError, parse_toml
+from kantor_protocol.storage import private_files
 
 HOST = WORLD_SIM
 OBSERVER = "observer"

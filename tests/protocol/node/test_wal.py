@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_protocol import private_files
 from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Outputs, Pose
 from kantor_protocol.node.recovery import RecoverableNode, WalContents
 from kantor_protocol.node.wal import _MAGIC, WalFile, _frame, tear
+from kantor_protocol.storage import private_files
 from kantor_protocol.wire.messages import INPUTS_BYTES_MAX, encode
 from support.strategies import INPUTS, examples
 

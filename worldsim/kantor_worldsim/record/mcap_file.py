@@ -17,7 +17,7 @@ import lz4.frame
 import zstandard
 from mcap.writer import CompressionType, Writer
 
-from kantor_worldsim.record.drafts import replace
+from kantor_protocol.storage.drafts import replace
 
 PROFILE = "kantor"
 _MAGIC = b"\x89MCAP0\r\n"

@@ -20,9 +20,9 @@ import msgspec
 from kantor_protocol.files.reading import read_text
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.storage.drafts import replace
 from kantor_protocol.wire.messages import RefusedError
 from kantor_worldsim.record import behaviour
-from kantor_worldsim.record.drafts import replace
 from kantor_worldsim.record.journal import read
 from kantor_worldsim.record.records import Ending, Opening, Record
 

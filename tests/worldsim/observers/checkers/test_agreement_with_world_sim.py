@@ -159,9 +159,9 @@ def test_clocks_of_drawn_missions_are_those_of_the_schedule(first: int) -> None:
         faults = ProcessFaults(scenario)
         for now_ns, name in itertools.product(moments_ns(scenario), scenario.roster):
             skew_ns = faults.skew_ns(name, now_ns)
-            least_ns, most_ns = bounded.skews_ns(name, now_ns)
+            least_ns, most_ns = bounded.skews_ns(name, now_ns, now_ns)
 
-            assert exact.skews_ns(name, now_ns) == (skew_ns, skew_ns)
+            assert exact.skews_ns(name, now_ns, now_ns) == (skew_ns, skew_ns)
             assert min(least_ns, -now_ns) <= skew_ns <= most_ns
 
 

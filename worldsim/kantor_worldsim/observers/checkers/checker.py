@@ -230,10 +230,11 @@ class Checker:
 
     def _check_clocks(self, batch: Batch) -> None:
         for step_record in batch.step_records:
-            least_ns, most_ns = self._clocks.skews_ns(step_record.name, step_record.now_ns)
+            name, now_ns = step_record.name, step_record.now_ns
+            least_ns, most_ns = self._clocks.skews_ns(name, now_ns, batch.now_ns)
             if not least_ns <= step_record.skew_ns <= most_ns:
                 what = f"its clock is {step_record.skew_ns} ns ahead, by its faults {most_ns}"
-                self._report("clock", step_record.name, what)
+                self._report("clock", name, what)
 
     def _follow_event(self, process_event: ProcessEvent) -> None:
         """Follow an event of a process."""

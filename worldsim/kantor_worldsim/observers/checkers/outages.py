@@ -79,8 +79,12 @@ class WrongClocks:
         """Whether any clock is ever wrong."""
         return bool(self._faults)
 
-    def skews_ns(self, name: ParticipantId, now_ns: int) -> tuple[int, int]:
-        """The least and the most that a clock may be ahead."""
+    def skews_ns(self, name: ParticipantId, now_ns: int, ruled_ns: int) -> tuple[int, int]:
+        """The least and the most that a clock may be ahead.
+
+        now_ns: time of the step, by the participant. ruled_ns: when it was ruled on, by world-sim, whose clock says
+        how wrong a clock of a realtime run is to be: the participant's own is behind by the way between them.
+        """
         faults = self._faults.get(name)
         if faults is None:
             return 0, 0
@@ -90,8 +94,8 @@ class WrongClocks:
             return skew_ns, skew_ns
         least_ns = most_ns = 0
         for fault in faults:
-            if fault.from_ns <= now_ns:
-                last_ns = now_ns if fault.until_ns is None else min(now_ns, fault.until_ns)
+            if fault.from_ns <= ruled_ns:
+                last_ns = ruled_ns if fault.until_ns is None else min(ruled_ns, fault.until_ns)
                 reached_ns = (0, _skew_ns(fault, fault.from_ns), _skew_ns(fault, last_ns))
                 least_ns, most_ns = least_ns + min(reached_ns), most_ns + max(reached_ns)
         return least_ns, most_ns

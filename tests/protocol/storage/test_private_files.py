@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from kantor_protocol import private_files
+from kantor_protocol.storage import private_files
 from kantor_protocol.transport import credentials
 
 
