@@ -6,7 +6,7 @@ Units are in the names. Positions are in the world frame: metres, x right, y up.
 import math
 from typing import Annotated, Literal
 
-from msgspec import Meta
+from msgspec import UNSET, Meta, UnsetType
 
 from kantor_protocol.base.machine import SUPERVISOR, ParticipantId
 from kantor_protocol.scenario.faults.schedule import FAULTS_MAX, AnyFault
@@ -269,6 +269,9 @@ class Scenario(ScenarioTable, frozen=True, kw_only=True):
     """min: elementwise minimum, as in the paper. ledger: the spending of all participants, each counted once."""
     claims: bool = True
     """Robots claim the sample they head for, if their planner heads for samples."""
+    trust: Literal["open", "signed"] | UnsetType = UNSET
+    """open: who forwards another's log, claim or register is believed. signed: only what its origin has signed counts.
+    By default signed over TLS, and open otherwise."""
     limit_s: Annotated[float, Meta(gt=0.0, le=1e9)] | None = None
     """Simulated time after which the mission is cut; by default 1.5 times the energy's."""
     linger_s: Seconds = 0.0
@@ -312,6 +315,11 @@ class Scenario(ScenarioTable, frozen=True, kw_only=True):
     def mapping(self) -> bool:
         """Whether the robots explore an unknown map, and not a density."""
         return self.map is not None
+
+    @property
+    def signed(self) -> bool:
+        """Whether participants sign what they say of themselves, and believe of others what these have signed."""
+        return self.trust == "signed"
 
     @property
     def claiming(self) -> bool:

@@ -25,6 +25,7 @@ from kantor_protocol.base.machine import (
     Pose,
 )
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Attestation
 
 VERSION = 1
 BODY_BYTES_MAX = 262_144
@@ -99,6 +100,9 @@ class GossipMessage(_Message, frozen=True, array_like=True, tag=1, gc=False):
     stamp, how many numbers, numbers. LEB128, the numbers zigzag-folded. Empty in a mission whose planner has none."""
     incarnation: int = 0
     """The sender's incarnation."""
+    attestations: tuple[Attestation, ...] = ()
+    """Of the state of origins, signed by them, with `trust = "signed"`; see `replication/attested.py`. The sender's own
+    one comes last, and its signature ends the message."""
 
 
 class Mission(_Message, frozen=True, array_like=True, tag=2):
@@ -120,6 +124,8 @@ class Mission(_Message, frozen=True, array_like=True, tag=2):
     """The name of this run of the mission, so that the write-ahead log of another run is not used."""
     body: Body
     """The body that the participant takes over."""
+    keys: dict[ParticipantId, bytes] = {}
+    """With `trust = "signed"`: the public key of every participant, see `signatures.py`."""
 
 
 class Refusal(_Message, frozen=True, array_like=True, tag=3):
@@ -259,7 +265,7 @@ _PROGRESS = msgspec.msgpack.Decoder(Progress)
 encode = _ENCODER.encode
 _decode_gossip = msgspec.msgpack.Decoder(GossipMessage).decode
 _decode_inputs = msgspec.msgpack.Decoder(Inputs).decode
-_NO_INCARNATION, _NO_REGISTERS = encode(0), encode(b"") + encode(0)
+_NO_ATTESTATIONS, _NO_INCARNATION, _NO_REGISTERS = encode(()), encode(0), encode(b"") + encode(0)
 
 
 def envelope_bytes(envelope: Envelope) -> int:
@@ -270,8 +276,11 @@ def envelope_bytes(envelope: Envelope) -> int:
 def encode_gossip(message: GossipMessage) -> bytes:
     """The body of an envelope. Fields at the end that have their default are left out."""
     body = encode(message)
-    if message.incarnation:
+    if message.attestations:
         return body
+    if message.incarnation:
+        return b"\x9a" + body[1 : -len(_NO_ATTESTATIONS)]
+    body = body[: -len(_NO_ATTESTATIONS)]
     if message.registers:
         return b"\x99" + body[1 : -len(_NO_INCARNATION)]
     return b"\x98" + body[1 : -len(_NO_REGISTERS)]

@@ -184,12 +184,17 @@ def test_inputs_come_back_as_they_were(inputs: Inputs) -> None:
 def test_independent_decoder_reads_gossip_messages(news: GossipMessage) -> None:
     """A record is a msgpack array: tag, version, fields in order. `msgpack` knows nothing more."""
     fields = [news.step, news.x_m, news.y_m, news.version_vector, news.logs, news.claims]
-    further = [news.registers, news.incarnation]
+    attestations = [
+        msgspec.to_builtins(attestation, builtin_types=(bytes,))
+        for attestation in news.attestations
+    ]
+    further = [news.registers, news.incarnation, attestations]
+    complete = [*fields, *further]
     while further and not further[-1]:
         further.pop()
 
     assert msgpack.unpackb(encode_gossip(news)) == [1, VERSION, *fields, *further]
-    assert msgpack.unpackb(encode(news)) == [1, VERSION, *fields, news.registers, news.incarnation]
+    assert msgpack.unpackb(encode(news)) == [1, VERSION, *complete]
 
 
 @examples(100)
@@ -297,7 +302,7 @@ def test_a_mission_without_a_body_is_refused() -> None:
 
     assert decode_to_participant(msgpack.packb(plain)) == told
     with pytest.raises(RefusedError):
-        decode_to_participant(msgpack.packb(plain[:-1]))
+        decode_to_participant(msgpack.packb(plain[:-2]))
 
 
 @examples(60)

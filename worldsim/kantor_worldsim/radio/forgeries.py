@@ -32,7 +32,7 @@ _OVERSIZED = bytes(BODY_BYTES_MAX + 1)
 _NOISE_BYTES_MAX = 96
 _NESTED = 10_000
 _FIELDS = 11
-"""One more than a gossip message has: further fields are skipped."""
+"""Of a gossip message, with its tag."""
 
 # LEB128.
 _NOT_ENDING = b"\x80"
@@ -144,8 +144,8 @@ def _register_cut_in_a_number(draws: ForgeryDraws, _body: bytes, message: Gossip
 
 
 def _nested(_draws: ForgeryDraws, _body: bytes, message: GossipMessage) -> bytes:
-    """Nested arrays without an end after the known fields."""
-    fields = encode(replace(message, incarnation=0))[1:]
+    """Nested arrays without an end, in place of attestations."""
+    fields = encode(replace(message, incarnation=0, attestations=()))[1 : -len(encode(()))]
     return bytes([0x90 + _FIELDS]) + fields + b"\x91" * _NESTED
 
 
