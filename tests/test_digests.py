@@ -105,14 +105,14 @@ MISSIONS = {
         9,
         (),
         (*SMALL, *SPECTRAL),
-        "59eae85a1467028e2bfb68e8738f11ce0679e198fc9dc86fa92d251ca8784b4a",
+        "d4bc77656998f4a953767b51a0056e208efe5d23476da41d077e68d7e6a54bfa",
     ),
     "spectral-supervisor": (
         "fleet",
         9,
         (),
         (*SMALL, *SPECTRAL, *CENTRALIZED),
-        "2a37cd28ffa1f101cdf58ca9ca09828f486b7fbfcb90198b1de7838d183d57af",
+        "e8a825e73ab3ae4c26e1b231978b9327367785c7fb026e62b5c6738e3617c331",
     ),
     "links": (
         "fleet",

@@ -24,6 +24,8 @@ from kantor_protocol.scenario.schema import Domain, Gaussian, Scenario
 
 _CELLS = 400
 """Midpoints along each axis by which a mixture is integrated over the domain."""
+_PRECISION = 2.0**-40
+"""Of a mean over a mixture. What is finer depends on how many numbers a processor adds at once."""
 _VANISHING = 1e-13
 """A gradient below this share of the sum of its terms is rounding."""
 
@@ -158,7 +160,9 @@ def mean_over_mixture(density: tuple[Gaussian, ...], domain: Domain, modes: int)
             factors.append(cosines @ curve)
         moments += component.weight * np.outer(*factors)
     mass = moments[0, 0]
-    return (moments / mass).ravel() if mass > 0.0 else None
+    if not mass > 0.0:
+        return None
+    return np.asarray(np.rint(moments / mass / _PRECISION) * _PRECISION).ravel()
 
 
 class Spectral:

@@ -34,6 +34,10 @@ CHANGES: dict[int, Change] = {
         "robots on a map give targets up by distance instead of steps, log bumps, and with noisy ranges look longer",
         lambda scenario: scenario.mapping,
     ),
+    3: Change(
+        "the mean of a mixture over a mode is rounded, so that all processors agree",
+        lambda scenario: scenario.planner.name == "spectral",
+    ),
 }
 """By the version that came with it."""
 
