@@ -73,30 +73,37 @@ def main() -> None:
 
 def _code(arguments: list[str]) -> int:
     """Run a command line; the exit code. Raises SystemExit."""
-    from kantor_fleet.execution.fork_server import StartError  # noqa: PLC0415
-    from kantor_protocol.scenario.errors import ScenarioError  # noqa: PLC0415
-    from kantor_protocol.transport.credentials import CredentialsError  # noqa: PLC0415
-    from kantor_protocol.transport.session import BusError  # noqa: PLC0415
-
     if isinstance(sys.stdout, io.TextIOWrapper):
         with contextlib.suppress(OSError):  # another stream may have taken its place
             sys.stdout.reconfigure(errors="surrogateescape")  # names of files may be any bytes
     try:
         return _run(arguments)
-    except (ScenarioError, CredentialsError) as error:
-        fail(Exit.USAGE, str(error))
-    except BusError as error:
-        fail(Exit.UNREACHABLE, str(error))
-    except StartError as error:
-        fail(Exit.PROCESS_FAILED, str(error))
-    except OSError as error:
-        fail(Exit.USAGE, f"{error.filename or 'file'}: {error.strerror or error}")
     except Interrupted as interrupted:
         return interrupted.code
     except KeyboardInterrupt:
         return Exit.INTERRUPTED
     except Exception as error:  # noqa: BLE001  whatever it is, it is one line
-        fail(Exit.PROCESS_FAILED, _crash(error))
+        fail(*_failure(error))
+
+
+def _failure(error: Exception) -> tuple[Exit, str]:
+    """The exit code and the line for an exception. Its kinds are imported here: a short command needs none of them."""
+    from kantor_fleet.execution.fork_server import StartError  # noqa: PLC0415
+    from kantor_protocol.scenario.errors import ScenarioError  # noqa: PLC0415
+    from kantor_protocol.transport.credentials import CredentialsError  # noqa: PLC0415
+    from kantor_protocol.transport.session import BusError  # noqa: PLC0415
+
+    match error:
+        case ScenarioError() | CredentialsError():
+            return Exit.USAGE, str(error)
+        case BusError():
+            return Exit.UNREACHABLE, str(error)
+        case StartError():
+            return Exit.PROCESS_FAILED, str(error)
+        case OSError():
+            return Exit.USAGE, f"{error.filename or 'file'}: {error.strerror or error}"
+        case _:
+            return Exit.PROCESS_FAILED, _crash(error)
 
 
 def _crash(error: Exception) -> str:

@@ -68,8 +68,10 @@ class CertificateKey:
     def __init__(self, pem: bytes) -> None:
         """pem: the private key, on P-256. Raises ValueError."""
         key = load_pem_private_key(pem, None)
-        if not isinstance(key, EllipticCurvePrivateKey) or not isinstance(key.curve, SECP256R1):
+        on_p256 = isinstance(key, EllipticCurvePrivateKey) and isinstance(key.curve, SECP256R1)
+        if not on_p256:
             raise ValueError("a key that is not on P-256")
+        assert isinstance(key, EllipticCurvePrivateKey)
         self._key = key
         self.public = public_key_of(key.public_key())
 
