@@ -80,7 +80,7 @@ def test_a_command_of_a_document_runs(files: "Kantor", words: Words) -> None:
 
 def _short(words: Words) -> Words:
     if "--processes" in words:
-        return ("--seeds", "1", "--minutes", "0.01")
+        return ("--seeds", "1", "--minutes", "0.01", "--storm", "10")
     with_faults = "--chaos" in words or "storm" in words  # they must have their time
     return () if with_faults else SHORT.get(words[0], ())
 

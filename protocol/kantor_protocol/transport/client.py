@@ -163,9 +163,10 @@ def _opened(connect: str, identity: Identity, give_up: float) -> zenoh.Session:
         crowded = isinstance(identity, Certificate) or is_crowded(connect)
         # Room may have become free just after an attempt failed for want of it: one refusal proves nothing.
         refusals = 0 if crowded else refusals + 1
+        # Since the last handshake it may have expired, or the router may have been started with another member list.
+        await_endpoint(connect, max(0.0, give_up - time.monotonic()), identity)
         if (crowded or refusals < _REFUSALS) and not late:
             continue
-        await_endpoint(connect, 0.0, identity)  # which may have changed since
         if crowded:
             raise BusError(
                 f"{connect}: has no room for {identity.user}: too many others are connecting; try again later"
