@@ -4,9 +4,9 @@ from typing import cast
 
 import pytest
 
-from kantor_protocol.transport.events import Event, Joined
+from kantor_protocol.transport.events import Event, Joined, Received
 from kantor_protocol.transport.router import HubRouter
-from kantor_protocol.wire.messages import Mission, decode_to_participant
+from kantor_protocol.wire.messages import VERSION, Mission, Ready, decode_to_participant, encode
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.config import MissionConfig
 from kantor_worldsim.exchange.lobby import RETRY_S, Lobby
@@ -28,6 +28,10 @@ class Bus:
         """The simulated time in seconds."""
         return self.now_s
 
+    def monotonic_ns(self) -> int:
+        """The same in nanoseconds."""
+        return round(self.now_s * 1e9)
+
     def next(self, timeout_s: float) -> Event | None:
         """The next event; without one, time passes."""
         if self.events:
@@ -41,21 +45,26 @@ class Bus:
         self.sent.append((name, payload))
 
 
-def test_a_silent_participant_is_sent_its_mission_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Behind a site's router a process may be visible before it can be reached: the mission is sent once in RETRY_S."""
-    bus, scenario = Bus(), mission()
-    monkeypatch.setattr("kantor_worldsim.exchange.lobby.time", bus)
+def lobby_on(bus: Bus) -> Lobby:
+    """The lobby of a mission in real time."""
+    scenario = mission()
     setup = WorldSetup.of(scenario, 0)
-    simulation = Simulation(scenario, 0, setup, [])
-    lobby = Lobby(
+    return Lobby(
         cast("HubRouter", bus),
         MissionConfig(scenario, 0, setup, "wall"),
         "run",
-        simulation,
+        Simulation(scenario, 0, setup, []),
         ProgressReporter(DensityMetrics(), scenario, lambda _progress: None),
         lambda: False,
         lambda _line: None,
     )
+
+
+def test_a_silent_participant_is_sent_its_mission_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind a site's router a process may be visible before it can be reached: the mission is sent once in RETRY_S."""
+    bus = Bus()
+    monkeypatch.setattr("kantor_worldsim.exchange.lobby.time", bus)
+    lobby = lobby_on(bus)
     bus.events.append(Joined("r1", "nonce"))
     while bus.now_s < 3.5 * RETRY_S:
         lobby.next(0.1 * RETRY_S)
@@ -64,3 +73,19 @@ def test_a_silent_participant_is_sent_its_mission_again(monkeypatch: pytest.Monk
     assert {name for name, _ in bus.sent} == {"r1"}
     assert len(received) == 4
     assert all(isinstance(message, Mission) and message.nonce == "nonce" for message in received)
+
+
+def test_clocks_run_on_while_world_sim_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A resumed mission goes on at the time that the robots' clocks show when all are there, not when each came."""
+    bus = Bus()
+    monkeypatch.setattr("kantor_worldsim.exchange.lobby.time", bus)
+    lobby = lobby_on(bus)
+    assert lobby.running_ns(4.0) == 0
+    for name, shows_s in (("r1", 5), ("r2", 1000)):
+        ready = Ready(VERSION, name, 0, 0, shows_s * 10**9)
+        bus.events += [Joined(name, name), Received(name, encode(ready))]
+        lobby.next(1.0)
+        lobby.next(1.0)
+    bus.now_s += 2.5
+
+    assert lobby.running_ns(4.0) == (5 + 4 * 2.5) * 10**9

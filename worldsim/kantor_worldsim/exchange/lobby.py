@@ -87,6 +87,8 @@ class Lobby:
         """Nonce of the process that plays each ready participant: on the bus, and with its mission."""
         self._last_ready: dict[ParticipantId, Ready] = {}
         """The last Ready message of each participant."""
+        self._ready_at_ns: dict[ParticipantId, int] = {}
+        """When it came, by the monotonic clock."""
         self._arrivals: dict[ParticipantId, int] = dict.fromkeys(config.scenario.roster, 0)
         """Number of times that each participant became ready."""
         self._excused: set[ParticipantId] = set()
@@ -230,13 +232,17 @@ class Lobby:
         """The last Ready message of a participant that has been ready."""
         return self._last_ready[name]
 
-    @property
-    def ready_ns(self) -> int:
-        """The simulated time by the clocks of those that became ready: their median, which no single one can push.
+    def running_ns(self, speed: float) -> int:
+        """The simulated time now by the clocks of those that became ready: their median, which no single one can push.
 
-        0 if no clock runs.
+        0 if no clock runs. speed: simulated seconds in a real one.
         """
-        running_ns = sorted(ready.now_ns for ready in self._last_ready.values() if ready.now_ns > 0)
+        now_ns, ready = time.monotonic_ns(), self._last_ready.items()
+        running_ns = sorted(
+            message.now_ns + round((now_ns - self._ready_at_ns[name]) * speed)
+            for name, message in ready
+            if message.now_ns > 0
+        )
         return running_ns[(len(running_ns) - 1) // 2] if running_ns else 0
 
     def excuse(self, name: ParticipantId) -> None:
@@ -405,7 +411,7 @@ class Lobby:
         if reason := _objection(message, self._simulation.body(name)):
             self._refuse(Joined(name, message.nonce), reason)
             return
-        self._last_ready[name] = message
+        self._last_ready[name], self._ready_at_ns[name] = message, time.monotonic_ns()
         self._arrive(name, message.nonce)
 
     def _arrive(self, name: ParticipantId, nonce: str) -> None:

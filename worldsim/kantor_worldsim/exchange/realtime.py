@@ -67,7 +67,7 @@ class RealtimeExchange:
         for name, outbox in self._outboxes.items():
             outbox.handed += simulation.inputs(name, DUE_MAX_NS).inbox[-2 * INBOX_MAX :]
         stopped_ns, restart_ns = simulation.now_ns, self._injector.world_starts_ns
-        start_ns = max(stopped_ns, self._lobby.ready_ns, restart_ns or 0)
+        start_ns = max(stopped_ns, self._lobby.running_ns(self._speed), restart_ns or 0)
         if restart_ns is None:
             simulation.note(ProcessEvent(stopped_ns, WORLD_SIM, ProcessEventKind.LEAVE))
             simulation.note(ProcessEvent(start_ns, WORLD_SIM, ProcessEventKind.JOIN))
