@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 KANTOR := $(BIN)/kantor
 PYTEST := $(BIN)/python -m pytest --dist loadgroup
 
-.PHONY: help demo test test-fast check lint types contracts format paper bench campaign mutants fuzz clean
+.PHONY: help demo test test-fast check lint types contracts format paper bench bench-compare campaign mutants fuzz clean
 
 help:
 	@echo "make demo       set up, then five robot processes explore on the bus and leave a picture"
@@ -16,6 +16,7 @@ help:
 	@echo "make format     format the code and fix what the linter can"
 	@echo "make paper      the first paper's figures with a verdict beside each number (kantor reproduce all)"
 	@echo "make bench      speed, as ratios in one run"
+	@echo "make bench-compare REV=...  the same commands in two revisions in turn, and their ratios"
 	@echo "make campaign   2000 drawn missions full of faults, with every checker"
 	@echo "make mutants    planted bugs, and which checker catches each: docs/mutants.md"
 	@echo "make fuzz       a million inputs for every decoder"
@@ -51,6 +52,9 @@ paper: $(VENV)/.developing $(VENV)/.kernels
 
 bench: $(VENV)/.installed $(VENV)/.kernels
 	$(BIN)/python benchmarks/run.py
+
+bench-compare: $(VENV)/.installed
+	$(BIN)/python benchmarks/compare.py $(REV)
 
 campaign: $(VENV)/.installed $(VENV)/.kernels
 	$(KANTOR) campaign
