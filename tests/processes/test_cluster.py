@@ -121,6 +121,51 @@ def test_a_worker_dies_and_the_table_is_that_of_one_machine(
     assert str(cluster.workers[1].pid) in (folder / "timings.csv").read_text()
 
 
+def tables_of(out: str) -> list[str]:
+    """What a campaign tells in the end, but for times and where it ran."""
+    lines = out[out.index(" missions, ") :].splitlines()[1:]
+    return [line for line in lines if not line.startswith("  speed")]
+
+
+def test_a_campaign_on_a_cluster_that_loses_a_worker_tells_what_one_process_tells(
+    kantor: "Kantor", cluster: Cluster
+) -> None:
+    """The same missions, totals and tables, whatever the order in which missions end."""
+    seeds = ("campaign", "--seeds", 10)
+    alone = kantor(*seeds, "--jobs", 1, "--out", "alone")
+    process = kantor.start(*seeds, "--cluster", cluster.address, "--out", "cluster")
+    await_run(process)
+    cluster.workers[0].send_signal(signal.SIGKILL)
+    out, err = process.communicate(timeout=EVENT_LIMIT_S)
+
+    assert (alone.code, process.returncode, err) == (0, 0, "")
+    assert tables_of(out) == tables_of(alone.out)
+    assert len(tables_of(out)) > 20
+
+
+def test_a_figure_on_a_cluster_is_that_of_one_process(kantor: "Kantor", cluster: Cluster) -> None:
+    """The same numbers and verdicts to the byte."""
+    command = ("reproduce", "fig8", "--runs", 2)
+    alone = kantor(*command, "--jobs", 1, "--out", "alone")
+    shared = kantor(*command, "--cluster", cluster.address, "--out", "cluster")
+
+    assert alone.code == shared.code
+    for name in ("fig8.csv", "verdicts.csv"):
+        one, other = (kantor.folder / place / name for place in ("alone", "cluster"))
+        assert one.read_bytes() == other.read_bytes()
+
+
+def test_campaigns_and_figures_without_a_cluster_end_with_exit_code_4(kantor: "Kantor") -> None:
+    """One line, and what is done is kept."""
+    nowhere = ("--cluster", "127.0.0.1:9")
+    for command in (("campaign", "--seeds", 2), ("reproduce", "fig4", "--runs", 2)):
+        finished = kantor(*command, *nowhere)
+
+        assert finished.code == 4
+        assert "127.0.0.1:9: no Dask scheduler there (" in finished.err
+        assert finished.err.count("\n") == 1
+
+
 def test_a_case_that_kills_workers_has_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

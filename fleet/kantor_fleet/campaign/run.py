@@ -4,6 +4,7 @@ import functools
 import hashlib
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
@@ -15,7 +16,7 @@ from kantor_fleet.campaign.mission import Follower, Trial
 from kantor_fleet.campaign.shrink import shrink
 from kantor_fleet.campaign.totals import ENOUGH, Totals
 from kantor_fleet.execution.experiment import Case, Outcome, code
-from kantor_fleet.execution.pools import Pool
+from kantor_fleet.execution.pools import ClusterError, Pool
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.report.progress import printable
@@ -57,11 +58,14 @@ def campaign(config: CampaignConfig, start: Callable[[Iterable[Case]], Pool]) ->
     start: the pool, whose work is `attempt`. Raises SweepError, OSError.
     """
     started_s = time.monotonic()
-    totals = Totals()
+    totals, unreachable = Totals(), None
     with Interrupts() as interrupts, RunsJournal(config.folder / RUNS, Trial) as journal:
         broken = _known(config, journal, totals)
         if broken is None:
-            broken = _run(config, journal, totals, start, interrupts)
+            try:
+                broken = _run(config, journal, totals, start, interrupts)
+            except ClusterError as error:
+                unreachable = error
         for line in totals.lines(time.monotonic() - started_s):
             print(line)
         if totals.missions:
@@ -70,6 +74,10 @@ def campaign(config: CampaignConfig, start: Callable[[Iterable[Case]], Pool]) ->
     if broken is not None:
         _report(config.folder, broken)
         return Exit.NOT_MET
+    if unreachable is not None:
+        print(f"kantor: {totals.missions} missions are done; the same command goes on")
+        print(f"kantor: {unreachable}", file=sys.stderr)
+        return Exit.UNREACHABLE
     return interrupts.code or _verdict(config, totals)
 
 

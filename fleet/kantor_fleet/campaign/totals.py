@@ -22,8 +22,9 @@ class Totals:
         self.violations = 0
         self.steps = 0
         self.cpu_s = 0.0
-        self.simulated_s = 0.0
-        self.robot_hours = 0.0
+        self.simulated_ns = 0
+        self.robots_ns = 0
+        """Simulated time of all robots together."""
         self.twice = 0
         self.cuts = 0
         self.joined = 0
@@ -41,8 +42,9 @@ class Totals:
         self.violations += trial.violation is not None
         self.steps += trial.steps
         self.cpu_s += trial.cpu_s
-        self.simulated_s += trial.simulated_s
-        self.robot_hours += trial.simulated_s * trial.robots / 3600.0
+        simulated_ns = round(trial.simulated_s * 1e9)
+        self.simulated_ns += simulated_ns
+        self.robots_ns += simulated_ns * trial.robots
         self.twice += trial.twice
         self.cuts += trial.cut
         self.joined += trial.joined
@@ -71,7 +73,7 @@ class Totals:
         yield f"  sorts      {_listed(self.sorts, tuple(SORTS))}"
         yield f"  planners   {_listed(self.planners)}  (* with a supervisor)"
         yield (
-            f"  simulated  {self.robot_hours:.1f} robot-hours, {self.steps} robot-steps; "
+            f"  simulated  {self.robots_ns / 3600e9:.1f} robot-hours, {self.steps} robot-steps; "
             f"{self.twice} missions executed twice, {self.cuts} journals cut, "
             f"{self.joined} records merged in another order"
         )
@@ -82,7 +84,7 @@ class Totals:
         yield (
             f"  speed      {self.steps / cpu_s:.0f} robot-steps per CPU second with every check on "
             f"({cpu_s:.0f} CPU s of all workers, {wall_s:.0f} s here); "
-            f"simulated : CPU time {self.simulated_s / cpu_s:.0f} : 1"
+            f"simulated : CPU time {self.simulated_ns * 1e-9 / cpu_s:.0f} : 1"
         )
 
     def tables(self) -> Iterator[Table]:
@@ -100,5 +102,6 @@ class Totals:
 
 
 def _listed(counts: Counter[str], order: tuple[str, ...] = ()) -> str:
-    names = [name for name in order if counts[name]] or [name for name, _ in counts.most_common()]
+    by_count = sorted(counts, key=lambda name: (-counts[name], name))  # in whatever order they came
+    names = [name for name in order if counts[name]] or by_count
     return ", ".join(f"{name or 'crashed'} {counts[name]}" for name in names)

@@ -10,6 +10,7 @@ def campaign(
     *,
     seeds: str | None = None,
     jobs: int | None = None,
+    cluster: str | None = None,
     minutes: float | None = None,
     out: Path = Path("campaign"),
     replay: int | None = None,
@@ -32,7 +33,9 @@ def campaign(
     Args:
         seeds: Number of seeds, from 0 on; or 500:1000 (without 1000). By default 2000; with --processes 18, or as
             many as there is time for.
-        jobs: Number of processes, by default one for each core; not with --processes.
+        jobs: Number of processes, by default one for each core; with --cluster slurm the number of Slurm jobs; not
+            with --processes.
+        cluster: Run on the Dask scheduler at this address, or in jobs of `slurm`; not with --processes.
         minutes: Real time after which no further mission begins.
         out: Folder of campaign.jsonl and of violations.
         replay: Run the mission of this seed alone, and leave its scenario and its record.
@@ -47,6 +50,11 @@ def campaign(
         check_seed(replay)
     if minutes is not None and not minutes > 0.0:
         fail(Exit.USAGE, f"--minutes {minutes:g}: give a time above 0")
+    if processes and cluster is not None:
+        fail(
+            Exit.USAGE,
+            f"--cluster {cluster}: not with --processes, which need this machine; drop one of the two",
+        )
     if processes:
         from kantor_fleet.campaign import processes as on_processes  # noqa: PLC0415
 
@@ -70,4 +78,4 @@ def campaign(
     if replay is not None:
         return replay_mission(replay, out)
     config = CampaignConfig(numbered(seeds or "2000"), out, minutes)
-    return run_campaign(config, pool(jobs, work=attempt))
+    return run_campaign(config, pool(jobs, cluster, attempt))

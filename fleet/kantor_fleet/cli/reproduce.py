@@ -31,6 +31,7 @@ def reproduce(
     *,
     runs: int | None = None,
     jobs: int | None = None,
+    cluster: str | None = None,
     out: Path = Path("reproduced"),
 ) -> int:
     """Run a paper's experiments, draw its figures, and compare the results with the published numbers.
@@ -46,7 +47,8 @@ def reproduce(
         runs: Runs for each setting; by default as many as in the paper (fig6: 50, fig9: 10, kme-*: 15),
             burgard-fig8: 20. kme-all: how many of the configurations, evenly spread over maps, starts and
             teams.
-        jobs: Processes; by default one for each core.
+        jobs: Processes; by default one for each core; with --cluster slurm the number of Slurm jobs.
+        cluster: Run on the Dask scheduler at this address, or in jobs of `slurm`.
         out: Folder of the figures.
     """
     from kantor_fleet.execution.pools import pool  # noqa: PLC0415
@@ -56,4 +58,5 @@ def reproduce(
 
     if runs is not None and runs < 2:
         fail(Exit.USAGE, f"--runs {runs}: give at least 2, an interval needs them")
-    return reproduce_figures(papers.figures(figure), runs, pool(jobs, work=run_measured), out)
+    start = pool(jobs, cluster, run_measured)
+    return reproduce_figures(papers.figures(figure), runs, start, out)

@@ -40,6 +40,8 @@ SLURM = "slurm"
 """The address of a Dask cluster of Slurm jobs that is started for this command."""
 _POLL_S = 0.1
 _CONNECT_S = 10.0
+_AHEAD_MIN = 8
+"""Workers may yet come."""
 
 
 class ClusterError(Exception):
@@ -128,27 +130,43 @@ def cluster(
 ) -> Pool:
     """Run cases on the Dask cluster whose scheduler has this address, or in `jobs` Slurm jobs.
 
-    When a worker dies Dask runs its cases elsewhere; a case that kills several has failed. Raises
-    ClusterError if there is no cluster, or no longer.
+    When a worker dies Dask runs its cases elsewhere; a case that kills several has failed. Cases are asked for as
+    workers need them. Raises ClusterError if there is no cluster, or no longer.
     """
     with _client(address, jobs) as client:
         arrived: SimpleQueue[Future] = SimpleQueue()
-        here = code()
-        pending = {
-            client.submit(_run_remotely, work, case, here, pure=False): case for case in cases
-        }
-        for future in pending:
-            future.add_done_callback(arrived.put)
+        pending: dict[Future, Case] = {}
+        waiting, here = iter(cases), code()
+        ahead = _ahead(client, address)
         try:
-            while pending:
+            while True:
+                for case in islice(waiting, max(0, ahead - len(pending))):
+                    future = client.submit(_run_remotely, work, case, here, pure=False)
+                    pending[future] = case
+                    future.add_done_callback(arrived.put)
+                if not pending:
+                    return
                 try:
                     future = arrived.get(timeout=_POLL_S)
                 except Empty:
+                    ahead = _ahead(client, address)
                     yield None
                 else:
                     yield pending.pop(future), _collected(future, address)
         finally:
             client.cancel(list(pending))
+
+
+def _ahead(client: "Client", address: str) -> int:
+    """Cases that are submitted at a time: none of the workers waits, and few are left when the time is up.
+
+    Raises ClusterError.
+    """
+    try:
+        threads: dict[str, int] = client.nthreads()
+    except OSError:
+        raise ClusterError(f"{address}: the scheduler is gone") from None
+    return max(_AHEAD_MIN, 2 * sum(threads.values()))
 
 
 class _Completed(NamedTuple):

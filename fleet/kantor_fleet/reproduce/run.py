@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.table import Table as Printed
 
 from kantor_fleet.execution.experiment import Case, Outcome
-from kantor_fleet.execution.pools import Pool
+from kantor_fleet.execution.pools import ClusterError, Pool
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.report.run_progress import RunProgressView, table_console
@@ -50,7 +50,12 @@ def reproduce(
         interrupts = stack.enter_context(Interrupts())
         kept = any(figure.kept for figure in figures.values())
         journal = stack.enter_context(RunsJournal(out / RUNS, MeasuredRun)) if kept else None
-        measured = _run_all(requests, start, interrupts, journal)
+        measured: dict[tuple[Setting, int], MeasuredRun] = {}
+        try:
+            _run_all(requests, start, interrupts, journal, measured)
+        except ClusterError as error:
+            print(f"kantor: {error}; {_resumable(requests, measured, journal)}", file=sys.stderr)
+            return Exit.UNREACHABLE
         if interrupts.code is not None:
             print(
                 f"kantor: interrupted; {_resumable(requests, measured, journal)}", file=sys.stderr
@@ -129,9 +134,12 @@ def _run_all(
     start: Callable[[Iterable[Case]], Pool],
     interrupts: Interrupts,
     journal: RunsJournal | None,
-) -> RunsBySetting:
-    """Runs of the journal, and new ones for the rest, which are added to the journal if there is one."""
-    measured: dict[tuple[Setting, int], MeasuredRun] = {}
+    measured: dict[tuple[Setting, int], MeasuredRun],
+) -> None:
+    """Add the runs of the journal, and new ones for the rest, which go into the journal too, if there is one.
+
+    Raises ClusterError.
+    """
     left: dict[Case, tuple[Setting, RunKey]] = {}
     for setting, seeds in requests.items():
         for key, case in setting.cases(seeds):
@@ -141,7 +149,7 @@ def _run_all(
             else:
                 left[case] = setting, key
     if not left:
-        return measured
+        return
     with RunProgressView(len(left)) as view, closing(start(left)) as pool:
         for done in pool:
             if done is not None:
@@ -153,7 +161,6 @@ def _run_all(
                 view.count(outcome.failed)
             if interrupts():
                 break
-    return measured
 
 
 def _measured(outcome: Outcome) -> MeasuredRun:
