@@ -7,17 +7,25 @@ them (eq. 9). It is a relay with a place of its own; a robot treats its messages
 from kantor_protocol.base.machine import Body, Inputs, Outputs, ParticipantId, State
 from kantor_protocol.replication.gossip import Gossip, build_replica
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Identities
 from kantor_protocol.wire.weights import Units, WeightsPublisher
 
 
 class DensitySupervisor:
     """The supervisor of a scenario with a density. `step` is its only entrance."""
 
-    def __init__(self, me: ParticipantId, scenario: Scenario, body: Body, samples: int) -> None:
-        """body: the one that the supervisor takes over. samples: N."""
+    def __init__(
+        self,
+        me: ParticipantId,
+        scenario: Scenario,
+        body: Body,
+        samples: int,
+        identities: Identities | None = None,
+    ) -> None:
+        """body: the one that the supervisor takes over. samples: N. identities: see Gossip."""
         units = Units.of(scenario.energy.points, samples)
         self._replica = build_replica(me, scenario, units, samples, body.incarnation)
-        self._gossip = Gossip(me, scenario, body.incarnation)
+        self._gossip = Gossip(me, scenario, body.incarnation, identities)
         self._publisher = WeightsPublisher(
             self._replica.weights,
             scenario.publish.weights_every,

@@ -19,19 +19,29 @@ from kantor_protocol.replication.gossip import Gossip, build_replica
 from kantor_protocol.replication.occupancy_log import entries
 from kantor_protocol.scenario.clocks import step_clocks
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Identities
 
 
 class MappingSupervisor:
     """The supervisor of a scenario with a map. `step` is its only entrance."""
 
     def __init__(
-        self, me: ParticipantId, scenario: Scenario, seed: int, body: Body, frame: Frame
+        self,
+        me: ParticipantId,
+        scenario: Scenario,
+        seed: int,
+        body: Body,
+        frame: Frame,
+        identities: Identities | None = None,
     ) -> None:
-        """body: the one that the supervisor takes over. frame: how the cells lie, not what is in them."""
+        """body: the one that the supervisor takes over. frame: how the cells lie, not what is in them.
+
+        identities: see Gossip.
+        """
         self._frame = frame
         self._robots = scenario.robots.count
         self._replica = build_replica(me, scenario, None, entries(frame), body.incarnation)
-        self._gossip = Gossip(me, scenario, body.incarnation)
+        self._gossip = Gossip(me, scenario, body.incarnation, identities)
         self._fused_map = FusedMap(frame, self._replica.origins)
         """Of `_replica`, as far as its logs have been folded."""
         self._cost_map = CostMap(scenario, self._fused_map)

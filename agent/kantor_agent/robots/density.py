@@ -13,6 +13,7 @@ from kantor_protocol.base.random_walk import RandomWalk
 from kantor_protocol.replication.gossip import Gossip, build_replica
 from kantor_protocol.replication.replica_kernels import NO_INDEX
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Identities
 from kantor_protocol.wire.weights import Units, WeightsPublisher
 
 _WALK_STEPS_MAX = 32
@@ -34,8 +35,12 @@ class DensityRobot:
         seed: int,
         body: Body,
         samples_m: npt.NDArray[np.float64],
+        identities: Identities | None = None,
     ) -> None:
-        """body: the one that the robot takes over. samples_m: (N, 2), world frame, at time 0."""
+        """body: the one that the robot takes over. samples_m: (N, 2), world frame, at time 0.
+
+        identities: see Gossip.
+        """
         units = Units.of(scenario.energy.points, samples_m.shape[0])
         replica = build_replica(me, scenario, units, samples_m.shape[0], body.incarnation)
         random_walk = RandomWalk(
@@ -49,7 +54,7 @@ class DensityRobot:
         self._replica = replica
         self._belief = Belief(random_walk, units, replica)
         """Over `_replica`; consistent with it between two steps."""
-        self._gossip = Gossip(me, scenario, body.incarnation)
+        self._gossip = Gossip(me, scenario, body.incarnation, identities)
         self._planner = PLANNERS[scenario.planner.name](scenario)
         self._vehicle = VEHICLES[scenario.vehicle.name](scenario.vehicle)
         self._publisher = WeightsPublisher(

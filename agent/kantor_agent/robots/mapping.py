@@ -44,6 +44,7 @@ from kantor_protocol.replication.occupancy_log import (
     retried_frontier,
 )
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Identities
 
 _REST_STEPS, _NOISY_REST_STEPS = 3, 30
 """Steps in a row without a frontier that can be reached, after which a robot rests."""
@@ -63,13 +64,17 @@ class MappingRobot:
         seed: int,
         body: Body,
         frame: Frame,
+        identities: Identities | None = None,
     ) -> None:
-        """body: the one that the robot takes over. frame: how the cells lie, not what is in them."""
+        """body: the one that the robot takes over. frame: how the cells lie, not what is in them.
+
+        identities: see Gossip.
+        """
         self._me = scenario.roster.index(me)
         self._frame = frame
         self._robots = scenario.robots.count
         self._replica = build_replica(me, scenario, None, entries(frame), body.incarnation)
-        self._gossip = Gossip(me, scenario, body.incarnation)
+        self._gossip = Gossip(me, scenario, body.incarnation, identities)
         self._fused_map = FusedMap(frame, self._replica.origins)
         """Of `_replica`, as far as its logs have been folded."""
         self._cost_map = CostMap(scenario, self._fused_map)

@@ -17,6 +17,7 @@ from kantor_protocol.replication.replica_kernels import (
 )
 from kantor_protocol.scenario.clocks import step_clocks, steps_max
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Identities
 from kantor_protocol.wire.messages import (
     VERSION,
     GossipMessage,
@@ -41,8 +42,15 @@ class Gossip:
     range, until it receives from it again: what a supervisor missed meanwhile it gets as any neighbour does.
     """
 
-    def __init__(self, me: ParticipantId, scenario: Scenario, incarnation: int = 0) -> None:
-        """incarnation: the one that sends."""
+    def __init__(
+        self,
+        me: ParticipantId,
+        scenario: Scenario,
+        incarnation: int = 0,
+        identities: Identities | None = None,
+    ) -> None:
+        """incarnation: the one that sends. identities: with `trust = "signed"`, and only then."""
+        assert scenario.signed == (identities is not None), "a signed mission needs identities"
         self.refused = 0
         """Messages that were malformed, too old or from no other participant of the roster."""
         roster = scenario.roster

@@ -9,12 +9,22 @@ import hashlib
 
 import msgspec
 
+from kantor_protocol.base.machine import ParticipantId
 from kantor_protocol.wire.signatures import SIGNATURE_BYTES, SigningKey, is_signed
 
 HASH_BYTES = 16
 UNSIGNED = bytes(SIGNATURE_BYTES)
 """In place of a signature: none yet."""
 _DOMAIN = b"kantor attestation 1\0"
+
+
+class Identities(msgspec.Struct, frozen=True, array_like=True, tag="identities"):
+    """Whose word counts in a run with `trust = "signed"`."""
+
+    run: str
+    """The name of this run of the mission: the context of signatures."""
+    keys: dict[ParticipantId, bytes]
+    """The public key of every participant, see `signatures.py`."""
 
 
 class Attestation(msgspec.Struct, frozen=True, array_like=True, gc=False):
