@@ -36,7 +36,7 @@ class DensitySupervisor:
     def step(self, inputs: Inputs, /) -> Outputs:
         """Take in what the robots sent, send every robot what it lacks."""
         self._step += 1
-        self._gossip.receive(inputs.inbox, self._replica.merge)
+        self._gossip.receive(inputs.inbox, self._replica)
         finished = self._replica.empty
         outputs = Outputs(
             step=self._step,
@@ -53,3 +53,4 @@ class DensitySupervisor:
     def validate(self) -> None:
         """Assert what its parts say of themselves; true between two steps."""
         self._replica.validate()
+        self._gossip.validate(self._replica)

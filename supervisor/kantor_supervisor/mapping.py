@@ -57,7 +57,7 @@ class MappingSupervisor:
     def step(self, inputs: Inputs, /) -> Outputs:
         """Take in what the robots sent, assign targets, send every robot what it lacks."""
         self._step += 1
-        self._gossip.receive(inputs.inbox, self._replica.merge)
+        self._gossip.receive(inputs.inbox, self._replica)
         self._fused_map.fold(self._replica)
         tick = inputs.now_ns // self._period_ns
         for robot, task in self._assignment.decide(*self._visible_team(tick), tick).items():
@@ -76,6 +76,7 @@ class MappingSupervisor:
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""
         self._replica.validate()
+        self._gossip.validate(self._replica)
         self._fused_map.validate(self._replica)
         self._cost_map.validate()
         registers = self._replica.registers

@@ -91,6 +91,7 @@ def _ship_packed(
     claims: np.ndarray,
     lowered: np.ndarray,
     mark: np.ndarray,
+    shipped: np.ndarray,
     counters: np.ndarray,
     best: np.ndarray,
     near: np.ndarray,
@@ -116,10 +117,11 @@ def _ship_packed(
         claims,
         lowered,
         mark,
+        shipped,
         counters,
     )
     # Of the configuration, spending reads only whose log it is and whether it is a ledger.
-    config = ReplicaConfig(me, ledger != 0, False, False, False, 0, 0, 0, 0, 0, 0)
+    config = ReplicaConfig(me, ledger != 0, False, False, False, 0, 0, 0, 0, 0, 0, 0, False)
     count = ship(grid, store, config, x, y, point, _Shipment(best, near, sample, units))
     used: int = pack_pairs(sample, units, count, out)
     return used

@@ -69,7 +69,7 @@ class DensityRobot:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the class."""
-        self._gossip.receive(inputs.inbox, self._replica.merge)
+        self._gossip.receive(inputs.inbox, self._replica)
         self._locate(inputs.observation)
         self._belief.advance(inputs.now_ns)
         elapsed_s = self._timer.elapsed_s(inputs.now_ns)
@@ -80,6 +80,7 @@ class DensityRobot:
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""
         self._replica.validate()
+        self._gossip.validate(self._replica)
         self._belief.validate()
         assert self._belief.replica is self._replica
         assert self._goal is None or self._state is State.EXPLORING
@@ -110,7 +111,8 @@ class DensityRobot:
             replica.claim(NO_INDEX, self._now_ns)
         lowered = replica.packed_lowered()
         weights = self._publisher.step(replica.lowered(), last=state is not State.EXPLORING)
-        envelope = self._gossip.compose(replica, self._step, self._pose)
+        final = state is not State.EXPLORING
+        envelope = self._gossip.compose(replica, self._step, self._pose, final=final)
         replica.end_step()
         return Outputs(
             step=self._step,

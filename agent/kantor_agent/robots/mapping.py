@@ -115,7 +115,7 @@ class MappingRobot:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step; see the module."""
-        self._gossip.receive(inputs.inbox, self._replica.merge)
+        self._gossip.receive(inputs.inbox, self._replica)
         self._locate(inputs.observation)
         elapsed_s = self._timer.elapsed_s(inputs.now_ns)
         self._now_ns, self._step = inputs.now_ns, self._step + 1
@@ -131,6 +131,7 @@ class MappingRobot:
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""
         self._replica.validate()
+        self._gossip.validate(self._replica)
         self._fused_map.validate(self._replica)
         self._cost_map.validate()
         assert not (self._resting and self._task.target != NOWHERE)
@@ -288,7 +289,7 @@ class MappingRobot:
         if self._resting:
             self._task = Task()
         self._replica.registers.write(self._own_register())
-        envelope = self._gossip.compose(self._replica, self._step, self._pose)
+        envelope = self._gossip.compose(self._replica, self._step, self._pose, final=self._resting)
         self._replica.end_step()
         target = self._task.target
         return Outputs(

@@ -1,23 +1,25 @@
 """A participant's end of the radio: envelopes in and out, every received message checked before it is merged."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
+from kantor_protocol.replication.attested import Attested, Rules, read_word
 from kantor_protocol.replication.registers import Registers, are_registers
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import (
     LENGTH_MAX,
     NO_INDEX,
+    UNITS_MAX,
     ReplicaArrays,
     ReplicaConfig,
     is_mergeable,
 )
 from kantor_protocol.scenario.clocks import step_clocks, steps_max
 from kantor_protocol.scenario.schema import Scenario
-from kantor_protocol.wire.attestations import Identities
+from kantor_protocol.wire.attestations import Attestation, Identities
 from kantor_protocol.wire.messages import (
     VERSION,
     GossipMessage,
@@ -30,9 +32,6 @@ from kantor_protocol.wire.weights import Units
 
 CONTACT_PERIODS = 8
 """A participant from which no message came for more of the own steps is out of contact."""
-
-Merge = Callable[[int, bytes, bytes, bytes, bytes], bool]
-"""Merges a message: the incarnation id of its sender and the parts of a GossipMessage; see `Replica.merge`."""
 
 
 class Gossip:
@@ -53,6 +52,7 @@ class Gossip:
         assert scenario.signed == (identities is not None), "a signed mission needs identities"
         self.refused = 0
         """Messages that were malformed, too old or from no other participant of the roster."""
+        self._attested = Attested(me, scenario, identities) if identities else None
         roster = scenario.roster
         self._me, self._incarnation, self._roster = me, incarnation, len(roster)
         self._places = {name: i for i, name in enumerate(roster) if name != me}
@@ -61,7 +61,12 @@ class Gossip:
         self._unheard_steps = -ack_timeout_steps(me, scenario)  # its first message takes its time
         """Own steps since a message of the supervisor was received."""
 
-    def receive(self, inbox: Iterable[Envelope], merge: Merge) -> None:
+    @property
+    def forked(self) -> Mapping[int, Attestation]:
+        """The origins that have told two stories, each with an attestation that shows it; see `attested.py`."""
+        return {} if self._attested is None else self._attested.forked
+
+    def receive(self, inbox: Iterable[Envelope], replica: Replica) -> None:
         """Have every well-formed message of a step merged; count the others."""
         self._unheard_steps += 1
         for envelope in inbox:
@@ -74,15 +79,20 @@ class Gossip:
                 self.refused += 1
                 continue
             source = place + message.incarnation * self._roster
-            parts = (message.version_vector, message.logs, message.claims, message.registers)
-            if not merge(source, *parts):
+            if not self._merge(replica, source, message):
                 self.refused += 1
             elif place == self._supervisor:
                 self._supervisor_id = max(self._supervisor_id, source)
                 self._unheard_steps = 0
 
-    def compose(self, replica: Replica, step: int, pose: Pose) -> Envelope:
-        """The envelope of one step, with what its receivers lack."""
+    def _merge(self, replica: Replica, source: int, message: GossipMessage) -> bool:
+        if self._attested is not None:
+            return self._attested.merge(replica, source, message)
+        parts = (message.version_vector, message.logs, message.claims, message.registers)
+        return replica.merge(source, *parts)
+
+    def compose(self, replica: Replica, step: int, pose: Pose, *, final: bool = False) -> Envelope:
+        """The envelope of one step, with what its receivers lack. final: the state of its sender is."""
         to_all = self._supervisor == NO_INDEX or self._unheard_steps > CONTACT_PERIODS
         receiver = NO_INDEX if to_all else self._supervisor_id
         target = EVERYBODY if to_all else SUPERVISOR
@@ -98,7 +108,14 @@ class Gossip:
             registers=replica.registers.compose(receiver),
             incarnation=self._incarnation,
         )
+        if self._attested is not None:
+            message = self._attested.attest(replica, message, to_all=to_all, final=final)
         return Envelope(source=self._me, sequence=step, target=target, body=encode_gossip(message))
+
+    def validate(self, replica: Replica) -> None:
+        """Assert what it says of a replica that it has received and composed for."""
+        if self._attested is not None:
+            self._attested.validate(replica)
 
 
 def build_replica(
@@ -109,6 +126,7 @@ def build_replica(
     incarnation_id = incarnation * roster + scenario.roster.index(me)
     relay, beacon = me == SUPERVISOR, scenario.radio.beacon == "state"
     timeout_steps = ack_timeout_steps(me, scenario)
+    proving = scenario.signed and not relay
     return Replica(
         incarnation_id,
         roster,
@@ -121,6 +139,8 @@ def build_replica(
         ack_timeout_steps=timeout_steps,
         length_max=log_length_max(scenario, units, samples),
         stamp_max=steps_max(scenario),
+        spend_max=spend_max(scenario, units),
+        proving=proving,
         registers=Registers(
             incarnation_id,
             roster,
@@ -130,6 +150,7 @@ def build_replica(
             beacon=beacon,
             ack_timeout_steps=timeout_steps,
             stamp_max=steps_max(scenario),
+            proving=proving,
         ),
     )
 
@@ -154,11 +175,24 @@ def log_length_max(scenario: Scenario, units: Units | None, samples: int) -> int
     return min(samples * units.sample, LENGTH_MAX)
 
 
+def spend_max(scenario: Scenario, units: Units | None) -> int:
+    """No participant of a mission ships more units, all its incarnations together. units: see `build_replica`."""
+    if units is None or scenario.merge != "ledger":
+        return UNITS_MAX
+    return min(scenario.steps_per_robot * units.point, UNITS_MAX)
+
+
 class MessageCheck:
     """The checks of every receiver on arrival, for one who is no participant and holds nothing."""
 
-    def __init__(self, scenario: Scenario, units: Units | None, samples: int) -> None:
-        """units, samples: see `build_replica`."""
+    def __init__(
+        self,
+        scenario: Scenario,
+        units: Units | None,
+        samples: int,
+        identities: Identities | None = None,
+    ) -> None:
+        """units, samples: see `build_replica`. identities: given them, what is said of others must be proven."""
         self._roster = len(scenario.roster)
         self._parts = 2 if scenario.claiming else 1
         self._width = scenario.register_width
@@ -177,7 +211,10 @@ class MessageCheck:
             roster=self._roster,
             length_max=log_length_max(scenario, units, samples),
             stamp_max=self._stamp_max,
+            spend_max=spend_max(scenario, units),
+            proving=scenario.signed,
         )
+        self._rules = identities and Rules.of(identities, scenario.roster, config, self._width)
         self._fields = (*_nothing_held(self._roster), np.array(config, dtype=np.int64))
 
     def passes(self, source: int, message: GossipMessage) -> bool:
@@ -189,6 +226,8 @@ class MessageCheck:
                 registers, covered, self._width, sums=self._sums, stamp_max=self._stamp_max
             ):
                 return False
+        if self._rules and read_word(self._rules, source, message) is None:
+            return False
         return bool(is_mergeable(*self._fields, vector, message.logs, message.claims, source))
 
 
@@ -204,6 +243,7 @@ def _nothing_held(origins: int) -> ReplicaArrays:
         claims=np.zeros((4, origins), dtype=np.int64),
         lowered=none32,
         mark=none32,
+        shipped=np.zeros((2, origins), dtype=np.int64),
         counters=none64,
     )
 

@@ -38,6 +38,8 @@ NUMBER_MAX = 1 << 52
 _BYTES_MAX = 48 * 1024
 """For one message; with the longest logs and claims a body still fits."""
 _NUMBER_BYTES, _HEAD_BYTES, _STAMP_BYTES = 8, 15, 6
+OTHERS_MAX = 64
+"""Logs of others, or registers of others, in one message with proofs, at most."""
 _STALE_STEPS = 6
 """Writes, or steps, by which a neighbour may be behind before a robot forwards another's register."""
 FRESH_STEPS = 4
@@ -161,6 +163,7 @@ def _is_due(
 def _compose(
     values: np.ndarray,
     stamps: np.ndarray,
+    held: np.ndarray,
     known: np.ndarray,
     received: np.ndarray,
     updated: np.ndarray,
@@ -170,18 +173,19 @@ def _compose(
     target: int,
     step: int,
 ) -> int:
-    """Write stamps and registers; the bytes used."""
+    """Write the stamps `held`, and of the registers with `stamps` those that are due; the bytes used."""
     origins, width = values.shape
-    me = settings[0]
+    me, others_left = settings[0], settings[4]
     at = 0
     for origin in range(origins):
-        at = put_uint(out, at, stamps[origin])
+        at = put_uint(out, at, held[origin])
     longest = _HEAD_BYTES + _NUMBER_BYTES * width
     for turn in range(origins + 1):
         origin = (step + turn) % origins if turn else me
-        if (turn and origin == me) or at + longest > out.shape[0]:
+        if (turn and (origin == me or others_left <= 0)) or at + longest > out.shape[0]:
             continue
         if _is_due(stamps, known, received, updated, sent, settings, origin, target, step):
+            others_left -= origin != me
             at = put_uint(out, at, origin)
             at = put_uint(out, at, stamps[origin])
             numbers = width  # zeros at the end are left out
@@ -209,19 +213,24 @@ class Registers:
         beacon: bool = False,
         ack_timeout_steps: int = 2,
         stamp_max: int = STAMP_MAX,
+        proving: bool = False,
     ) -> None:
         """Registers without a write.
 
         me: its incarnation id. roster: participants in the roster. width: integers in a register, or 0. sums:
         registers are sums, the first number of which is the largest in size. stamp_max: no origin writes more often
-        in this mission.
+        in this mission. proving: of others it sends only what they have attested, see `attested.py`.
         """
         self.me = me
         """One of the origins."""
         self._roster = roster
         self._sums = sums
         self._stamp_max = min(stamp_max, STAMP_MAX)
-        self._settings = np.array([me, relay, beacon, max(1, ack_timeout_steps)], dtype=np.int64)
+        self._proving = proving
+        others = OTHERS_MAX if proving else STAMP_MAX
+        self._settings = np.array(
+            [me, relay, beacon, max(1, ack_timeout_steps), others], dtype=np.int64
+        )
         self.step = 0
         """The current step."""
         self.total = np.zeros(width, dtype=np.int64)
@@ -231,6 +240,10 @@ class Registers:
         number is not negative, and no other is larger in size."""
         self.stamps: Register
         """(n,) writes of each origin that `values` includes; of others at most STAMP_MAX."""
+        self.offered: Register
+        """(n, width) the registers that may be sent: `values`; or when proving, of others what they have attested."""
+        self.offered_stamps: Register
+        """(n,) their stamps: `stamps`; or when proving, of others at most as large, 0 while nothing may be sent."""
         self._known: Register
         """(n, n) the stamps that each origin is known to hold, at most STAMP_MAX; 0 in the own row, and in rows of
         origins from which nothing was received."""
@@ -248,6 +261,8 @@ class Registers:
         width = self.total.shape[0]
         self.values = np.zeros((origins, width), dtype=np.int64)
         self.stamps = np.zeros(origins, dtype=np.int64)
+        self.offered = np.zeros_like(self.values) if self._proving else self.values
+        self.offered_stamps = np.zeros_like(self.stamps) if self._proving else self.stamps
         self._known = np.zeros((origins, origins), dtype=np.int64)
         self._received = np.full(origins, -1, dtype=np.int64)
         self._updated = np.zeros(origins, dtype=np.int64)
@@ -263,8 +278,10 @@ class Registers:
             return
         before = self.stamps.shape[0]
         old = (self.values, self.stamps, self._known, self._received, self._updated, self._sent)
+        offered, offered_stamps = self.offered, self.offered_stamps
         self._make_room(origins)
         self.values[:before], self.stamps[:before] = old[0], old[1]
+        self.offered[:before], self.offered_stamps[:before] = offered, offered_stamps
         self._known[:before, :before] = old[2]
         self._received[:before], self._updated[:before] = old[3], old[4]
         self._sent[:, :before] = old[5]
@@ -281,6 +298,14 @@ class Registers:
         register[len(numbers) :] = 0
         self.total += register
         self.stamps[self.me] += 1
+
+    def offer(self, origin: int, stamp: int) -> None:
+        """When proving: send others the register of an origin that has this stamp, or none if it is not known."""
+        if self.offered_stamps[origin] == stamp:
+            return
+        held = self.stamps[origin] == stamp
+        self.offered[origin] = self.values[origin] if held else 0
+        self.offered_stamps[origin] = stamp if held else 0
 
     def age_steps(self, origin: int) -> int:
         """Own steps since the register of an origin was last replaced; negative if never."""
@@ -325,8 +350,11 @@ class Registers:
         """The part of a message to all in range, or to one origin; empty without registers."""
         if not self._out.size:
             return b""
+        if self._proving:
+            self.offer(self.me, int(self.stamps[self.me]))
         used = _compose(
-            self.values,
+            self.offered,
+            self.offered_stamps,
             self.stamps,
             self._known,
             self._received,
@@ -352,6 +380,12 @@ class Registers:
         assert self._known.shape == (origins, origins)
         assert self._sent.shape == (2, origins)
         assert (self.total == self.values.sum(axis=0)).all()
+        if self._proving:
+            assert self.offered.shape == (origins, width)
+            assert ((self.offered_stamps >= 0) & (self.offered_stamps <= self.stamps)).all()
+        else:
+            assert self.offered is self.values
+            assert self.offered_stamps is self.stamps
         unwritten, others = self.stamps == 0, np.arange(origins) != me
         assert (self.stamps >= 0).all()
         assert (self.stamps[others] <= STAMP_MAX).all()

@@ -41,7 +41,7 @@ import numpy.typing as npt
 
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX, known_ids
 from kantor_protocol.base.varint import Pairs
-from kantor_protocol.replication.registers import STAMP_MAX, Registers
+from kantor_protocol.replication.registers import OTHERS_MAX, STAMP_MAX, Registers
 from kantor_protocol.replication.replica_kernels import (
     ENTRIES_MAX,
     HISTORY,
@@ -61,9 +61,11 @@ from kantor_protocol.replication.replica_kernels import (
     STAMP,
     STAMP_STEP,
     STEP,
+    UNITS_MAX,
     ReplicaArrays,
     ReplicaConfig,
     claim,
+    claims_to_prove,
     compose,
     end_step,
     merge,
@@ -90,6 +92,8 @@ class Replica:
         ack_timeout_steps: int = 2,
         length_max: int = LENGTH_MAX,
         stamp_max: int = STAMP_MAX,
+        spend_max: int = UNITS_MAX,
+        proving: bool = False,
         registers: Registers | None = None,
     ) -> None:
         """An empty replica. Raises ValueError for an incarnation too many.
@@ -115,6 +119,8 @@ class Replica:
             roster=roster,
             length_max=min(length_max, LENGTH_MAX),
             stamp_max=stamp_max,
+            spend_max=min(spend_max, UNITS_MAX),
+            proving=proving,
         )
         """`me` is one of the origins."""
         self._initial_weight = units.sample
@@ -128,10 +134,14 @@ class Replica:
             claims=_no_claims(origins),
             lowered=np.zeros(weighed, dtype=np.int32),
             mark=np.zeros(weighed, dtype=np.int32),
+            shipped=np.zeros((2, origins), dtype=np.int64),
             counters=np.array([0, 1, weighed], dtype=np.int64),
         )
         """The arrays that kernels work on. ReplicaArrays states which of them agree with which."""
         self._settings = np.array(self.config, dtype=np.int64)
+        self.offered = np.zeros(origins, dtype=np.int64) if proving else self.store.length
+        """(n,) entries of each log that may be sent: `store.length`; or when proving, of others what they have
+        attested and is held, and of the own one what was sent last."""
         self._make_scratch()
 
     def _make_scratch(self) -> None:
@@ -213,18 +223,20 @@ class Replica:
         known = np.zeros((origins, 2 * origins), dtype=np.int32)
         known[:before, :before] = old.known[:, :before]
         known[:before, origins : origins + before] = old.known[:, before:]
-        length = np.zeros(origins, dtype=np.int64)
-        length[:before] = old.length
+        length = _extended(old.length, origins)
         sending = _nothing_sent(origins, self.config.ack_timeout_steps)
         claims = _no_claims(origins)
         sending[:, :before], claims[:, :before] = old.sending, old.claims
+        shipped = np.zeros((2, origins), dtype=np.int64)
+        shipped[:, :before] = old.shipped
         logs = old.logs
         if self.config.ledger:
             logs = np.zeros((origins, *old.logs.shape[1:]), dtype=np.int32)
             logs[:before] = old.logs
         self.store = old._replace(
-            logs=logs, length=length, known=known, sending=sending, claims=claims
+            logs=logs, length=length, known=known, sending=sending, claims=claims, shipped=shipped
         )
+        self.offered = _extended(self.offered, origins) if self.config.proving else length
         self._make_scratch()
         self.registers.widen(origins)
 
@@ -234,9 +246,21 @@ class Replica:
 
     def compose(self, target: int = NO_INDEX) -> tuple[bytes, bytes, bytes]:
         """(version vector, logs, claims) of one message to all in range, or to one origin."""
-        end_of_vector, end_of_logs, end = compose(*self._fields, self._out, self._least, target)
+        if self.config.proving:
+            self.offered[self.config.me] = self.store.length[self.config.me]
+        end_of_vector, end_of_logs, end = compose(
+            *self._fields, self._out, self._least, self.offered, target
+        )
         message = self._out[:end].tobytes()
         return message[:end_of_vector], message[end_of_vector:end_of_logs], message[end_of_logs:]
+
+    def claims_to_prove(
+        self, attested: npt.NDArray[np.int64], sent: npt.NDArray[np.int64]
+    ) -> list[int]:
+        """Origins whose attested claim a receiver of the message that was just composed lacks; see the kernel."""
+        store, some = self.store, np.zeros(OTHERS_MAX, dtype=np.int64)
+        counts = (store.claims, store.counters, self._settings, self._least, attested, sent)
+        return some[: claims_to_prove(*counts, some)].tolist()
 
     @property
     def fell(self) -> bool:
@@ -277,7 +301,12 @@ class Replica:
         assert store.claims.shape == (4, origins)
         assert store.lowered.shape == store.mark.shape == (samples,)
         assert samples in {0, config.bound}
+        assert store.shipped.shape == (2, origins)
+        assert self.offered.shape == (origins,)
+        assert config.proving != (self.offered is store.length)
+        assert ((self.offered >= 0) & (self.offered <= store.length)).all()
         self._validate_logs()
+        self._validate_shipped()
         self._validate_weights()
         self._validate_lowered()
         self._validate_sending()
@@ -307,6 +336,18 @@ class Replica:
             assert (log >= 0).all()
             assert (log[:, 0] < config.bound).all()
             assert (log[:, 1] <= config.value_max).all()
+
+    def _validate_shipped(self) -> None:
+        store, config = self.store, self.config
+        units, arriving = store.shipped
+        assert not arriving.any()
+        if not config.ledger:
+            assert not units.any()
+            return
+        assert units.tolist() == [log[:, 1].sum(dtype=np.int64) for log in self._held_logs()]
+        by_place = units.reshape(-1, config.roster).sum(axis=0)
+        others = np.arange(config.roster) != config.me % config.roster
+        assert (by_place[others] <= config.spend_max).all()
 
     def _validate_weights(self) -> None:
         store, initial = self.store, self._initial_weight
@@ -364,6 +405,11 @@ class Replica:
         assert stamp_step[me] == 0
         others = np.arange(self.origins) != me
         assert self.config.claims or not stamp[others].any()
+
+
+def _extended(numbers: npt.NDArray[np.int64], origins: int) -> npt.NDArray[np.int64]:
+    """(origins,) the numbers, and 0 for every further origin."""
+    return np.pad(numbers, (0, origins - numbers.shape[0]))
 
 
 def _nothing_sent(origins: int, ack_timeout_steps: int) -> npt.NDArray[np.int64]:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.varint import put_int, put_uint, read_int, read_uint, skip_numbers
-from kantor_protocol.replication.registers import FRESH_STEPS
+from kantor_protocol.replication.registers import FRESH_STEPS, OTHERS_MAX
 from kantor_protocol.wire.version_vector import count_ids, raise_entries
 
 NO_INDEX = -1
@@ -36,11 +36,23 @@ LENGTH_MAX = 1 << 40
 KNOWN_MAX = (1 << 31) - 2
 """More is not remembered of what another holds: it fits into 32 bits, and no log gets so long."""
 
+UNITS_MAX = 1 << 62
+"""No participant ships more units."""
+
+BLOCK = 128
+"""Entries of a log whose hash is one link of a chain; see `attested.py`."""
+
+REST_BLOCKS_MAX = 2048
+"""Blocks of which a message holds the hash instead of the entries, at most."""
+
 # Rows of ReplicaArrays.claims.
 SAMPLE, SINCE_NS, STAMP, STAMP_STEP = 0, 1, 2, 3
 
 # Rows of ReplicaArrays.sending; from HISTORY on, one for each step of the acknowledgement timeout.
 SENT, REPEATED_STEP, RECEIVED_STEP, HISTORY = 0, 1, 2, 3
+
+# Rows of ReplicaArrays.shipped.
+HELD, ARRIVING = 0, 1
 
 # Entries of ReplicaArrays.counters.
 LOWERED, STEP, HOLDING = 0, 1, 2
@@ -79,6 +91,9 @@ class ReplicaArrays(NamedTuple):
     mark: npt.NDArray[np.int32]
     """(N,) the step at which an index was put into `lowered`: the current one for those in it, an earlier one for all
     others."""
+    shipped: npt.NDArray[np.int64]
+    """(2, n), with a ledger. HELD: the sum of values of all entries held of each log; all incarnations of another
+    participant together at most `ReplicaConfig.spend_max`. ARRIVING: scratch for each place, 0 between two messages."""
     counters: npt.NDArray[np.int64]
     """(3,): LOWERED, how many indices are in `lowered`; STEP, the current step; HOLDING, how many weights are
     above 0."""
@@ -107,6 +122,10 @@ class ReplicaConfig(NamedTuple):
     """No origin writes a longer log in this mission; at most LENGTH_MAX."""
     stamp_max: int
     """No claim has a later stamp in this mission."""
+    spend_max: int
+    """No participant ships more units in this mission, all its incarnations together; at most UNITS_MAX."""
+    proving: bool
+    """Of others it sends only what they have attested, from the beginning of a block on; see `attested.py`."""
 
 
 @kernel
@@ -127,11 +146,28 @@ def _append(store: ReplicaArrays, row: int, origin: int, index: int, value: int)
 
 
 @kernel
+def _append_spending(store: ReplicaArrays, origin: int, index: int, value: int) -> None:
+    _append(store, origin, origin, index, value)
+    store.shipped[HELD, origin] += value
+
+
+@kernel
+def _is_affordable(store: ReplicaArrays, config: ReplicaConfig, origin: int, units: int) -> bool:
+    """Count units that arrive of an origin; whether its participant can have shipped them with all that is held."""
+    place = origin % config.roster
+    store.shipped[ARRIVING, place] += units
+    total = store.shipped[ARRIVING, place]
+    for each in range(place, store.length.shape[0], config.roster):
+        total += store.shipped[HELD, each]
+    return bool(total <= config.spend_max)
+
+
+@kernel
 def spend(store: ReplicaArrays, config: ReplicaConfig, index: int, units: int) -> None:
     """Ship `units` to a sample and log it. The log must have room for one more entry."""
     _lower(store, index, store.weights[index] - units)
     if config.ledger:
-        _append(store, config.me, config.me, index, units)
+        _append_spending(store, config.me, index, units)
     else:
         _append(store, 0, config.me, index, store.weights[index])
 
@@ -141,7 +177,7 @@ def _merge_entry(
     store: ReplicaArrays, config: ReplicaConfig, origin: int, index: int, value: int
 ) -> None:
     if config.ledger:
-        _append(store, origin, origin, index, value)
+        _append_spending(store, origin, index, value)
         if value > 0 and store.weights[index] > 0:
             _lower(store, index, max(0, store.weights[index] - value))
     elif value < store.weights[index]:
@@ -189,6 +225,7 @@ def _walk_suffixes(
             at = skip_numbers(suffixes, at, 2 * count if config.value_max > 0 else count)
             continue
         index = 0
+        units = 0
         for i in range(count):
             step, at = read_int(suffixes, at)
             value = 0
@@ -197,8 +234,12 @@ def _walk_suffixes(
             index += step
             if at < 0 or index < 0 or index >= config.bound or value > config.value_max:
                 return -1
-            if apply and (not ledger or start + i >= held):
-                _merge_entry(store, config, origin, index, value)
+            if not ledger or start + i >= held:
+                units += value
+                if apply:
+                    _merge_entry(store, config, origin, index, value)
+        if ledger and not apply and units > 0 and not _is_affordable(store, config, origin, units):
+            return -1
         if apply and not ledger and start <= held:
             store.length[origin] = max(held, start + span)
     return longest
@@ -257,6 +298,8 @@ def config_of(settings: np.ndarray) -> ReplicaConfig:
         settings[8],
         settings[9],
         settings[10],
+        settings[11],
+        settings[12] != 0,
     )
 
 
@@ -274,6 +317,7 @@ def _check(
     if not 0 <= source < covered or source == config.me:
         return MALFORMED
     longest = _walk_suffixes(store, config, suffixes, source, covered, False)
+    store.shipped[ARRIVING, : config.roster] = 0
     if longest < 0 or _walk_claims(store, config, claimed, covered, False) < 0:
         return MALFORMED
     return longest
@@ -289,6 +333,7 @@ def is_mergeable(
     claims: np.ndarray,
     lowered: np.ndarray,
     mark: np.ndarray,
+    shipped: np.ndarray,
     counters: np.ndarray,
     settings: np.ndarray,
     version_vector: bytes,
@@ -306,6 +351,7 @@ def is_mergeable(
         claims,
         lowered,
         mark,
+        shipped,
         counters,
     )
     return _check(store, config_of(settings), version_vector, suffixes, claimed, source) >= 0
@@ -321,6 +367,7 @@ def merge(
     claims: np.ndarray,
     lowered: np.ndarray,
     mark: np.ndarray,
+    shipped: np.ndarray,
     counters: np.ndarray,
     settings: np.ndarray,
     version_vector: bytes,
@@ -343,6 +390,7 @@ def merge(
         claims,
         lowered,
         mark,
+        shipped,
         counters,
     )
     config = config_of(settings)
@@ -388,14 +436,19 @@ def _find_least(
 
 @kernel
 def _start_of_suffix(
-    store: ReplicaArrays, config: ReplicaConfig, target: int, least: int, origin: int, aged: int
+    store: ReplicaArrays,
+    config: ReplicaConfig,
+    target: int,
+    least: int,
+    origin: int,
+    length: int,
+    aged: int,
 ) -> int:
-    """First entry to send of an origin's log; its length when nothing is to be sent.
+    """First entry to send of an origin's log; `length` when nothing is to be sent.
 
-    least: how much of it all neighbours hold.
+    least: how much of it all neighbours hold. length: how much of it may be sent; aged: some steps ago.
     """
     me, relay = config.me, config.relay
-    length = store.length[origin]
     if least < 0 and target < 0 and config.beacon:
         return 0
     if least < 0:
@@ -414,6 +467,18 @@ def _start_of_suffix(
 
 
 @kernel
+def _proven_part(start: int, length: int, room: int) -> tuple[int, int]:
+    """The part of a suffix that is sent with its proof: from the beginning of a block to the end or to that of another."""
+    start -= start % BLOCK
+    end = min(length, start + room)
+    if end < length:
+        end -= end % BLOCK
+    if length - end > REST_BLOCKS_MAX * BLOCK:
+        return start, start
+    return start, end
+
+
+@kernel
 def _put_suffix(
     store: ReplicaArrays,
     config: ReplicaConfig,
@@ -421,14 +486,15 @@ def _put_suffix(
     at: int,
     origin: int,
     start: int,
+    length: int,
     room: int,
 ) -> tuple[int, int]:
-    """Write one suffix: (position after it, entries written)."""
+    """Write one suffix of the first `length` entries: (position after it, entries written)."""
     ledger, valued = config.ledger, config.value_max > 0
     log = store.logs[origin if ledger else 0]
     count = 0
     end = start
-    while end < store.length[origin] and count < room:
+    while end < length and count < room:
         # In a log of minima only the newest entry of a sample matters: the one the vector holds.
         if ledger or log[end, 1] == store.weights[log[end, 0]]:
             count += 1
@@ -458,6 +524,8 @@ def _put_claims(
     step = store.counters[STEP]
     for origin in range(origins):
         stamp = store.claims[STAMP, origin]
+        if origin != me and config.proving:
+            continue  # it travels in its origin's attestation
         if stamp <= 0 or (
             origin != me and step - store.claims[STAMP_STEP, origin] > _CLAIM_LEASE_STEPS
         ):
@@ -484,15 +552,18 @@ def compose(
     claims: np.ndarray,
     lowered: np.ndarray,
     mark: np.ndarray,
+    shipped: np.ndarray,
     counters: np.ndarray,
     settings: np.ndarray,
     out: np.ndarray,
     least: np.ndarray,
+    offered: np.ndarray,
     target: int,
 ) -> tuple[int, int, int]:
     """Write version vector, logs and claims one after the other; the position at the end of each.
 
-    least: (2n,) scratch, see `_find_least`. Everything else: see `merge`.
+    least: (2n,) scratch, see `_find_least`. offered: (n,) entries of each log that may be sent. Everything else: see
+    `merge`.
     """
     store = ReplicaArrays(
         weights,
@@ -503,6 +574,7 @@ def compose(
         claims,
         lowered,
         mark,
+        shipped,
         counters,
     )
     config = config_of(settings)
@@ -517,21 +589,55 @@ def compose(
             at = put_uint(out, at, store.claims[STAMP, origin])
     end_of_vector = at
     now = HISTORY + store.counters[STEP] % config.ack_timeout_steps
-    entries_left = ENTRIES_MAX
+    entries_left, others_left = ENTRIES_MAX, OTHERS_MAX if config.proving else origins
     for turn in range(origins):
         origin = (me + turn) % origins
         if ledger or origin == me:
-            aged = store.sending[now, origin]
-            start = _start_of_suffix(store, config, target, least[origin], origin, aged)
-            if start < store.length[origin] and entries_left > 0:
-                at, written = _put_suffix(store, config, out, at, origin, start, entries_left)
+            aged, end = store.sending[now, origin], offered[origin]
+            start = _start_of_suffix(store, config, target, least[origin], origin, end, aged)
+            if start < end and origin != me and config.proving:
+                start, end = _proven_part(start, end, entries_left if others_left > 0 else 0)
+                others_left -= start < end
+            if start < end and entries_left > 0:
+                at, written = _put_suffix(store, config, out, at, origin, start, end, entries_left)
                 entries_left -= written
     for origin in range(origins):
-        store.sending[now, origin] = store.length[origin]
+        store.sending[now, origin] = offered[origin]
     end_of_logs = at
     if config.claims:
         at = _put_claims(store, config, out, at, least)
     return end_of_vector, end_of_logs, at
+
+
+@kernel
+def claims_to_prove(
+    claims: np.ndarray,
+    counters: np.ndarray,
+    settings: np.ndarray,
+    least: np.ndarray,
+    attested: np.ndarray,
+    sent: np.ndarray,
+    out: np.ndarray,
+) -> int:
+    """Write to `out` origins whose attested claim a neighbour lacks; their number, at most the size of `out`.
+
+    least: as `compose` has left it. attested: (n,) the stamp of each attested claim, 0 for none. sent: (2, n) the stamp
+    with which it was last sent, and the step. The rules: as of `_put_claims`, and each is sent again only when the
+    acknowledgement has not come.
+    """
+    me, ack_timeout_steps = settings[0], settings[5]
+    origins, step = attested.shape[0], counters[STEP]
+    count = 0
+    for turn in range(origins):
+        origin = (me + turn) % origins
+        stamp, held = attested[origin], least[origins + origin]
+        wanted = stamp > 0 and 0 <= held < stamp - _CLAIM_RENEWAL_STEPS
+        alive = step - claims[STAMP_STEP, origin] <= _CLAIM_LEASE_STEPS
+        waits = stamp <= sent[0, origin] and step - sent[1, origin] < ack_timeout_steps
+        if wanted and alive and not waits and count < out.shape[0]:
+            out[count] = origin
+            count += 1
+    return count
 
 
 @kernel

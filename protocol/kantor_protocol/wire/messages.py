@@ -100,6 +100,9 @@ class GossipMessage(_Message, frozen=True, array_like=True, tag=1, gc=False):
     stamp, how many numbers, numbers. LEB128, the numbers zigzag-folded. Empty in a mission whose planner has none."""
     incarnation: int = 0
     """The sender's incarnation."""
+    proofs: tuple[bytes, ...] = ()
+    """For each attestation of another, in order: hashes by which it covers the suffix of its log that comes with it;
+    see `replication/attested.py`."""
     attestations: tuple[Attestation, ...] = ()
     """Of the state of origins, signed by them, with `trust = "signed"`; see `replication/attested.py`. The sender's own
     one comes last, and its signature ends the message."""
@@ -265,7 +268,8 @@ _PROGRESS = msgspec.msgpack.Decoder(Progress)
 encode = _ENCODER.encode
 _decode_gossip = msgspec.msgpack.Decoder(GossipMessage).decode
 _decode_inputs = msgspec.msgpack.Decoder(Inputs).decode
-_NO_ATTESTATIONS, _NO_INCARNATION, _NO_REGISTERS = encode(()), encode(0), encode(b"") + encode(0)
+_NO_ATTESTATIONS = encode(()) + encode(())
+_NO_INCARNATION, _NO_REGISTERS = encode(0), encode(b"") + encode(0)
 
 
 def envelope_bytes(envelope: Envelope) -> int:
@@ -276,7 +280,7 @@ def envelope_bytes(envelope: Envelope) -> int:
 def encode_gossip(message: GossipMessage) -> bytes:
     """The body of an envelope. Fields at the end that have their default are left out."""
     body = encode(message)
-    if message.attestations:
+    if message.attestations or message.proofs:
         return body
     if message.incarnation:
         return b"\x9a" + body[1 : -len(_NO_ATTESTATIONS)]

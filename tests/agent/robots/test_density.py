@@ -326,7 +326,8 @@ def test_resting_robot_keeps_relaying(overrides: tuple[str, ...]) -> None:
     """r2 is exhausted after its first step and stands between r1 and r3: news still gets across."""
     scenario = mission(*overrides)
     machines = build_team(scenario, SAMPLES_M)
-    machines["r2"] = robot(mission("energy.steps=1", *overrides), "r2")
+    tired = Body(Pose(*scenario.starts.poses_m[1]), energy_spent=scenario.steps_per_robot - 1)
+    machines["r2"] = DensityRobot("r2", scenario, 1, tired, SAMPLES_M)
     played = step_rounds(machines, scenario, 40, in_a_row)
     vectors = []
     for robot_id in ("r1", "r3"):
@@ -336,7 +337,7 @@ def test_resting_robot_keeps_relaying(overrides: tuple[str, ...]) -> None:
         vectors.append(vector)
 
     assert played["r2"][0][1].state is State.EXHAUSTED
-    assert played["r2"][-1][1].energy_spent == 1
+    assert played["r2"][-1][1].energy_spent == scenario.steps_per_robot
     assert vectors[0] == vectors[1]
     assert sum(vectors[0].values()) < sum(UNITS.sample for _ in range(N)) - 10 * UNITS.point
 

@@ -1,5 +1,7 @@
 """A participant's end of the radio: what is merged, what is counted, what is sent."""
 
+from unittest.mock import patch
+
 import pytest
 
 from kantor_protocol.base.machine import SUPERVISOR, Envelope, Pose
@@ -16,14 +18,16 @@ SOUND = encode(
 
 def heard(*envelopes: Envelope, taken: bool = True) -> tuple[list[int], int]:
     """Which places in the roster r2 learns from, and how many envelopes it refuses."""
-    radio = Gossip("r2", TEAM)
+    radio, units = Gossip("r2", TEAM), Units.of(30, 12)
+    replica = build_replica("r2", TEAM, units, 12)
     places: list[int] = []
 
     def learn(source: int, *_parts: bytes) -> bool:
         places.append(source)
         return taken
 
-    radio.receive(envelopes, learn)
+    with patch.object(replica, "merge", learn):
+        radio.receive(envelopes, replica)
     return places, radio.refused
 
 

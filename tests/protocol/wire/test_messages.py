@@ -188,7 +188,7 @@ def test_independent_decoder_reads_gossip_messages(news: GossipMessage) -> None:
         msgspec.to_builtins(attestation, builtin_types=(bytes,))
         for attestation in news.attestations
     ]
-    further = [news.registers, news.incarnation, attestations]
+    further = [news.registers, news.incarnation, list(news.proofs), attestations]
     complete = [*fields, *further]
     while further and not further[-1]:
         further.pop()

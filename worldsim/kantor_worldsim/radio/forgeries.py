@@ -31,8 +31,8 @@ _STRANGERS = ("r0", "mallory", WORLD_SIM, SUPERVISOR, "r1 ", "R1", "r999999", "r
 _OVERSIZED = bytes(BODY_BYTES_MAX + 1)
 _NOISE_BYTES_MAX = 96
 _NESTED = 10_000
-_FIELDS = 11
-"""Of a gossip message, with its tag."""
+_FIELDS, _UNPROVEN = 11, encode(()) + encode(())
+"""Of a gossip message, with its tag and its proofs. Its last two fields when they are empty."""
 
 # LEB128.
 _NOT_ENDING = b"\x80"
@@ -144,8 +144,10 @@ def _register_cut_in_a_number(draws: ForgeryDraws, _body: bytes, message: Gossip
 
 
 def _nested(_draws: ForgeryDraws, _body: bytes, message: GossipMessage) -> bytes:
-    """Nested arrays without an end, in place of attestations."""
-    fields = encode(replace(message, incarnation=0, attestations=()))[1 : -len(encode(()))]
+    """Nested arrays without an end, in place of proofs."""
+    fields = encode(replace(message, incarnation=0, proofs=(), attestations=()))[
+        1 : -len(_UNPROVEN)
+    ]
     return bytes([0x90 + _FIELDS]) + fields + b"\x91" * _NESTED
 
 
