@@ -12,8 +12,8 @@ that of all its numbers, as little-endian int64.
 
 Attesting
 ---------
-Every `attested_every` steps, staggered by place, and when its state becomes final, a participant that sends to all in
-range attests its log, claim and register. With merge = "min" logs are never forwarded, and length is 0.
+A participant that sends to all in range, and hears any, attests its log, claim and register when it did so
+`attested_every` steps ago or more, and when its state has become final. With merge = "min" logs are never forwarded, and length is 0.
 
 Forwarding
 ----------
@@ -72,7 +72,7 @@ from kantor_protocol.wire.version_vector import count_ids
 
 ATTESTATIONS_MAX = 3 * OTHERS_MAX + 1
 """In one message: for logs, registers and claims of others, and the sender's own."""
-_EVERY_STEPS, _EVERY_STEPS_ON_MAPS = 16, 4
+_EVERY_STEPS, _EVERY_STEPS_ON_MAPS = 20, 4
 """On a map a robot's register has to be heard of again before it counts as out of contact."""
 _NUMBER_MAX = 1 << 62
 
@@ -303,7 +303,9 @@ class Attested:
         assert identities.keys.keys() >= set(scenario.roster), "every participant has a public key"
         self._identities, self._roster = identities, scenario.roster
         self._place = scenario.roster.index(me)
-        self._every, self._final = attested_every(scenario), False
+        self._every = attested_every(scenario)
+        self._due_step, self._final = self._place % self._every, False
+        """From when on it attests again; whether its state is final."""
         self._rules: Rules | None = None
         self.newest: dict[int, Attestation] = {}
         """By origin: the newest attestation that covers no more than what is held. Never of the own id."""
@@ -469,9 +471,11 @@ class Attested:
 
         message: what the replica has composed last. to_all: it is for all in range. final: the state of its sender is.
         """
-        became_final, self._final = final and not self._final, final
-        due = (message.step + self._place) % self._every == 0 or became_final
-        own = [self._own(replica, message.step)] if due and to_all else []
+        if final and not self._final:
+            self._final, self._due_step = True, message.step
+        own = []
+        if to_all and message.step >= self._due_step and replica.in_contact:
+            own, self._due_step = [self._own(replica, message.step)], message.step + self._every
         proofs = self._proofs(replica, message) if replica.config.proving else {}
         if not own and not proofs:
             return message

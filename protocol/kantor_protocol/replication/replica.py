@@ -254,6 +254,11 @@ class Replica:
         message = self._out[:end].tobytes()
         return message[:end_of_vector], message[end_of_vector:end_of_logs], message[end_of_logs:]
 
+    @property
+    def in_contact(self) -> bool:
+        """Whether the message that was composed last is for anybody from whom a message was received lately."""
+        return self.config.beacon or self._least.item(self.config.me) >= 0
+
     def claims_to_prove(
         self, attested: npt.NDArray[np.int64], sent: npt.NDArray[np.int64]
     ) -> list[int]:

@@ -39,10 +39,10 @@ KNOWN_MAX = (1 << 31) - 2
 UNITS_MAX = 1 << 62
 """No participant ships more units."""
 
-BLOCK = 128
+BLOCK = 32
 """Entries of a log whose hash is one link of a chain; see `attested.py`."""
 
-REST_BLOCKS_MAX = 2048
+REST_BLOCKS_MAX = 4096
 """Blocks of which a message holds the hash instead of the entries, at most."""
 
 # Rows of ReplicaArrays.claims.
