@@ -49,7 +49,6 @@ from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import (
     BLOCK,
     ENTRIES_MAX,
-    HELD,
     NO_INDEX,
     SAMPLE,
     SINCE_NS,
@@ -185,10 +184,8 @@ def read_word(rules: Rules, source: int, message: GossipMessage) -> Word | None:
         or not all(_is_sound(rules, covered, each) for each in attestations)
     ):
         return None
-    parts = message.logs, message.claims, message.registers
-    trusted = source % config.roster == rules.supervisor
-    if trusted or not speaks_of_others(*parts, covered, rules.valued, source):
-        return None if any(message.proofs) else Word(attestations, parts)
+    if is_own_word(rules, source, message):
+        return None if any(message.proofs) else Word(attestations, parts_of(message))
     proofs = {origin: proof for origin, proof in zip(others, message.proofs, strict=True) if proof}
     suffixes = _read_suffixes(rules, source, message.logs, by_origin, proofs)
     registers = _read_registers(rules, source, message.registers, covered, by_origin)
@@ -199,6 +196,21 @@ def read_word(rules: Rules, source: int, message: GossipMessage) -> Word | None:
     own = _without(message.logs, [each.part for each in suffixes])
     parts = own, message.claims, _without(message.registers, registers)
     return Word(attestations, parts, tuple(suffixes), tuple(registers))
+
+
+def is_own_word(rules: Rules, source: int, message: GossipMessage) -> bool:
+    """Whether the parts of a message need no proof: they are of its source alone, or of the supervisor."""
+    config, covered = rules.config, 0
+    if source % config.roster == rules.supervisor:
+        return True
+    if message.registers:
+        covered = count_ids(message.version_vector, config.roster, 2 if config.claims else 1)
+    return not speaks_of_others(*parts_of(message), covered, rules.valued, source)
+
+
+def parts_of(message: GossipMessage) -> Parts:
+    """The parts of a message that are merged."""
+    return message.logs, message.claims, message.registers
 
 
 def _is_sound(rules: Rules, covered: int, attestation: Attestation) -> bool:
@@ -322,7 +334,11 @@ class Attested:
 
     def merge(self, replica: Replica, source: int, message: GossipMessage) -> bool:
         """Merge a message of an origin, but what is unproven; False, and nothing changed, when it must be refused."""
-        word = read_word(self._rules_of(replica), source, message)
+        rules = self._rules_of(replica)
+        proven = message.attestations or message.proofs
+        if not proven and is_own_word(rules, source, message):
+            return replica.merge(source, message.version_vector, *parts_of(message))
+        word = read_word(rules, source, message)
         if word is None:
             return False
         lies = {
@@ -362,29 +378,19 @@ class Attested:
         logs, claims, registers = word.parts
         for suffix in word.suffixes:
             part = suffix.part
-            if part.origin not in doubted and self._is_next(replica, suffix):
+            if part.origin not in doubted:
                 logs += message.logs[part.begin : part.end]
         for part in word.registers:
             if part.origin not in doubted:
                 registers += message.registers[part.begin : part.end]
-        if replica.config.claims:
-            claims += packed_claims(
-                [
-                    (each.origin, *each.claim)
-                    for each in word.attestations
-                    if each.origin != source and each.claim[0] and each.origin not in doubted
-                ]
-            )
+        attested = [
+            (each.origin, *each.claim)
+            for each in word.attestations
+            if each.claim[0] and each.origin != source and each.origin not in doubted
+        ]
+        if attested:
+            claims += packed_claims(attested)
         return logs, claims, registers
-
-    def _is_next(self, replica: Replica, suffix: ProvenSuffix) -> bool:
-        """Whether a suffix begins within what is held, and its participant can have shipped it besides."""
-        origin, start = suffix.part.origin, suffix.part.first
-        held, config = self._held(replica, origin), replica.config
-        if start > held:
-            return False
-        shipped = replica.store.shipped[HELD, origin % config.roster :: config.roster].sum()
-        return int(shipped) + suffix.entries[held - start :, 1].sum() <= config.spend_max
 
     def _held(self, replica: Replica, origin: int) -> int:
         """Entries held of a log that can be attested."""

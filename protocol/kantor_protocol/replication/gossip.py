@@ -243,7 +243,7 @@ def _nothing_held(origins: int) -> ReplicaArrays:
         claims=np.zeros((4, origins), dtype=np.int64),
         lowered=none32,
         mark=none32,
-        shipped=np.zeros((2, origins), dtype=np.int64),
+        shipped=np.zeros(origins, dtype=np.int64),
         counters=none64,
     )
 

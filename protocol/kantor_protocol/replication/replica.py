@@ -134,7 +134,7 @@ class Replica:
             claims=_no_claims(origins),
             lowered=np.zeros(weighed, dtype=np.int32),
             mark=np.zeros(weighed, dtype=np.int32),
-            shipped=np.zeros((2, origins), dtype=np.int64),
+            shipped=np.zeros(origins, dtype=np.int64),
             counters=np.array([0, 1, weighed], dtype=np.int64),
         )
         """The arrays that kernels work on. ReplicaArrays states which of them agree with which."""
@@ -227,8 +227,7 @@ class Replica:
         sending = _nothing_sent(origins, self.config.ack_timeout_steps)
         claims = _no_claims(origins)
         sending[:, :before], claims[:, :before] = old.sending, old.claims
-        shipped = np.zeros((2, origins), dtype=np.int64)
-        shipped[:, :before] = old.shipped
+        shipped = _extended(old.shipped, origins)
         logs = old.logs
         if self.config.ledger:
             logs = np.zeros((origins, *old.logs.shape[1:]), dtype=np.int32)
@@ -306,7 +305,7 @@ class Replica:
         assert store.claims.shape == (4, origins)
         assert store.lowered.shape == store.mark.shape == (samples,)
         assert samples in {0, config.bound}
-        assert store.shipped.shape == (2, origins)
+        assert store.shipped.shape == (origins,)
         assert self.offered.shape == (origins,)
         assert config.proving != (self.offered is store.length)
         assert ((self.offered >= 0) & (self.offered <= store.length)).all()
@@ -344,13 +343,13 @@ class Replica:
 
     def _validate_shipped(self) -> None:
         store, config = self.store, self.config
-        units, arriving = store.shipped
-        assert not arriving.any()
         if not config.ledger:
-            assert not units.any()
+            assert not store.shipped.any()
             return
-        assert units.tolist() == [log[:, 1].sum(dtype=np.int64) for log in self._held_logs()]
-        by_place = units.reshape(-1, config.roster).sum(axis=0)
+        assert store.shipped.tolist() == [
+            log[:, 1].sum(dtype=np.int64) for log in self._held_logs()
+        ]
+        by_place = store.shipped.reshape(-1, config.roster).sum(axis=0)
         others = np.arange(config.roster) != config.me % config.roster
         assert (by_place[others] <= config.spend_max).all()
 

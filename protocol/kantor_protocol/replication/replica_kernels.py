@@ -51,9 +51,6 @@ SAMPLE, SINCE_NS, STAMP, STAMP_STEP = 0, 1, 2, 3
 # Rows of ReplicaArrays.sending; from HISTORY on, one for each step of the acknowledgement timeout.
 SENT, REPEATED_STEP, RECEIVED_STEP, HISTORY = 0, 1, 2, 3
 
-# Rows of ReplicaArrays.shipped.
-HELD, ARRIVING = 0, 1
-
 # Entries of ReplicaArrays.counters.
 LOWERED, STEP, HOLDING = 0, 1, 2
 
@@ -92,8 +89,8 @@ class ReplicaArrays(NamedTuple):
     """(N,) the step at which an index was put into `lowered`: the current one for those in it, an earlier one for all
     others."""
     shipped: npt.NDArray[np.int64]
-    """(2, n), with a ledger. HELD: the sum of values of all entries held of each log; all incarnations of another
-    participant together at most `ReplicaConfig.spend_max`. ARRIVING: scratch for each place, 0 between two messages."""
+    """(n,) the sum of values of all entries held of each log, with a ledger; 0 otherwise. All incarnations of another
+    participant together at most `ReplicaConfig.spend_max`."""
     counters: npt.NDArray[np.int64]
     """(3,): LOWERED, how many indices are in `lowered`; STEP, the current step; HOLDING, how many weights are
     above 0."""
@@ -148,18 +145,16 @@ def _append(store: ReplicaArrays, row: int, origin: int, index: int, value: int)
 @kernel
 def _append_spending(store: ReplicaArrays, origin: int, index: int, value: int) -> None:
     _append(store, origin, origin, index, value)
-    store.shipped[HELD, origin] += value
+    store.shipped[origin] += value
 
 
 @kernel
-def _is_affordable(store: ReplicaArrays, config: ReplicaConfig, origin: int, units: int) -> bool:
-    """Count units that arrive of an origin; whether its participant can have shipped them with all that is held."""
-    place = origin % config.roster
-    store.shipped[ARRIVING, place] += units
-    total = store.shipped[ARRIVING, place]
-    for each in range(place, store.length.shape[0], config.roster):
-        total += store.shipped[HELD, each]
-    return bool(total <= config.spend_max)
+def _unspent(store: ReplicaArrays, config: ReplicaConfig, origin: int) -> int:
+    """Units that the participant of an origin can have shipped beside all that is held of it."""
+    left = config.spend_max
+    for each in range(origin % config.roster, store.length.shape[0], config.roster):
+        left -= store.shipped[each]
+    return left
 
 
 @kernel
@@ -196,6 +191,8 @@ def _walk_suffixes(
 ) -> int:
     """Read all suffixes, of the first `covered` origins; apply what is new, or only check.
 
+    Of a log that ships more than its participant has, what is too much is not applied; it is malformed in the message of
+    its own origin, and where one suffix has more by itself.
     Returns how many entries some log may then hold, or a negative number when malformed.
     """
     ledger = config.ledger
@@ -220,6 +217,7 @@ def _walk_suffixes(
             longest = store.length[config.me] + entries
         elif start <= held + entries:  # it may follow on another suffix in this message
             longest = max(longest, start + span)
+        left = _unspent(store, config, origin) if ledger else config.spend_max
         fresh = origin != config.me and (not ledger or start <= held < start + count)
         if apply and not fresh:
             at = skip_numbers(suffixes, at, 2 * count if config.value_max > 0 else count)
@@ -236,9 +234,9 @@ def _walk_suffixes(
                 return -1
             if not ledger or start + i >= held:
                 units += value
-                if apply:
+                if apply and (not ledger or units <= left):
                     _merge_entry(store, config, origin, index, value)
-        if ledger and not apply and units > 0 and not _is_affordable(store, config, origin, units):
+        if ledger and not apply and units > (left if origin == source else config.spend_max):
             return -1
         if apply and not ledger and start <= held:
             store.length[origin] = max(held, start + span)
@@ -317,7 +315,6 @@ def _check(
     if not 0 <= source < covered or source == config.me:
         return MALFORMED
     longest = _walk_suffixes(store, config, suffixes, source, covered, False)
-    store.shipped[ARRIVING, : config.roster] = 0
     if longest < 0 or _walk_claims(store, config, claimed, covered, False) < 0:
         return MALFORMED
     return longest
