@@ -24,10 +24,11 @@ def run(
 
     def build(mission: Mission, body: Body) -> StateMachine:
         me, scenario, seed = identity.user, mission.scenario, mission.seed
+        identities = mission.identities
         if mission.frame is not None:
             from kantor_agent.robots.mapping import MappingRobot  # noqa: PLC0415  only where there is a map
 
-            return MappingRobot(me, scenario, seed, body, mission.frame)
-        return DensityRobot(me, scenario, seed, body, mission.samples.open("<f8", 2))
+            return MappingRobot(me, scenario, seed, body, mission.frame, identities)
+        return DensityRobot(me, scenario, seed, body, mission.samples.open("<f8", 2), identities)
 
     return participate(connect, identity, build, connect_timeout_s, say, state)

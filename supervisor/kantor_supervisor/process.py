@@ -24,10 +24,11 @@ def run(
 
     def build(mission: Mission, body: Body) -> StateMachine:
         me, scenario = identity.user, mission.scenario
+        identities = mission.identities
         if mission.frame is not None:
             from kantor_supervisor.mapping import MappingSupervisor  # noqa: PLC0415  only on a map
 
-            return MappingSupervisor(me, scenario, mission.seed, body, mission.frame)
-        return DensitySupervisor(me, scenario, body, mission.samples.shape[0])
+            return MappingSupervisor(me, scenario, mission.seed, body, mission.frame, identities)
+        return DensitySupervisor(me, scenario, body, mission.samples.shape[0], identities)
 
     return participate(connect, identity, build, connect_timeout_s, say, state)

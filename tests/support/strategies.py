@@ -27,7 +27,9 @@ from kantor_protocol.base.machine import (
 )
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import HASH_BYTES, Attestation
 from kantor_protocol.wire.messages import GossipMessage
+from kantor_protocol.wire.signatures import SIGNATURE_BYTES
 from kantor_supervisor.density import DensitySupervisor
 
 Points = npt.NDArray[np.float64]
@@ -214,6 +216,17 @@ def crowds(draw: st.DrawFn) -> Points:
 
 # Messages.
 
+ATTESTATIONS = st.builds(
+    Attestation,
+    origin=COUNTS,
+    step=COUNTS,
+    length=COUNTS,
+    log=st.binary(min_size=HASH_BYTES, max_size=HASH_BYTES),
+    claim=st.tuples(COUNTS, COUNTS, COUNTS),
+    register_stamp=COUNTS,
+    register=st.sampled_from([b"", bytes(HASH_BYTES)]),
+    signature=st.binary(min_size=SIGNATURE_BYTES, max_size=SIGNATURE_BYTES),
+)
 NEWS = st.builds(
     GossipMessage,
     version=st.just(1),
@@ -225,6 +238,7 @@ NEWS = st.builds(
     claims=st.binary(max_size=40),
     registers=st.binary(max_size=40),
     incarnation=st.integers(0, 15),
+    attestations=st.lists(ATTESTATIONS, max_size=2).map(tuple),
 )
 POSES = st.builds(Pose, x_m=FINITE, y_m=FINITE, heading_rad=FINITE, speed_m_s=FINITE)
 ENVELOPES = st.builds(

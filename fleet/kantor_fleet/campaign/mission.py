@@ -15,9 +15,10 @@ from kantor_fleet.campaign.keyed_draws import KeyedDraws
 from kantor_fleet.campaign.merge_convergence import merge_shuffled
 from kantor_fleet.campaign.rare_events import RareEvents
 from kantor_fleet.execution.experiment import Case, Outcome, reason
-from kantor_fleet.execution.in_process_team import play, team
+from kantor_fleet.execution.in_process_team import play, team, team_identities
 from kantor_protocol.base.machine import WORLD_SIM
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Identities
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.in_process import InProcessExchange
@@ -26,7 +27,7 @@ from kantor_worldsim.observers.checkers.liveness import LivenessChecker
 from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.record.journal import Digest, Journal, read
-from kantor_worldsim.record.records import Opening, Record, decode_record, encode_record
+from kantor_worldsim.record.records import Opening, Record, decode_record
 from kantor_worldsim.record.run_folder import JOURNAL
 from kantor_worldsim.world.world import WorldSetup
 
@@ -134,7 +135,8 @@ class Follower:
         scenario, seed = self._scenario, self._seed
         setup = WorldSetup.of(scenario, seed)
         machines = team(scenario, seed, setup)
-        simulation = Simulation(scenario, seed, setup, [self.observe])
+        identities = team_identities(scenario, seed)
+        simulation = Simulation(scenario, seed, setup, [self.observe], identities)
         if self._invariants is not None:
             self._invariants.watch({**machines, WORLD_SIM: simulation})
         exchange = InProcessExchange(machines)
@@ -145,7 +147,7 @@ class Follower:
         self.payloads.append(self.recording.observe(record).payload)
         self.fault_coverage.observe(record)
         self.rare_events.observe(record)
-        if self._invariants is not None and not isinstance(record, Opening):
+        if self._invariants is not None and not isinstance(record, Opening | Identities):
             self._invariants.count(record.now_ns)
 
     @property
@@ -209,7 +211,7 @@ def _run_again(scenario: Scenario, seed: int, digest: str) -> Iterable[str]:
     """A violation if the mission, run again from its scenario and seed, has another digest."""
     again = Digest()
     setup = WorldSetup.of(scenario, seed)
-    play(scenario, seed, setup, [lambda record: again.add(encode_record(record))])
+    play(scenario, seed, setup, [again.follow])
     if again.hex != digest:
         yield f"digest: executed twice, and {again.hex} is not {digest}"
 

@@ -48,7 +48,7 @@ from kantor_worldsim.engine.process_faults import schedule_of
 from kantor_worldsim.observers.checkers.liveness import LivenessChecker
 from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.record.journal import Digest, read
-from kantor_worldsim.record.records import Batch, ProcessEvent, Record, encode_record
+from kantor_worldsim.record.records import Batch, ProcessEvent, Record
 from kantor_worldsim.record.run_folder import JOURNAL, SCENARIO
 from kantor_worldsim.world.world import WorldSetup
 
@@ -267,12 +267,7 @@ def _process_events(records: Sequence[Record]) -> list[ProcessEvent]:
 def _run_again(scenario: Scenario, seed: int, digest: str) -> Iterator[str]:
     """A violation if the mission of a lockstep run has another digest in this process."""
     alone = Digest()
-    play(
-        scenario,
-        seed,
-        WorldSetup.of(scenario, seed),
-        [lambda record: alone.add(encode_record(record))],
-    )
+    play(scenario, seed, WorldSetup.of(scenario, seed), [alone.follow])
     if alone.hex != digest:
         yield f"digest: {digest} over the bus, {alone.hex} in process"
 

@@ -1,5 +1,10 @@
-"""The participants of a scenario as objects, and a mission of theirs inside one process."""
+"""The participants of a scenario as objects, and a mission of theirs inside one process.
 
+With `trust = "signed"` their keys follow from the seed: here they keep nobody out, and the same mission gives the same
+signatures.
+"""
+
+import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
@@ -7,8 +12,11 @@ from kantor_agent.robots.density import DensityRobot
 from kantor_agent.robots.mapping import MappingRobot
 from kantor_protocol.base.machine import SUPERVISOR, Body, ParticipantId, StateMachine
 from kantor_protocol.node.recovery import KillableNode
+from kantor_protocol.node.signing import Signing
 from kantor_protocol.scenario.faults.processes import Kill
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Identities
+from kantor_protocol.wire.signatures import Ed25519Key
 from kantor_supervisor.density import DensitySupervisor
 from kantor_supervisor.mapping import MappingSupervisor
 from kantor_worldsim.engine.event_loop import simulate
@@ -20,25 +28,57 @@ from kantor_worldsim.world.world import WorldSetup
 def team(scenario: Scenario, seed: int, setup: WorldSetup) -> dict[ParticipantId, StateMachine]:
     """All participants of the roster; a `KillableNode` for each that the scenario kills."""
     killed = {name for fault in scenario.faults if isinstance(fault, Kill) for name in fault.who}
+    identities = team_identities(scenario, seed)
     made: dict[ParticipantId, StateMachine] = {}
     for name, pose in setup.poses(scenario).items():
-        build, body = partial(participant, name, scenario, seed, setup), Body(pose)
-        made[name] = KillableNode(build, body) if name in killed else build(body)
+        build = partial(_member, name, scenario, seed, setup, identities)
+        made[name] = KillableNode(build, Body(pose)) if name in killed else build(Body(pose))
     return made
 
 
-def participant(
-    name: ParticipantId, scenario: Scenario, seed: int, setup: WorldSetup, body: Body
+def team_identities(scenario: Scenario, seed: int) -> Identities | None:
+    """Whose word counts in a mission in this process; None with `trust = "open"`."""
+    if not scenario.signed:
+        return None
+    keys = {name: _key(seed, name).public for name in scenario.roster}
+    return Identities(f"{scenario.name}, seed {seed}", keys)
+
+
+def _key(seed: int, name: ParticipantId) -> Ed25519Key:
+    secret = hashlib.blake2b(name.encode(), digest_size=32, key=seed.to_bytes(8, "little"))
+    return Ed25519Key(secret.digest())
+
+
+def _member(
+    name: ParticipantId,
+    scenario: Scenario,
+    seed: int,
+    setup: WorldSetup,
+    identities: Identities | None,
+    body: Body,
 ) -> StateMachine:
-    """The state machine of a participant that takes over a body."""
+    """A participant that signs, if the mission is signed."""
+    machine = participant(name, scenario, seed, setup, body, identities)
+    return machine if identities is None else Signing(machine, identities.run, _key(seed, name))
+
+
+def participant(
+    name: ParticipantId,
+    scenario: Scenario,
+    seed: int,
+    setup: WorldSetup,
+    body: Body,
+    identities: Identities | None = None,
+) -> StateMachine:
+    """The state machine of a participant that takes over a body. identities: with `trust = "signed"`."""
     frame = setup.ground.frame if setup.ground is not None else None
     if name == SUPERVISOR:
         if frame is not None:
-            return MappingSupervisor(name, scenario, seed, body, frame)
-        return DensitySupervisor(name, scenario, body, setup.samples_m.shape[0])
+            return MappingSupervisor(name, scenario, seed, body, frame, identities)
+        return DensitySupervisor(name, scenario, body, setup.samples_m.shape[0], identities)
     if frame is not None:
-        return MappingRobot(name, scenario, seed, body, frame)
-    return DensityRobot(name, scenario, seed, body, setup.samples_m)
+        return MappingRobot(name, scenario, seed, body, frame, identities)
+    return DensityRobot(name, scenario, seed, body, setup.samples_m, identities)
 
 
 def play(
@@ -51,6 +91,6 @@ def play(
     stopped: Callable[[], bool] = lambda: False,
 ) -> str:
     """Run a mission in this process; the reason of its end. machines: instead of the scenario's team."""
-    simulation = Simulation(scenario, seed, setup, observers)
+    simulation = Simulation(scenario, seed, setup, observers, team_identities(scenario, seed))
     exchange = InProcessExchange(machines or team(scenario, seed, setup))
     return simulate(simulation, exchange, seed, stopped, exchange)

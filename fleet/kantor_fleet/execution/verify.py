@@ -11,11 +11,17 @@ import msgspec
 from kantor_fleet.execution.experiment import reason
 from kantor_fleet.execution.in_process_team import participant, play
 from kantor_fleet.exits import Exit, fail
-from kantor_protocol.base.machine import WORLD_SIM, Outputs, ParticipantId, StateMachine
+from kantor_protocol.base.machine import WORLD_SIM, Envelope, Outputs, ParticipantId, StateMachine
 from kantor_protocol.files.reading import UnreadableError, read_text
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario
-from kantor_protocol.wire.messages import RefusedError
+from kantor_protocol.wire.attestations import (
+    Attestation,
+    Identities,
+    is_genuine,
+    unsigned_outputs,
+)
+from kantor_protocol.wire.messages import RefusedError, decode_gossip
 from kantor_worldsim.engine.process_faults import ProcessFaults
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.record import behaviour
@@ -30,6 +36,7 @@ from kantor_worldsim.record.records import (
     Record,
     StepRecord,
     encode_record,
+    without_signatures,
 )
 from kantor_worldsim.record.run_folder import JOURNAL, MANIFEST, Manifest
 from kantor_worldsim.world.inputs import InputFile, changes_since, inputs_of
@@ -73,7 +80,8 @@ def findings(folder: Path, records: list[tuple[bytes, Record]] | None = None) ->
         )
     drawn_anew = not changes and (bool(inputs) or not _names_files(opening.scenario))
     execution = partial(_finding_of_execution, drawn_anew=drawn_anew)
-    judges = (_finding_of_checker, execution)
+    signed = (_finding_on_signatures,) if opening.scenario.signed else ()
+    judges = (*signed, _finding_of_checker, execution)
     return [*found, *(_judged(judge, manifest, records) for judge in judges)]
 
 
@@ -139,8 +147,8 @@ def _findings_on_file(
         yield True, f"{JOURNAL}: {manifest.record}; {len(records)} records up to then"
         return
     digest = Digest()
-    for payload, _ in records:
-        digest.add(payload)
+    for payload, record in records:
+        digest.follow(record, payload)
     same = digest.hex == manifest.digest and digest.records == manifest.records
     yield same, f"digest of {digest.records} records: {digest.hex}"
 
@@ -163,6 +171,39 @@ def _finding_of_checker(manifest: Manifest, records: list[tuple[bytes, Record]])
     if not checker.count:
         return True, "checker: all rules held"
     return False, f"checker: {checker.count} violations, first: {checker.violations[0]}"
+
+
+def _finding_on_signatures(_manifest: Manifest, records: list[tuple[bytes, Record]]) -> Finding:
+    """Whether every attestation that a participant has sent is signed by its origin, with the keys on record."""
+    opening, identities = records[0][1], _identities_in(records)
+    assert isinstance(opening, Opening)
+    if identities is None:
+        return False, "signatures: the record does not say whose word counts"
+    roster, count = opening.scenario.roster, 0
+    for _, record in records:
+        for step_record in record.step_records if isinstance(record, Batch) else ():
+            for envelope in step_record.outputs.outbox if step_record.outputs else ():
+                for attestation in _attestations_in(envelope):
+                    count += 1
+                    origin = roster[attestation.origin % len(roster)]
+                    if not is_genuine(identities, origin, attestation):
+                        at_s = f"t={step_record.now_ns * 1e-9:.3f} s"
+                        what = f"{step_record.name} sends what {origin} has not signed"
+                        return False, f"signatures: {at_s}: {what}, step {attestation.step}"
+    return True, f"signatures: {count} attestations, all signed by their origins"
+
+
+def _attestations_in(envelope: Envelope) -> tuple[Attestation, ...]:
+    """What a receiver finds in an envelope, which refuses a malformed one."""
+    try:
+        return decode_gossip(envelope.body).attestations
+    except RefusedError:
+        return ()
+
+
+def _identities_in(records: list[tuple[bytes, Record]]) -> Identities | None:
+    """Whose word counts in a run; None with `trust = "open"`."""
+    return next((record for _, record in records[1:2] if isinstance(record, Identities)), None)
 
 
 def _finding_of_execution(
@@ -197,37 +238,48 @@ def _unscheduled(scenario: Scenario, records: list[tuple[bytes, Record]]) -> Ite
 def _executed(
     opening: Opening, records: list[tuple[bytes, Record]], *, drawn_anew: bool
 ) -> Finding:
-    """Execute the run again in this process, and compare it record by record.
+    """Execute the run again in this process, and compare it record by record, of a signed run without signatures.
 
     drawn_anew: draw what it starts from again as well, and read its files; else take that from the record.
     """
     scenario, seed = opening.scenario, opening.seed
     setup = WorldSetup.of(scenario, seed) if drawn_anew else opening.setup
-    expected = iter(payload for payload, _ in records)
+    expected = [each for each in records if not isinstance(each[1], Identities)]
+    bare = _unsigned if scenario.signed else _as_it_is
     compared, differing = 0, -1
 
     def compare(record: Record) -> None:
         nonlocal compared, differing
-        payload = next(expected, None)
-        if payload is None or differing >= 0:
+        if isinstance(record, Identities) or compared == len(expected) or differing >= 0:
             return
-        if payload != encode_record(record):
+        if bare(*expected[compared]) != bare(encode_record(record), record):
             differing = compared
         compared += 1
 
     whole = isinstance(records[-1][1], Ending)
-    steps = len(records) - (1 if whole else 0)
+    steps = len(expected) - (1 if whole else 0)
     play(scenario, seed, setup, [compare], stopped=lambda: compared >= steps or differing >= 0)
     if differing >= 0:
         return False, f"executed again: record {differing} differs"
-    if compared < len(records):
-        return False, f"executed again: {compared} records, the journal has {len(records)}"
-    return True, f"executed again: {compared} records, every byte the same"
+    if compared < len(expected):
+        return False, f"executed again: {compared} records, the journal has {len(expected)}"
+    extent = "every byte but signatures" if scenario.signed else "every byte"
+    return True, f"executed again: {compared} records, {extent} the same"
+
+
+def _as_it_is(payload: bytes, _record: Record) -> bytes:
+    return payload
+
+
+def _unsigned(payload: bytes, record: Record) -> bytes:
+    """An encoded record with all signatures zeroed."""
+    bare = without_signatures(record)
+    return payload if bare is record else encode_record(bare)
 
 
 def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Finding:
     """Step every participant again from its recorded inputs, and compare its outputs."""
-    team = _ReplayedTeam(opening)
+    team = _ReplayedTeam(opening, _identities_in(records))
     steps = 0
     for _, record in records:
         if isinstance(record, ProcessEvent):
@@ -242,7 +294,7 @@ def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Finding:
                 except (KeyError, RefusedError):
                     line = f"{name} received at t={step_record.now_ns} a message that was not sent"
                     return False, f"replayed: {line}"
-                if outputs != recorded:
+                if unsigned_outputs(outputs) != unsigned_outputs(recorded):
                     return False, f"replayed: {name} differs at its step {recorded.step}"
                 steps += 1
             team.envelopes.add(record)
@@ -252,7 +304,8 @@ def _replayed(opening: Opening, records: list[tuple[bytes, Record]]) -> Finding:
 class _ReplayedTeam:
     """The participants of a record. A new incarnation takes over the body in the state that the world knows."""
 
-    def __init__(self, opening: Opening) -> None:
+    def __init__(self, opening: Opening, identities: Identities | None) -> None:
+        self._identities = identities
         self.envelopes = EnvelopeIndex()
         self._opening = opening
         self._setup = opening.setup
@@ -283,4 +336,6 @@ class _ReplayedTeam:
 
     def _participant(self, name: ParticipantId) -> StateMachine:
         opening, body = self._opening, self._world.body(name)
-        return participant(name, opening.scenario, opening.seed, self._setup, body)
+        return participant(
+            name, opening.scenario, opening.seed, self._setup, body, self._identities
+        )

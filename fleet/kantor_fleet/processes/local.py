@@ -31,7 +31,7 @@ from kantor_protocol.node.runner import RejectedError, StateError
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.transport import credentials
 from kantor_protocol.transport.client import ObserverSession, observer_session
-from kantor_protocol.transport.credentials import Identity, Password
+from kantor_protocol.transport.credentials import Identity, Password, public_key
 from kantor_protocol.transport.endpoint import free_endpoint
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import BusError
@@ -417,7 +417,10 @@ def _be_world_sim(
         except ResumeError:  # nothing has happened yet
             past = None
     setup = WorldSetup.of(scenario, seed) if past is None else past.opening.setup
-    mission = MissionConfig(scenario, seed, setup, config.exchange, config.speed)
+    keys = {name: public_key(identities[name]) for name in scenario.roster}
+    mission = MissionConfig(
+        scenario, seed, setup, config.exchange, config.speed, keys=keys if scenario.signed else {}
+    )
     # The terminal and the parent may both send the signal: one Ctrl-C must not count as two.
     with Interrupts(patient=True) as interrupts:
         if stopping:

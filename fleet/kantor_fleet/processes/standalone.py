@@ -6,6 +6,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+from msgspec import UNSET
+
 from kantor_fleet.exits import Exit, fail, warn
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.processes import resume_pointer
@@ -22,6 +25,7 @@ from kantor_protocol.transport.credentials import (
 from kantor_protocol.transport.endpoint import await_endpoint, check_endpoint, is_tls
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.zenoh_log import host_log, init_log
+from kantor_protocol.wire.attestations import Identities
 
 if TYPE_CHECKING:
     from kantor_worldsim.exchange.config import MissionConfig
@@ -61,12 +65,12 @@ def host_standalone(
 
     with ExitStack() as stack:
 
-        def record() -> tuple[Path, "Recording"]:
-            folder = folder_for(scenario, seed, out)
+        def record(mission: Scenario) -> tuple[Path, "Recording"]:
+            folder = folder_for(mission, seed, out)
             stack.enter_context(FolderLock(folder))
             if state is not None:
                 resume_pointer.note(state, folder)
-            return folder, Recording(scenario, seed, exchange, folder, exact_every, speed=speed)
+            return folder, Recording(mission, seed, exchange, folder, exact_every, speed=speed)
 
         return _host(plan, listen, secrets, fleet, record)
 
@@ -92,9 +96,9 @@ def _go_on(folder: Path, past: "Past", listen: str, secrets: Path, fleet: str | 
     _check_resumable(folder, past)
     plan = MissionConfig(scenario, seed, opening.setup, exchange, terms.speed)
 
-    def record() -> tuple[Path, "Recording"]:
+    def record(mission: Scenario) -> tuple[Path, "Recording"]:
         every = terms.exact_every
-        return folder, Recording(scenario, seed, exchange, folder, every, past=past)
+        return folder, Recording(mission, seed, exchange, folder, every, past=past)
 
     return _host(plan, listen, secrets, fleet, record, past)
 
@@ -167,17 +171,21 @@ def _host(
     listen: str,
     secrets: Path,
     fleet: str | None,
-    record: "Callable[[], tuple[Path, Recording]]",
+    record: "Callable[[Scenario], tuple[Path, Recording]]",
     past: "Past | None" = None,
 ) -> Exit:
-    """Host a mission. record: opens the run folder once the bus is up."""
+    """Host a mission. record: opens the run folder of the mission once the bus is up."""
     from kantor_fleet.execution.preload import warm_up  # noqa: PLC0415  standalone robots do not need these
     from kantor_fleet.report.progress import ProgressView  # noqa: PLC0415
     from kantor_fleet.report.summary import conclude, exit_code_of, read_result  # noqa: PLC0415
     from kantor_worldsim.exchange.main import run  # noqa: PLC0415
 
+    identity, keys = _host_identity(listen, secrets, fleet, plan.scenario)
+    if past is None:
+        plan = _with_trust(plan, identity, keys)
+    elif past.identities is not None:
+        _check_keys(past.identities, keys)
     scenario = plan.scenario
-    identity = _host_identity(listen, secrets, fleet, scenario)
     with (
         host_log(identity, lambda line: view.note(line)),  # noqa: PLW0108  view is defined below
         Interrupts() as interrupts,
@@ -187,7 +195,7 @@ def _host(
             warm_up()
         users = credentials.users_file(secrets)
         with HubRouter(identity, listen, users, scenario.roster, view.note) as host:
-            folder, recording = record()
+            folder, recording = record(scenario)
             view.note(f"world-sim of fleet {identity.fleet} at {listen}, credentials in {secrets}")
             for name in scenario.roster:
                 view.note(f"  {_joining(name, listen, secrets)}")
@@ -209,16 +217,61 @@ def _joining(name: ParticipantId, listen: str, secrets: Path) -> str:
     return f"kantor {verb} --connect {endpoint} --credentials {file}"
 
 
-def _host_identity(listen: str, place: Path, fleet: str | None, scenario: Scenario) -> Identity:
-    """World-sim's identity for a mission with this roster. Raises BusError, CredentialsError.
+def _with_trust(
+    plan: "MissionConfig", identity: Identity, keys: dict[ParticipantId, bytes]
+) -> "MissionConfig":
+    """The plan with the keys of a signed mission; by default it is one over TLS. Raises CredentialsError.
 
-    Missing passwords are issued here; certificates never are.
+    keys: of the roster, empty where there is none.
+    """
+    scenario, members = plan.scenario, getattr(identity, "members", {})
+    unknown = [name for name in scenario.roster if not keys[name] and name in members]
+    if scenario.trust is UNSET and isinstance(identity, Certificate):
+        if unknown:
+            warn([f"trust stays open: {_no_keys(identity, unknown)}"])
+            return plan
+        scenario = msgspec.structs.replace(scenario, trust="signed")
+    if scenario.signed and unknown:
+        raise CredentialsError(f'trust = "signed": {_no_keys(identity, unknown)}')
+    return plan._replace(scenario=scenario, keys=keys if scenario.signed else {})
+
+
+def _no_keys(identity: Identity, names: list[ParticipantId]) -> str:
+    more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+    return (
+        f"the register has no key of {names[0]}{more}; `kantor keys {identity.fleet}` adds those whose files "
+        f"are beside it, and `--renew {names[0]}` makes one"
+    )
+
+
+def _check_keys(identities: Identities, keys: dict[ParticipantId, bytes]) -> None:
+    """Compare the keys of a run that goes on with those of today's credentials. Raises CredentialsError.
+
+    A run keeps its keys: what was signed before must count.
+    """
+    known = [name for name in identities.keys if keys[name]]
+    other = [name for name in known if keys[name] != identities.keys[name]]
+    if other and other == known:
+        raise CredentialsError(
+            "the run on record is signed with other keys; give the --credentials that it began with"
+        )
+    warn(f"{name} has another key than on record, and can take no more part" for name in other)
+
+
+def _host_identity(
+    listen: str, place: Path, fleet: str | None, scenario: Scenario
+) -> tuple[Identity, dict[ParticipantId, bytes]]:
+    """World-sim's identity for a mission with this roster, and the roster's public keys, as far as they are known.
+
+    Missing passwords are issued here; certificates never are. Raises BusError, CredentialsError.
     """
     if not is_tls(listen):
         name = fleet or _FLEET
         if not FLEET_PATTERN.fullmatch(name):
             fail(Exit.USAGE, f"--fleet {name}: use lower-case letters, digits and dashes")
-        return credentials.issue(place, name, scenario.roster)[credentials.HOST]
+        issued = credentials.issue(place, name, scenario.roster)
+        keys = {user: credentials.public_key(issued[user]) for user in scenario.roster}
+        return issued[credentials.HOST], keys
     identity = credentials.find(place, credentials.HOST)
     check_endpoint(listen, identity)
     if not isinstance(identity, Certificate):
@@ -229,7 +282,7 @@ def _host_identity(listen: str, place: Path, fleet: str | None, scenario: Scenar
         )
     _check_members(identity, scenario, place)
     warn(identity.warnings((*scenario.roster, credentials.OBSERVER), datetime.now(UTC)))
-    return identity
+    return identity, identity.public_keys(scenario.roster)
 
 
 def _check_members(identity: Certificate, scenario: Scenario, place: Path) -> None:

@@ -15,6 +15,7 @@ from kantor_protocol.base.machine import SUPERVISOR, ParticipantId, State
 from kantor_protocol.base.random_walk import RandomWalk
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.scenario.faults.processes import Late
+from kantor_protocol.wire.attestations import Identities
 from kantor_worldsim.observers.pipeline import Pipeline
 from kantor_worldsim.observers.recording import metrics_of
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent, Record, StepRecord
@@ -135,7 +136,7 @@ class RunHistory:
         self._pipeline.observe(record)
         if isinstance(record, ProcessEvent):
             self._follow_event(record)
-        if not isinstance(record, Opening):
+        if not isinstance(record, Opening | Identities):
             self.end_ns = max(self.end_ns, record.now_ns)
         if isinstance(record, Batch):
             for step_record in record.step_records:

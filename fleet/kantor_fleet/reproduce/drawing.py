@@ -31,6 +31,7 @@ from kantor_fleet.report.style import (
 )
 from kantor_fleet.reproduce.claims import Measure, interval
 from kantor_fleet.reproduce.measured_runs import MeasuredRun, Setting, records_of
+from kantor_protocol.wire.attestations import Identities
 from kantor_worldsim.observers.metrics.density import DensityRow
 from kantor_worldsim.record.records import Batch, Opening
 
@@ -214,6 +215,8 @@ def _runs_at(setting: Setting, ticks: Sequence[int], seed: int = 0) -> Iterator[
     opening = next(records)
     assert isinstance(opening, Opening)
     run, waiting = RunHistory(opening), next(records, None)
+    if isinstance(waiting, Identities):
+        waiting = next(records, None)
     for tick in ticks:
         until_ns = (tick + 1) * run.scenario.period_ns  # robots step at any phase of a period
         while isinstance(waiting, Batch) and waiting.now_ns < until_ns:

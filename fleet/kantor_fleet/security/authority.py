@@ -35,6 +35,7 @@ from kantor_protocol.transport.credentials import (
     CredentialsError,
     Member,
     expiry,
+    public_key,
     read,
     to_toml,
     write,
@@ -107,10 +108,9 @@ def issue(folder: Path, wanted: Wanted, now: datetime) -> list[str]:
         fresh = _fresh(before, authority, wanted)
         made = {user: _certify(authority, user, wanted.days, now) for user in fresh}
         moved = _moved(folder, authority, made)
-        issued = {user: Member(identity.name, identity.until) for user, identity in made.items()}
-        members = dict(
-            sorted((authority.members | issued).items(), key=lambda row: _sort_key(row[0]))
-        )
+        issued = {user: _member(identity) for user, identity in made.items()}
+        listed = _with_keys(folder, authority) | issued
+        members = dict(sorted(listed.items(), key=lambda row: _sort_key(row[0])))
         authority = msgspec.structs.replace(authority, members=members)
         routers = _routers(folder, before, authority, made)
 
@@ -124,6 +124,21 @@ def issue(folder: Path, wanted: Wanted, now: datetime) -> list[str]:
             _save(folder / f"{user}.toml", identity)
     changed = [] if before is None else [*routers, *moved]
     return _changes(folder, wanted, fresh, changed, first=before is None)
+
+
+def _member(identity: Certificate) -> Member:
+    """The entry of the member list for a certificate."""
+    return Member(identity.name, identity.until, public_key(identity).hex())
+
+
+def _with_keys(folder: Path, authority: Authority) -> dict[ParticipantId, Member]:
+    """The member list; keys that it lacks, since it was of an older version, from the identities in the folder."""
+    members = dict(authority.members)
+    for user, member in authority.members.items():
+        identity = None if member.key else read(folder / f"{user}.toml", Certificate)
+        if identity is not None and identity.name == member.name:
+            members[user] = _member(identity)
+    return members
 
 
 def _moved(

@@ -20,11 +20,12 @@ from pathlib import Path
 from kantor_protocol.base.machine import Body, Inputs, Outputs, StateMachine
 from kantor_protocol.node import memory_trim
 from kantor_protocol.node.recovery import RecoverableNode
+from kantor_protocol.node.signing import Signing
 from kantor_protocol.node.wal import WalFile
 from kantor_protocol.node.wall_clock import WallClock
 from kantor_protocol.storage import private_files
 from kantor_protocol.transport.client import ParticipantSession, participant_session
-from kantor_protocol.transport.credentials import Identity
+from kantor_protocol.transport.credentials import Identity, signing_key
 from kantor_protocol.wire.messages import (
     VERSION,
     Mission,
@@ -99,6 +100,7 @@ class _Runner:
     ) -> None:
         self._session = session
         self._me = identity.user
+        self._identity = identity
         self._build = build
         self._notify = notify
         self._path = state / f"{identity.user}.diary"
@@ -164,8 +166,26 @@ class _Runner:
         if ours is not None and ours.run == mission.run and self._covers(mission.body):
             self._send_ready()
             return
+        self._check_key(mission)
         self._mission, self._node, self._clock, self._requested = mission, None, None, None
         self._notify(f"{self._me}: mission {mission.scenario.name}, seed {mission.seed}")
+
+    def _check_key(self, mission: Mission) -> None:
+        """Raise RejectedError if nobody would believe this participant."""
+        if not mission.scenario.signed:
+            return
+        if mission.keys.get(self._me) != signing_key(self._identity).public:
+            raise RejectedError(
+                f"{self._me}: this mission knows it by another key; "
+                "use the credentials that the mission began with, or begin another"
+            )
+
+    def _build_signing(self, mission: Mission, body: Body) -> StateMachine:
+        """The machine for a mission; what it attests is signed on its way out, again after a recovery."""
+        machine = self._build(mission, body)
+        if not mission.scenario.signed:
+            return machine
+        return Signing(machine, mission.run, signing_key(self._identity))
 
     def _covers(self, body: Body) -> bool:
         """Whether the node is as far as world-sim's knowledge, or farther."""
@@ -203,7 +223,7 @@ class _Runner:
         if self._wal is not None:
             self._wal.close()
         self._wal = WalFile(self._path, mission.run)
-        node = RecoverableNode(partial(self._build, mission), self._wal, mission.body)
+        node = RecoverableNode(partial(self._build_signing, mission), self._wal, mission.body)
         self._node = node
         if node.step_count:
             how = "begins" if node.incarnation > mission.body.incarnation else "goes on as"

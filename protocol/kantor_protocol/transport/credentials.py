@@ -4,8 +4,12 @@ There are two kinds. A *password* is for a run on one machine: `kantor worldsim`
 `<id>.toml` for each identity and `users.txt` for the router. A *certificate* is for everything else: it is
 issued by the fleet's authority (`kantor keys`), and never by world-sim. World-sim's own certificate comes
 with the list of the members that it admits.
+
+With both a participant signs (`signing_key`): the key follows from the password, or is the certificate's. World-sim
+knows all public keys: it made the passwords, or has the member list.
 """
 
+import hashlib
 import os
 import re
 import secrets
@@ -21,6 +25,7 @@ from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.files.reading import UnreadableError, read_text
 from kantor_protocol.files.toml import TomlError, parse_toml
 from kantor_protocol.storage import private_files
+from kantor_protocol.wire.signatures import CertificateKey, Ed25519Key, SigningKey
 
 HOST = WORLD_SIM
 OBSERVER = "observer"
@@ -34,6 +39,9 @@ _PEM_MAX = 16_384
 FLEET_PATTERN = re.compile(r"[a-z0-9][a-z0-9-]{0,63}")
 NAME_PATTERN = re.compile(r"[a-z0-9-]{1,69}\.[0-9a-f]{16}")
 """Names of certificates."""
+_KEY_PATTERN = re.compile(r"|([0-9a-f]{2}){1,34}")
+_SIGNING = b"kantor signing"
+"""What a key is made from a password for; at most 16 bytes."""
 
 
 class CredentialsError(ValueError):
@@ -64,6 +72,13 @@ class Member(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Its common name: the identity's id, a dot, and the certificate's serial number in hexadecimal."""
     until: datetime
     """Its expiry (UTC)."""
+    key: str = ""
+    """Its public key, see `wire/signatures.py`, hexadecimal; empty in a list of an older version."""
+
+    def __post_init__(self) -> None:
+        """Check that the key can be one. Raises ValueError."""
+        if not _KEY_PATTERN.fullmatch(self.key):
+            raise ValueError("no public key")
 
 
 class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -114,6 +129,11 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             f"what answers is {user or 'nobody'}, not {' or '.join(map(str, known))}; do not trust it, "
             f"or use the newest {self.user}.toml"
         )
+
+    def public_keys(self, users: Iterable[ParticipantId]) -> dict[ParticipantId, bytes]:
+        """The public key of each of these users; empty for one that is not on the list, or without its key."""
+        listed = {user: member.key for user, member in self.members.items()}
+        return {user: bytes.fromhex(listed.get(user, "")) for user in users}
 
     def robots_by_site(self) -> dict[ParticipantId, tuple[ParticipantId, ...]]:
         """For each site the robots that it acts for: those that have not been revoked."""
@@ -172,6 +192,27 @@ class Certificate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 Identity = Password | Certificate
+
+
+def signing_key(identity: Identity) -> SigningKey:
+    """The key with which a participant signs. Raises CredentialsError."""
+    if isinstance(identity, Password):
+        key = hashlib.blake2b(identity.password.encode()).digest()
+        owner = f"{identity.fleet}/{identity.user}".encode()
+        return Ed25519Key(hashlib.blake2b(owner, digest_size=32, key=key, person=_SIGNING).digest())
+    try:
+        return CertificateKey(identity.key.encode())
+    except ValueError:
+        raise CredentialsError(
+            f"{identity.user}: its certificate's key cannot sign; "
+            f"`kantor keys {identity.fleet} --renew {identity.user}` makes another"
+        ) from None
+
+
+def public_key(identity: Identity) -> bytes:
+    """The public key of a participant. Raises CredentialsError."""
+    return signing_key(identity).public
+
 
 T = TypeVar("T")
 

@@ -25,7 +25,7 @@ from kantor_protocol.base.machine import (
     Pose,
 )
 from kantor_protocol.scenario.schema import Scenario
-from kantor_protocol.wire.attestations import Attestation
+from kantor_protocol.wire.attestations import Attestation, Identities
 
 VERSION = 1
 BODY_BYTES_MAX = 262_144
@@ -129,6 +129,11 @@ class Mission(_Message, frozen=True, array_like=True, tag=2):
     """The body that the participant takes over."""
     keys: dict[ParticipantId, bytes] = {}
     """With `trust = "signed"`: the public key of every participant, see `signatures.py`."""
+
+    @property
+    def identities(self) -> Identities | None:
+        """Whose word counts; None with `trust = "open"`."""
+        return Identities(self.run, self.keys) if self.scenario.signed else None
 
 
 class Refusal(_Message, frozen=True, array_like=True, tag=3):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import astuple
 
 from kantor_protocol.base.grid import Frame
 from kantor_protocol.base.machine import Body, Envelope, Inputs, Observation, Outputs, Pose, State
@@ -185,7 +186,7 @@ def test_independent_decoder_reads_gossip_messages(news: GossipMessage) -> None:
     """A record is a msgpack array: tag, version, fields in order. `msgpack` knows nothing more."""
     fields = [news.step, news.x_m, news.y_m, news.version_vector, news.logs, news.claims]
     attestations = [
-        msgspec.to_builtins(attestation, builtin_types=(bytes,))
+        [list(value) if isinstance(value, tuple) else value for value in astuple(attestation)]
         for attestation in news.attestations
     ]
     further = [news.registers, news.incarnation, list(news.proofs), attestations]

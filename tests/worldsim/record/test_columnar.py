@@ -302,6 +302,7 @@ def parts(body: bytes) -> tuple[int, bytes, bytes] | None:
     )
 
 
+_ATTESTATION = [0, 1, 2, b"h" * 16, [1, 2, 3], 4, b"", b"s" * 64]
 _ALL_FIELDS = GossipMessage(1, 0, 0.0, 0.0, b"", b"", b"\x00", b"\x00")
 
 
@@ -331,13 +332,22 @@ def test_a_gossip_message_has_the_parts_that_the_codec_decodes(
     "tree",
     [
         [1, 1, 7, 1, -2, b"h", b"l", b""],
-        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"more", 3, [1, {"a": 2}]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"more", 3, [], [1, {"a": 2}]],
         [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 15],
         [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 16],
         [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", -1],
         [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"more", "no epoch"],
         [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"more", b"no epoch", [1, {"a": 2}]],
         [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", 5, 5],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 1, [_ATTESTATION, _ATTESTATION]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 1, [[*_ATTESTATION, "more"]], "more"],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 1, [_ATTESTATION[:4]]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 1, [_ATTESTATION[:3]]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 1, [[0, 1, 2, b"h", [1, 2]]]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 1, [[0, 1, 2, b"h", [1, b"", 2]]]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 1, [[0, 1, 2, "h"]]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 1, [7]],
+        [1, 1, 7, 1.5, 2.5, b"h", b"l", b"", b"", 1, {}],
         [1, 2, 7, 1.5, 2.5, b"h", b"l", b""],
         [2, 1, 7, 1.5, 2.5, b"h", b"l", b""],
         [1, 1, -7, 1.5, 2.5, b"h", b"l", b""],
@@ -353,7 +363,7 @@ def test_a_gossip_message_has_the_parts_that_the_codec_decodes(
 def test_odd_gossip_messages_have_the_parts_that_the_codec_decodes(
     tree: Any, *, single: bool
 ) -> None:
-    """Whole metres, short floats, further fields, other versions, missing fields."""
+    """Whole metres, short floats, further fields, other versions, missing fields, attestations of any shape."""
     body = msgpack.packb(tree, use_single_float=single)
 
     assert parts(body) == readable(body)

@@ -23,6 +23,7 @@ from kantor_protocol.base.machine import (
 from kantor_protocol.scenario.faults.processes import Kill, OnProcesses
 from kantor_protocol.scenario.faults.schedule import AnyFault
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Identities
 from kantor_protocol.wire.messages import RefusedError, check_outputs
 from kantor_worldsim.engine.process_faults import schedule_of
 from kantor_worldsim.radio.channel import Channel, Sent
@@ -65,8 +66,14 @@ class Simulation:
     """A mission in progress. Steps and process events go in, records come out."""
 
     def __init__(
-        self, scenario: Scenario, seed: int, setup: WorldSetup, observers: Iterable[Observer]
+        self,
+        scenario: Scenario,
+        seed: int,
+        setup: WorldSetup,
+        observers: Iterable[Observer],
+        identities: Identities | None = None,
     ) -> None:
+        """identities: whose word counts, for the record of a mission with `trust = "signed"`."""
         self.scenario = scenario
         self.seed = seed
         self.now_ns = 0
@@ -103,6 +110,8 @@ class Simulation:
         for name in scenario.roster:
             self.channel.place(name, self._world.pose(name))
         self._emit(opening_of(scenario, seed, setup, self._world.first_look()))
+        if identities is not None:
+            self._emit(identities)
 
     @classmethod
     def resumed(
@@ -148,6 +157,8 @@ class Simulation:
             self.settle(record.now_ns, [self._step_of(made) for made in record.step_records])
         elif isinstance(record, ProcessEvent):
             self.note(record)
+        elif isinstance(record, Identities):
+            self._emit(record)
 
     def _step_of(self, made: StepRecord) -> Step:
         """The step that a record is of."""

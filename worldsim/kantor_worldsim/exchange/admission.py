@@ -10,6 +10,7 @@ it. An honest participant never sends such a report.
 3. An envelope speaks of incarnations that were there; of logs, claims and registers as far as their origins have
    written them; and an entry of a log is the one that its origin has consumed (ledger) or has sent first (map).
    With merge = "min" no weight is below what all spending leaves.
+4. With `trust = "signed"` every attestation in an envelope is signed by its origin, in this run.
 """
 
 import math
@@ -23,6 +24,7 @@ from kantor_protocol.base.varint import Pairs, sum_pairs
 from kantor_protocol.replication.gossip import MessageCheck, log_length_max
 from kantor_protocol.replication.occupancy_log import entries
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Identities, is_genuine
 from kantor_protocol.wire.messages import (
     OUTBOX_MAX,
     GossipMessage,
@@ -47,8 +49,12 @@ Entries = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 class Admission:
     """Judges reports by the records of a mission, all of which it observes."""
 
-    def __init__(self, scenario: Scenario, setup: WorldSetup) -> None:
-        """Nothing has happened yet."""
+    def __init__(
+        self, scenario: Scenario, setup: WorldSetup, identities: Identities | None = None
+    ) -> None:
+        """Nothing has happened yet. identities: with `trust = "signed"`."""
+        self._identities = identities
+        self._roster = scenario.roster
         roster, self._samples = len(scenario.roster), setup.samples_m.shape[0]
         units = None if setup.ground else units_of(scenario, self._samples)
         indices = entries(setup.ground.frame) if setup.ground else self._samples
@@ -157,8 +163,19 @@ class Admission:
             return f"an envelope of incarnation {message.incarnation}"
         if not self._receivers.passes(own, message):
             return "a malformed envelope"
+        if reason := self._refusal_of_attestations(message):
+            return reason
         arrays = (self._logs, self._written, self._consumed, self._stamps, self._settings)
         return REASONS[int(judge(*arrays, *_parts(message), message.registers, own, step))]
+
+    def _refusal_of_attestations(self, message: GossipMessage) -> str:
+        if message.attestations and self._identities is None:
+            return "an attestation, and trust is open"
+        for attestation in message.attestations:
+            name = self._roster[attestation.origin % len(self._roster)]
+            if self._identities is None or not is_genuine(self._identities, name, attestation):
+                return f"an attestation that {name} has not signed"
+        return ""
 
     def _follow_event(self, event: ProcessEvent) -> None:
         if event.kind not in TAKE_OVER or event.who not in self._places:

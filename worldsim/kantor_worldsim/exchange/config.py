@@ -1,6 +1,7 @@
 """The mission that a world-sim process runs, and what it needs for that."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from kantor_protocol.base.machine import ParticipantId
@@ -13,6 +14,7 @@ from kantor_protocol.scenario.faults.processes import (
 )
 from kantor_protocol.scenario.faults.schedule import kind_of
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Identities
 from kantor_worldsim.world.world import WorldSetup
 
 
@@ -28,6 +30,12 @@ class MissionConfig(NamedTuple):
     """Realtime: simulated seconds in a real one."""
     start_after_s: float | None = None
     """Real seconds after which the mission starts without the missing participants; None: never."""
+    keys: Mapping[ParticipantId, bytes] = MappingProxyType({})
+    """With `trust = "signed"`: the public key of every participant; empty for one whose word does not count."""
+
+    def identities(self, run: str) -> Identities | None:
+        """Whose word counts in a run that begins; None with `trust = "open"`."""
+        return Identities(run, dict(self.keys)) if self.scenario.signed else None
 
 
 def needs_process_control(scenario: Scenario, exchange: str) -> str | None:

@@ -15,6 +15,7 @@ from kantor_protocol.base.machine import EVERYBODY, WORLD_SIM, Body, Outputs, Pa
 from kantor_protocol.transport.events import Flooded, Joined, Left, Received
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import LEASE_MS, BusError
+from kantor_protocol.wire.attestations import Identities
 from kantor_protocol.wire.messages import (
     VERSION,
     Array,
@@ -64,10 +65,12 @@ class Lobby:
         stopped: Callable[[], bool],
         say: Callable[[str], None],
         admission: Admission | None = None,
+        identities: Identities | None = None,
     ) -> None:
         """run: the run's name, which processes compare with that in their write-ahead log. say: prints a line.
 
-        admission: has observed all records so far; by default one of a mission that begins.
+        admission: has observed all records so far; by default one of a mission that begins. identities: with
+        `trust = "signed"`.
         """
         self.refused = 0
         """Messages that were malformed, or from a process that does not play that participant."""
@@ -78,7 +81,8 @@ class Lobby:
         self._reporter = reporter
         self._stopped = stopped
         self._say = say
-        self._admission = admission or Admission(config.scenario, config.setup)
+        self._admission = admission or Admission(config.scenario, config.setup, identities)
+        self._keys = identities.keys if identities is not None else {}
         self._refused_reports: dict[ParticipantId, RefusedReports] = {}
         self._unsound: set[ParticipantId] = set()
         """Participants whose last report was refused."""
@@ -339,6 +343,7 @@ class Lobby:
             config.setup.ground and config.setup.ground.frame,
             self._run,
             self._simulation.body(event.name),
+            self._keys,
         )
         self._host.send(event.name, encode(mission), blocking=True)
 

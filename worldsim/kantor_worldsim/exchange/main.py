@@ -49,15 +49,16 @@ def run(
         show(progress)
 
     reporter = ProgressReporter(recording.metrics, scenario, publish)
-    admission = Admission(scenario, config.setup)
+    run_name = recording.run
+    identities = past.identities if past is not None else config.identities(run_name)
+    admission = Admission(scenario, config.setup, identities)
     observers = (recording.observe, reporter.observe, admission.observe)
     if past is None:
-        simulation = Simulation(scenario, seed, config.setup, observers)
+        simulation = Simulation(scenario, seed, config.setup, observers, identities)
     else:
         simulation = Simulation.resumed(scenario, seed, config.setup, past.records, observers)
     simulation.forget()
-    run_name = recording.run
-    lobby = Lobby(host, config, run_name, simulation, reporter, stopped, say, admission)
+    lobby = Lobby(host, config, run_name, simulation, reporter, stopped, say, admission, identities)
     if past is not None:
         for record in past.records:
             admission.observe(record)

@@ -179,6 +179,12 @@ def _array(payload: bytes, at: int, room: int) -> tuple[int, int]:
     return items, at
 
 
+_ATTESTED = np.array([NUMBER, NUMBER, NUMBER, BYTES, ARRAY, NUMBER, BYTES, BYTES])
+"""Kinds of the fields of an Attestation; of the array, `claim`, all items are numbers."""
+_ATTESTED_MIN, _CLAIMED = 4, 3
+"""Fields without a default, and items of `claim`."""
+
+
 class BatchColumns(NamedTuple):
     """The arrays into which a batch is decoded, for the kernels; see `ColumnarBatch`."""
 
@@ -452,6 +458,29 @@ def _is_finite(kind: int, value: int) -> bool:
 
 
 @kernel
+def _skip_attestations(payload: bytes, at: int) -> int:
+    """The position after the attestations at `at`, or a negative one if malformed."""
+    count, at = _array(payload, at, _ANY)
+    while count > 0 and at >= 0:
+        count -= 1
+        fields, at = _array(payload, at, _ANY)
+        if fields < _ATTESTED_MIN:
+            return _MALFORMED
+        for field in range(min(fields, _ATTESTED.shape[0])):
+            expected = _ATTESTED[field]
+            kind, size, at = head_of(payload, at)
+            if kind != expected or (kind == ARRAY and size != _CLAIMED):
+                return _MALFORMED
+            if kind == BYTES and at >= 0:
+                at += size
+            elif kind == ARRAY:
+                for _ in range(_CLAIMED):
+                    _, at = _number(payload, at)
+        at = skip(payload, at, fields - _ATTESTED.shape[0])
+    return at
+
+
+@kernel
 def parts_of_gossip(payload: bytes, at: int, end: int) -> tuple[int, int, int, int, int]:
     """Incarnation of the GossipMessage in payload[at:end]; where its `version_vector` and `logs` begin and end.
 
@@ -486,7 +515,9 @@ def parts_of_gossip(payload: bytes, at: int, end: int) -> tuple[int, int, int, i
     incarnation = 0
     if fields > 9:
         incarnation, at = _number(payload, at)
-    if not 0 <= incarnation <= INCARNATIONS_MAX or skip(payload, at, fields - 10) != end:
+    if fields > 10:
+        at = _skip_attestations(payload, at)
+    if not 0 <= incarnation <= INCARNATIONS_MAX or skip(payload, at, fields - 11) != end:
         return refused
     return incarnation, version_vector, vector_end, logs, logs_end
 

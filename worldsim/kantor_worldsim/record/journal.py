@@ -16,9 +16,18 @@ from typing import IO, Any
 import msgspec
 from mcap.writer import CompressionType, IndexType, Writer
 
+from kantor_protocol.wire.attestations import Identities
 from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.mcap_file import PROFILE, messages, write_index
-from kantor_worldsim.record.records import Batch, Ending, Record, decode_record, encode_record
+from kantor_worldsim.record.records import (
+    Batch,
+    Ending,
+    Opening,
+    Record,
+    decode_record,
+    encode_record,
+    without_signatures,
+)
 
 RECORD_TOPIC = "/kantor/record"
 METRICS_TOPIC = "/kantor/metrics"
@@ -26,14 +35,25 @@ _RESERVE_BYTES = 256 * 1024
 
 
 class Digest:
-    """The digest of a record: BLAKE2b over the encoded records in order."""
+    """The digest of a record: BLAKE2b over the encoded records in order, without identities and signatures."""
 
     def __init__(self) -> None:
         self._hash = hashlib.blake2b(digest_size=32)
+        self._signed = False
         self.records = 0
+        """Number of records in it."""
+
+    def follow(self, record: Record, payload: bytes = b"") -> None:
+        """Add one record. payload: the record encoded, if the caller has it."""
+        if isinstance(record, Opening):
+            self._signed = record.scenario.signed
+        if isinstance(record, Identities):
+            return
+        bare = without_signatures(record) if self._signed else record
+        self.add(payload if payload and bare is record else encode_record(bare))
 
     def add(self, payload: bytes) -> None:
-        """Add one encoded record."""
+        """Add one encoded record as it is."""
         self._hash.update(len(payload).to_bytes(8, "little") + payload)
         self.records += 1
 
@@ -95,7 +115,7 @@ class Journal:
     def append(self, record: Record, payload: bytes = b"") -> None:
         """Write one record. payload: the record encoded, if the caller has it."""
         payload = payload or encode_record(record)
-        self.digest.add(payload)
+        self.digest.follow(record, payload)
         if isinstance(record, (Batch, Ending)):
             self._time_ns = record.now_ns
         if self._file is not None:

@@ -1,5 +1,8 @@
 """The record of a run: one opening, a batch for each moment at which participants stepped, process events, one ending.
 
+With `trust = "signed"` the identities follow the opening. They and all signatures are no part of what a mission is:
+records are compared, and digested, without them (`without_signatures`).
+
 Everything that judges or measures a run (checkers, metrics, reports, replay) reads these records and
 nothing else. They hold no trace of the exchange, so that the same scenario and seed give the same bytes in process
 and over the bus. Tags and the order of fields are a contract.
@@ -12,6 +15,7 @@ from kantor_protocol.base.machine import Envelope, Inputs, Observation, Outputs,
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.scenario.validate import complaints
+from kantor_protocol.wire.attestations import Identities, unsigned_envelope, unsigned_outputs
 from kantor_protocol.wire.messages import Array, RefusedError
 from kantor_protocol.wire.weights import Units
 from kantor_worldsim.radio.channel import DeliveryDecision
@@ -150,7 +154,7 @@ class Ending(msgspec.Struct, frozen=True, array_like=True, tag="ending"):
     """`done`, `limit`, `interrupted` or `deserted` (no robot left)."""
 
 
-Record = Opening | Batch | ProcessEvent | Ending
+Record = Opening | Identities | Batch | ProcessEvent | Ending
 
 _ENCODER = msgspec.msgpack.Encoder()
 _DECODER = msgspec.msgpack.Decoder(Record)
@@ -162,6 +166,25 @@ def decode_record(payload: bytes) -> Record:
     """A record from its bytes. Raises msgspec.MsgspecError."""
     record: Record = _DECODER.decode(payload)
     return record
+
+
+def without_signatures(record: Record) -> Record:
+    """The record with all signatures zeroed; itself if it has none."""
+    if not isinstance(record, Batch):
+        return record
+    steps = tuple([_without_signatures(step_record) for step_record in record.step_records])
+    injected = tuple([unsigned_envelope(envelope) for envelope in record.injected])
+    before = (*record.step_records, *record.injected)
+    if all(new is old for new, old in zip((*steps, *injected), before, strict=True)):
+        return record
+    return msgspec.structs.replace(record, step_records=steps, injected=injected)
+
+
+def _without_signatures(step_record: StepRecord) -> StepRecord:
+    outputs = step_record.outputs
+    if outputs is None or (unsigned := unsigned_outputs(outputs)) is outputs:
+        return step_record
+    return msgspec.structs.replace(step_record, outputs=unsigned)
 
 
 def opening_of(

@@ -21,6 +21,7 @@ from kantor_protocol.files.reading import read_text
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.storage.drafts import replace
+from kantor_protocol.wire.attestations import Identities
 from kantor_protocol.wire.messages import RefusedError
 from kantor_worldsim.record import behaviour
 from kantor_worldsim.record.journal import read
@@ -192,12 +193,20 @@ class Past(NamedTuple):
             records[0].check()
         except (RefusedError, ScenarioError) as error:
             raise ResumeError(f"{folder / JOURNAL}: no run can start from it: {error}") from None
+        past = cls(terms, records[0], tuple(records), manifest)
+        if records[0].scenario.signed and past.identities is None:
+            raise ResumeError(f"{folder / JOURNAL}: nothing has happened in it; start the run anew")
         last = records[-1]
         if isinstance(last, Ending):
             if "digest" in manifest and last.reason != "interrupted":
                 raise OverError(f"{folder}: its mission is over ({last.reason})")
-            records.pop()
-        return cls(terms, records[0], tuple(records), manifest)
+            past = past._replace(records=past.records[:-1])
+        return past
+
+    @property
+    def identities(self) -> Identities | None:
+        """Whose word counts in this run; None with `trust = "open"`."""
+        return next((each for each in self.records[1:2] if isinstance(each, Identities)), None)
 
 
 class MetricsFile:

@@ -11,6 +11,7 @@ import numpy as np
 from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.scenario.faults.links import Hostile
 from kantor_protocol.scenario.faults.processes import Kill, Late
+from kantor_protocol.wire.attestations import Identities
 from kantor_protocol.wire.weights import WeightsSubscriber
 from kantor_worldsim.observers.checkers.batch_pass import check_batch
 from kantor_worldsim.observers.checkers.delivery_index import index_deliveries
@@ -87,7 +88,8 @@ class Checker:
     register    the own register that a robot sends is the sum over the places from which it chose
                 (spectral)
     order       steps count up by one, whatever happens to processes, time never runs back, an opening
-                comes first, nothing after the end
+                comes first, nothing after the end; with trust = "signed", and only then, the identities of
+                the whole roster follow the opening
     hold        a step is made after the verdict on the one before
     ruling      world-sim refused nothing of a step, but the speed of a robot whose clock has gained on time
                 since its last step
@@ -122,6 +124,8 @@ class Checker:
         self._map_checker: MapChecker | None = None
         self._register_checker: RegisterChecker | None = None
         self._opening: Opening | None = None
+        self._unidentified = False
+        """The opening is of a signed run, and the next record must be its identities."""
         self._ended = False
         self._now_ns = 0
 
@@ -136,13 +140,26 @@ class Checker:
             self._open(record)
         elif self._opening is None:
             self._report("order", "record", "no opening")
+        elif self._unidentified or isinstance(record, Identities):
+            self._identify(record)
         elif isinstance(record, Batch):
             self._check(record, decoded)
         elif isinstance(record, ProcessEvent):
             self._follow_event(record)
-        else:
+        elif isinstance(record, Ending):
             self._ended = True
             self._end(record)
+
+    def _identify(self, record: Record) -> None:
+        expected, self._unidentified = self._unidentified, False
+        if not isinstance(record, Identities):
+            self._report("order", "record", "signed, and no identities follow the opening")
+        elif not expected:
+            self._report(
+                "order", "record", "identities that do not follow the opening of a signed run"
+            )
+        elif record.keys.keys() != set(self._names):
+            self._report("order", "record", "identities of another team")
 
     def observe_row(self, row: tuple[Any, ...]) -> None:
         """Compare a row's bounds with its exact distance, if they claim to be bounds."""
@@ -164,6 +181,7 @@ class Checker:
         scenario = opening.scenario
         self._opening, self._scenario, self._units = opening, scenario, opening.units
         self._names = scenario.roster
+        self._unidentified = scenario.signed
         self._places = {name: i for i, name in enumerate(self._names)}
         self._subscriber = WeightsSubscriber(opening.samples_m.shape[0])
         self._hostile = [fault for fault in scenario.faults if isinstance(fault, Hostile)]

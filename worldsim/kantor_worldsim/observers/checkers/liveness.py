@@ -106,7 +106,7 @@ class LivenessChecker:
                 self._note_late(record)
         elif isinstance(record, ProcessEvent):
             self._follow_event(record)
-        else:
+        elif isinstance(record, Ending):
             self._end(record)
 
     def _open(self, opening: Opening) -> None:

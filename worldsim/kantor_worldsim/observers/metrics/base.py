@@ -88,7 +88,7 @@ class RunMetrics:
             self._follow(record, decoded)
         elif isinstance(record, ProcessEvent):
             self._follow_event(record)
-        else:
+        elif isinstance(record, Ending):
             self._ending = record
             self._row(last=True)
 
