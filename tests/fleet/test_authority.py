@@ -17,6 +17,7 @@ from kantor_fleet.security import authority as issuing
 from kantor_fleet.security.authority import Authority, Wanted, issue, listing
 from kantor_protocol.transport import credentials
 from kantor_protocol.transport.credentials import Certificate, CredentialsError
+from kantor_protocol.wire.signatures import public_key_of
 from support.strategies import examples
 
 if TYPE_CHECKING:
@@ -76,6 +77,8 @@ def test_every_member_gets_one_file(tmp_path: Path) -> None:
         assert (
             certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value == found.name
         )
+        assert own.members[user].key == credentials.public_key(found).hex()
+        assert public_key_of(certificate.public_key()).hex() == own.members[user].key  # type: ignore[arg-type]
         assert found.name == f"{user}.{certificate.serial_number:016x}"
         assert found.until == certificate.not_valid_after_utc == NOW + timedelta(days=30)
         assert own.members[user].name == found.name
@@ -112,6 +115,28 @@ def test_a_second_command_keeps_members_and_adds_missing_ones(tmp_path: Path) ->
         "worldsim.toml",
     ]
     assert set(identity(tmp_path, "worldsim").members) == {"observer", "worldsim", "r1", "r2", "r3"}
+
+
+def test_a_member_list_without_keys_is_completed(tmp_path: Path) -> None:
+    """Of an older version: from the files that are there; a member whose file is elsewhere gets a key by renewal."""
+    issue(tmp_path, Wanted("demo", 2), NOW)
+    full = authority_in(tmp_path).members
+    for name in ("authority", "worldsim"):
+        path = tmp_path / f"{name}.toml"
+        path.write_text(re.sub(r', key = "[0-9a-f]+"', "", path.read_text()))
+    (tmp_path / "r2.toml").unlink()  # it is with its robot
+    assert not any(member.key for member in identity(tmp_path, "worldsim").members.values())
+
+    assert issue(tmp_path, Wanted("demo"), NOW) == [
+        f"{tmp_path}/worldsim.toml: changed; start worldsim again with it"
+    ]
+    keys = {user: member.key for user, member in identity(tmp_path, "worldsim").members.items()}
+    assert keys == {user: member.key for user, member in full.items()} | {"r2": ""}
+    assert issue(tmp_path, Wanted("demo"), NOW) == ["nothing to do"]
+
+    issue(tmp_path, Wanted("demo", renew=("r2",)), NOW)
+    (listed,) = identity(tmp_path, "worldsim").public_keys(("r2",)).values()
+    assert listed == credentials.public_key(identity(tmp_path, "r2"))
 
 
 def test_renewal_and_revocation_invalidate_the_old_certificate(tmp_path: Path) -> None:

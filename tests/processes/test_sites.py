@@ -109,12 +109,12 @@ def drained(heard: "queue.SimpleQueue[str]") -> list[str]:
 
 
 def test_a_mission_through_a_site_is_the_one_in_process(place: Place) -> None:
-    """Two robots behind a site's router and one at the hub, in lockstep: the digest of one process.
+    """Two robots behind a site's router and one at the hub, in lockstep: the digest of one process, signed as well.
 
     Beside it, with the files of r1 and r3, an intruder at the site sends as others and reads others' `rx`.
     """
     kantor = place.kantor
-    assert kantor("run", *MISSION, "--exchange", "in-process").code == 0
+    assert kantor("run", *MISSION, "trust=signed", "--exchange", "in-process").code == 0
     world = place.world_sim(*MISSION, "--exchange", "lockstep")
     site = place.site()
     others = (f"{ROOT}/**", f"{ROOT}/r2/rx", f"{ROOT}/r3/rx", f"{ROOT}/*/tx", f"{ROOT}/*/pose")
@@ -216,7 +216,7 @@ def test_a_site_finds_world_sim_again(place: Place) -> None:
     """World-sim is killed and goes on with its run: the site connects again, and nothing is lost or done twice."""
     kantor = place.kantor
     mission = (*MISSION, "energy.points=6000", "energy.steps=6000", "samples.count=1000")
-    assert kantor("run", *mission, "--exchange", "in-process").code == 0
+    assert kantor("run", *mission, "trust=signed", "--exchange", "in-process").code == 0
     world = place.world_sim(*mission, "--exchange", "lockstep")
     site = place.site()
     robots = place.robots()
@@ -235,3 +235,4 @@ def test_a_site_finds_world_sim_again(place: Place) -> None:
     first, second = map(result_of, kantor.runs())
     assert first["digest"] == second["digest"]
     assert second["violations"] == 0
+    assert kantor("verify", folder).code == 0

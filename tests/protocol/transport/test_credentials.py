@@ -11,12 +11,14 @@ from hypothesis import strategies as st
 
 from kantor_protocol.transport import credentials
 from kantor_protocol.transport.credentials import Certificate, CredentialsError, Member, Password
+from kantor_protocol.wire.signatures import is_signed
 from support.strategies import examples
 
 NOW = datetime(2026, 11, 23, tzinfo=UTC)
 USERS = ("r1", "r2", "r3", "observer", "supervisor")
 times = st.datetimes(timezones=st.just(UTC)).map(lambda time: time.replace(microsecond=0))
 texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=40)
+hexes = st.sampled_from(["", "01" * 33, "02" * 34])
 serials = st.integers(0, 2**64 - 1)
 
 
@@ -29,7 +31,9 @@ def name_of(user: str, serial: int) -> str:
 def routers(draw: st.DrawFn) -> Certificate:
     """World-sim's identity with some register; parts are texts of any kind."""
     users = draw(st.lists(st.sampled_from(USERS), unique=True))
-    members = {user: Member(name_of(user, draw(serials)), draw(times)) for user in users}
+    members = {
+        user: Member(name_of(user, draw(serials)), draw(times), draw(hexes)) for user in users
+    }
     gone = draw(st.lists(st.builds(name_of, st.sampled_from(USERS), serials), max_size=3))
     sites = draw(
         st.dictionaries(
@@ -152,3 +156,34 @@ def test_passwords_overwrite_nothing(tmp_path: Path) -> None:
         with pytest.raises(CredentialsError, match=complaint):
             credentials.issue(tmp_path, "demo", ("r1", "r2", "r3", "r4"))
         assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_every_password_has_a_key_of_its_own() -> None:
+    """It follows from the password, and is another for each fleet and user, even with the same password."""
+    one = Password("demo", "r1", "secret")
+    others = [
+        Password("demo", "r1", "Secret"),
+        Password("demo", "r2", "secret"),
+        Password("de", "r1", "secret"),
+    ]
+    keys = [credentials.public_key(each) for each in (one, *others)]
+
+    assert len(set(keys)) == 4
+    assert credentials.public_key(one) == keys[0]
+    assert is_signed(keys[0], b"word", credentials.signing_key(one).sign(b"word"))
+    assert not is_signed(keys[1], b"word", credentials.signing_key(one).sign(b"word"))
+
+
+def test_a_certificate_without_its_key_cannot_sign() -> None:
+    """One line with the remedy."""
+    for text in ("", "c", "-----BEGIN PRIVATE KEY-----"):
+        broken = Certificate("demo", "r1", "r1.0123456789abcdef", NOW, "a", "b", text)
+        with pytest.raises(CredentialsError, match="`kantor keys demo --renew r1` makes another"):
+            credentials.signing_key(broken)
+
+
+@pytest.mark.parametrize("key", ["0", "0g", "0A", "01" * 35, " "])
+def test_a_member_list_has_keys_or_nothing(key: str) -> None:
+    """Whole bytes, hexadecimal, no longer than any key."""
+    with pytest.raises(ValueError, match="public key"):
+        Member("r1.0123456789abcdef", NOW, key)

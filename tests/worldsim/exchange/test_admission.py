@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_fleet.execution.in_process_team import team
+from kantor_fleet.execution.in_process_team import _key, team, team_identities
 from kantor_protocol.base.machine import Envelope, Inputs, Outputs, ParticipantId, Pose
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import HASH_BYTES, Attestation, signed
 from kantor_protocol.wire.messages import (
     OUTBOX_MAX,
     GossipMessage,
@@ -32,6 +33,7 @@ KILLS = (
     'faults=[{kind="kill", who=["r2"], disk="lost", from_s=0.3, until_s=0.5},'
     ' {kind="kill", who=["r1"], disk="torn", mid_step=true, from_s=0.4, until_s=0.7}]'
 )
+SIGNED = 'trust="signed"'
 FAR = """
 name = "far"
 domain = { min_m = [500000, 4649776], max_m = [500002, 4649778] }
@@ -54,6 +56,10 @@ MISSIONS = {
     "late-news": mission("radio.range_m=45", "radio.drop=0.3", "radio.delay_s=0.25", KILLS),
     "map": on_map(),
     "map-with-supervisor": on_map("coordination=centralized", "planner.name=burgard"),
+    "signed": mission(SIGNED, KILLS),
+    "signed-min": mission(SIGNED, *MINIMUM),
+    "signed-spectral": mission(SIGNED, "planner=spectral", "planner.modes=4", KILLS),
+    "signed-map": on_map(SIGNED),
 }
 
 
@@ -76,8 +82,9 @@ def played(scenario: Scenario, steps: int | None = None) -> tuple[Judged, Simula
     """A mission, at least its first steps."""
     setup = WorldSetup.of(scenario, 3)
     exchange = Judged(team(scenario, 3, setup))
-    exchange.admission, exchange.reasons = Admission(scenario, setup), []
-    simulation = Simulation(scenario, 3, setup, [exchange.admission.observe])
+    identities = team_identities(scenario, 3)
+    exchange.admission, exchange.reasons = Admission(scenario, setup, identities), []
+    simulation = Simulation(scenario, 3, setup, [exchange.admission.observe], identities)
     enough = lambda: steps is not None and len(exchange.reasons) >= 3 * steps  # noqa: E731
     simulate(simulation, exchange, 3, enough, exchange)
     return exchange, simulation
@@ -303,3 +310,46 @@ def test_envelopes_have_one_sender() -> None:
     both = msgspec.structs.replace(honest, outbox=(*honest.outbox, other))
 
     assert "another" in admission.refusal_reason("r2", both)
+
+
+# Attestations.
+
+
+def attested(run: str, signer: ParticipantId, **changes: object) -> Attestation:
+    """What r2 says of itself, or something else, signed by somebody for a run."""
+    said = msgspec.structs.replace(Attestation(1, 16, 0, bytes(HASH_BYTES)), **changes)
+    return signed(run, said, _key(3, signer))
+
+
+IDENTITIES = team_identities(mission(SIGNED), 3)
+assert IDENTITIES is not None
+RUN = IDENTITIES.run
+FALSE_ATTESTATIONS: dict[str, tuple[str, tuple[Attestation, ...]]] = {
+    "unsigned": ("r2", (Attestation(1, 16, 0, bytes(HASH_BYTES)),)),
+    "signed-by-another": ("r2", (attested(RUN, "r1"),)),
+    "of-another-run": ("r2", (attested(RUN + "0", "r2"),)),
+    "another-s-in-the-own-name": ("r1", (attested(RUN, "r2", origin=0),)),
+    "another-s-unsigned": ("r3", (Attestation(2, 16, 0, bytes(HASH_BYTES)), attested(RUN, "r2"))),
+    "changed": ("r2", (msgspec.structs.replace(attested(RUN, "r2"), length=1),)),
+    "a-short-signature": ("r2", (msgspec.structs.replace(attested(RUN, "r2"), signature=b"r2"),)),
+}
+
+
+@pytest.mark.parametrize("name", FALSE_ATTESTATIONS)
+def test_what_its_origin_has_not_signed_is_refused_and_named(name: str) -> None:
+    """Whoever sends it: the report is refused whole."""
+    admission, honest = next_report("r2", SIGNED)
+    origin, attestations = FALSE_ATTESTATIONS[name]
+
+    reason = admission.refusal_reason("r2", sending(honest, attestations=attestations))
+
+    assert reason == f"an attestation that {origin} has not signed"
+
+
+def test_without_identities_no_attestation_passes() -> None:
+    """In an open mission nobody signs."""
+    admission, honest = next_report("r2")
+
+    reason = admission.refusal_reason("r2", sending(honest, attestations=(attested(RUN, "r2"),)))
+
+    assert reason == "an attestation, and trust is open"

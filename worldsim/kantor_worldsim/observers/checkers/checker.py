@@ -132,6 +132,9 @@ class Checker:
     def observe(self, decoded: DecodedRecord, /) -> None:
         """Check one record."""
         record = decoded.record
+        if self._unidentified and not isinstance(record, Identities):
+            self._unidentified = False
+            self._report("order", "record", "signed, and no identities follow the opening")
         if self._ended:
             self._report("order", "record", "something follows the ending")
         elif isinstance(record, Opening):
@@ -140,7 +143,7 @@ class Checker:
             self._open(record)
         elif self._opening is None:
             self._report("order", "record", "no opening")
-        elif self._unidentified or isinstance(record, Identities):
+        elif isinstance(record, Identities):
             self._identify(record)
         elif isinstance(record, Batch):
             self._check(record, decoded)
@@ -150,16 +153,13 @@ class Checker:
             self._ended = True
             self._end(record)
 
-    def _identify(self, record: Record) -> None:
-        expected, self._unidentified = self._unidentified, False
-        if not isinstance(record, Identities):
-            self._report("order", "record", "signed, and no identities follow the opening")
-        elif not expected:
-            self._report(
-                "order", "record", "identities that do not follow the opening of a signed run"
-            )
-        elif record.keys.keys() != set(self._names):
+    def _identify(self, identities: Identities) -> None:
+        if not self._unidentified:
+            what = "identities that do not follow the opening of a signed run"
+            self._report("order", "record", what)
+        elif identities.keys.keys() != set(self._names):
             self._report("order", "record", "identities of another team")
+        self._unidentified = False
 
     def observe_row(self, row: tuple[Any, ...]) -> None:
         """Compare a row's bounds with its exact distance, if they claim to be bounds."""
