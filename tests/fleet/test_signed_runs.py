@@ -181,7 +181,7 @@ def test_one_bit_of_a_signature_is_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], at: int, *, forwarded: bool
 ) -> None:
     """The own one and one that was passed on, in a record that is otherwise whole."""
-    recorded(small(), tmp_path)
+    recorded(troubled(SIGNED), tmp_path)
     records = records_in(tmp_path)
     body, attestations, _ = next(
         found for found in attested_in(records) if found[2] or not forwarded

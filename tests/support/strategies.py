@@ -238,6 +238,7 @@ NEWS = st.builds(
     claims=st.binary(max_size=40),
     registers=st.binary(max_size=40),
     incarnation=st.integers(0, 15),
+    proofs=st.lists(st.binary(max_size=20), max_size=2).map(tuple),
     attestations=st.lists(ATTESTATIONS, max_size=2).map(tuple),
 )
 POSES = st.builds(Pose, x_m=FINITE, y_m=FINITE, heading_rad=FINITE, speed_m_s=FINITE)

@@ -76,7 +76,7 @@ def hash_of(*parts: bytes) -> bytes:
 
 # Bodies of envelopes. Attestations are the last field of a message, and a message without any has a shorter head.
 
-_HEADS = frozenset(bytes([0x90 + fields]) for fields in (11, 12, 13, 14, 15))
+_HEADS = frozenset(bytes([0x90 + fields]) for fields in (12, 13, 14, 15))
 """The first bytes of messages that may have attestations."""
 _NOT_SIGNED = b"\xc4" + bytes([SIGNATURE_BYTES]) + UNSIGNED
 """The end of a message whose sender has yet to sign it."""

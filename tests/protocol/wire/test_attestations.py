@@ -72,13 +72,13 @@ def test_without_signatures_only_signatures_are_gone(news: GossipMessage) -> Non
 @examples(200)
 def test_any_other_body_is_left_alone(body: bytes) -> None:
     """What is no message, and messages that end in zeros but not in an attestation."""
-    for odd in (body, body + UNSIGNED, b"\x9b" + body, b"\x9b" + body + b"\xc4\x40" + UNSIGNED):
+    for odd in (body, body + UNSIGNED, b"\x9c" + body, b"\x9c" + body + b"\xc4\x40" + UNSIGNED):
         assert sign_body(RUN, odd, KEY) is odd
         assert without_signatures(odd) is odd
 
 
 @pytest.mark.parametrize(
-    "nested", [b"\x9b" + b"\x91" * 100_000, b"\x9b" + b"\x01" * 10 + b"\x91" * 9]
+    "nested", [b"\x9c" + b"\x91" * 100_000, b"\x9c" + b"\x01" * 10 + b"\x91" * 9]
 )
 def test_nesting_ends_nothing(nested: bytes) -> None:
     """A body of arrays in arrays is no message."""

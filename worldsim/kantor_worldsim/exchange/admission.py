@@ -66,7 +66,7 @@ class Admission:
         """Whether logs are what was spent, entry for entry."""
         self._way_max_m = scenario.vehicle.speed_m_s * scenario.clock.period_s * (1.0 + _ROUNDING)
         self._poses = setup.poses(scenario)
-        self._receivers = MessageCheck(scenario, units, indices)
+        self._receivers = MessageCheck(scenario, units, indices, identities)
         self._settings = np.array(
             [
                 roster,
@@ -161,10 +161,10 @@ class Admission:
             return f"a malformed envelope ({error})"
         if message.incarnation != own // len(self._places):
             return f"an envelope of incarnation {message.incarnation}"
-        if not self._receivers.passes(own, message):
-            return "a malformed envelope"
         if reason := self._refusal_of_attestations(message):
             return reason
+        if not self._receivers.passes(own, message):
+            return "a malformed envelope"
         arrays = (self._logs, self._written, self._consumed, self._stamps, self._settings)
         return REASONS[int(judge(*arrays, *_parts(message), message.registers, own, step))]
 

@@ -458,6 +458,19 @@ def _is_finite(kind: int, value: int) -> bool:
 
 
 @kernel
+def _skip_proofs(payload: bytes, at: int) -> int:
+    """The position after the proofs at `at`, or a negative one if malformed."""
+    count, at = _array(payload, at, _ANY)
+    while count > 0 and at >= 0:
+        count -= 1
+        kind, size, at = head_of(payload, at)
+        if kind != BYTES or at < 0:
+            return _MALFORMED
+        at += size
+    return at
+
+
+@kernel
 def _skip_attestations(payload: bytes, at: int) -> int:
     """The position after the attestations at `at`, or a negative one if malformed."""
     count, at = _array(payload, at, _ANY)
@@ -516,8 +529,10 @@ def parts_of_gossip(payload: bytes, at: int, end: int) -> tuple[int, int, int, i
     if fields > 9:
         incarnation, at = _number(payload, at)
     if fields > 10:
+        at = _skip_proofs(payload, at)
+    if fields > 11:
         at = _skip_attestations(payload, at)
-    if not 0 <= incarnation <= INCARNATIONS_MAX or skip(payload, at, fields - 11) != end:
+    if not 0 <= incarnation <= INCARNATIONS_MAX or skip(payload, at, fields - 12) != end:
         return refused
     return incarnation, version_vector, vector_end, logs, logs_end
 
