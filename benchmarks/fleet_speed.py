@@ -108,7 +108,7 @@ def _settings(*, quick: bool) -> list[Setting]:
         Setting("centralized, ledger, claims", _cut(centralized, ticks), ticks, TARGET_FEW),
         Setting("paper-centralized", _cut(find("paper-centralized"), ticks), ticks, TARGET_FEW),
         Setting("fleet", _cut(find("fleet"), ticks), ticks, TARGET_FEW),
-        Setting("100 robots", _crowd(crowd_ticks), crowd_ticks, TARGET_CROWD),
+        Setting("100 robots", crowd(crowd_ticks), crowd_ticks, TARGET_CROWD),
     ]
 
 
@@ -118,7 +118,7 @@ def _cut(scenario: Scenario, ticks: int) -> Scenario:
     return from_tree(tree, scenario.name)
 
 
-def _crowd(ticks: int) -> Scenario:
+def crowd(ticks: int) -> Scenario:
     """A hundred robots anywhere in a domain with many clusters of samples."""
     width_m, height_m = DOMAIN_M
     # Each of the others is in range with probability pi r^2 / area.

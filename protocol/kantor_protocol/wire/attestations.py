@@ -130,11 +130,12 @@ def unsigned_envelope(envelope: Envelope) -> Envelope:
 
 
 def _with_bodies(outputs: Outputs, change: Callable[[bytes], bytes]) -> Outputs:
-    """Outputs whose envelopes have changed; themselves if none has."""
-    outbox = tuple([_with_body(envelope, change) for envelope in outputs.outbox])
-    if all(new is old for new, old in zip(outbox, outputs.outbox, strict=True)):
-        return outputs
-    return msgspec.structs.replace(outputs, outbox=outbox)
+    """Outputs whose envelopes have changed; themselves if none can have attestations."""
+    for envelope in outputs.outbox:
+        if envelope.body[:1] in _HEADS:
+            outbox = tuple([_with_body(each, change) for each in outputs.outbox])
+            return msgspec.structs.replace(outputs, outbox=outbox)
+    return outputs
 
 
 def _with_body(envelope: Envelope, change: Callable[[bytes], bytes]) -> Envelope:

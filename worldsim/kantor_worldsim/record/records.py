@@ -182,7 +182,10 @@ def without_signatures(record: Record) -> Record:
 
 def _without_signatures(step_record: StepRecord) -> StepRecord:
     outputs = step_record.outputs
-    if outputs is None or (unsigned := unsigned_outputs(outputs)) is outputs:
+    if outputs is None:
+        return step_record
+    unsigned = unsigned_outputs(outputs)
+    if unsigned is outputs:
         return step_record
     return msgspec.structs.replace(step_record, outputs=unsigned)
 
