@@ -162,10 +162,14 @@ IMPOSSIBLE: dict[str, tuple[str, Callable[[Outputs], Outputs]]] = {
     ),
     "another-s-log": (
         "their origin never made",
-        lambda o: sending(o, logs=suffix(0, 0, *((j, 2) for j in range(12)))),
+        lambda o: sending(o, logs=suffix(0, 0, *((j, 2) for j in range(10)))),
     ),
     "own-log": (
         "its own log that it never made",
+        lambda o: sending(o, logs=suffix(1, 0, *((j, 2) for j in range(10)))),
+    ),
+    "more-than-its-energy": (
+        "malformed",
         lambda o: sending(o, logs=suffix(1, 0, *((j, 2) for j in range(12)))),
     ),
     "own-log-goes-on": (
