@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
-from kantor_protocol.replication.attested import Attested, Rules, read_word
+from kantor_protocol.replication.attested import Attested
+from kantor_protocol.replication.proofs import Rules, read_word
 from kantor_protocol.replication.registers import Registers, are_registers
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import (

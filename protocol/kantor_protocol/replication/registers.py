@@ -40,7 +40,7 @@ _BYTES_MAX = 48 * 1024
 _NUMBER_BYTES, _HEAD_BYTES, _STAMP_BYTES = 8, 15, 6
 OTHERS_MAX = 64
 """Logs of others, or registers of others, in one message with proofs, at most."""
-_STALE_STEPS = 6
+STALE_STEPS = 6
 """Writes, or steps, by which a neighbour may be behind before a robot forwards another's register."""
 FRESH_STEPS = 4
 """A participant of which a message was received within so many steps beyond `ack_timeout_steps` is a neighbour."""
@@ -155,7 +155,7 @@ def _is_due(
         return beacon != 0 and target < 0
     if least >= stamp or (stamp <= sent[0, origin] and step - sent[1, origin] < ack_timeout_steps):
         return False
-    stale = least + _STALE_STEPS < stamp or step - updated[origin] > _STALE_STEPS
+    stale = least + STALE_STEPS < stamp or step - updated[origin] > STALE_STEPS
     return origin == me or relay != 0 or stale
 
 
@@ -301,7 +301,7 @@ class Registers:
 
     def offer(self, origin: int, stamp: int) -> None:
         """When proving: send others the register of an origin that has this stamp, or none if it is not known."""
-        if self.offered_stamps[origin] == stamp:
+        if not self._out.size or self.offered_stamps[origin] == stamp:
             return
         held = self.stamps[origin] == stamp
         self.offered[origin] = self.values[origin] if held else 0
