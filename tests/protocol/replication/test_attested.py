@@ -67,10 +67,13 @@ def acquainted(*overrides: str) -> list[Member]:
 
 
 def forwarded(two: Member, three: Member) -> Envelope:
-    """The message in which r2 brings r3 what r1 has attested."""
-    for _ in range(9):
+    """The message in which r2 brings r3 all that r1 has attested."""
+    has_register = len(two.registers[0]) > 0
+    for _ in range(20):
         word = two.speak()
-        if any(each.origin == 0 for each in message_of(word).attestations):
+        message = message_of(word)
+        brings = any(each.origin == 0 for each in message.attestations) and message.proofs[0]
+        if brings and len(message.registers) > (3 if has_register else -1):
             return word
         two.hear(three.speak())
     raise AssertionError("nothing is forwarded")
@@ -266,6 +269,19 @@ def test_a_false_word_of_another_is_refused_whole(name: str) -> None:
     assert three.held_log(one.me) == one.log
 
 
+def test_a_false_register_of_another_is_refused_whole() -> None:
+    """Also one that is as it should be but for a number."""
+    one, two, three = acquainted(*SPECTRAL)
+    word = forwarded(two, three)
+    content = message_of(word).registers
+
+    assert content == bytes([1, 0, 0, 0, 1, 1, 2 * 3])  # stamps, then r1's
+    assert three.hear(changed(word, registers=content[:-1] + bytes([2 * 4]))) == 1
+    assert three.hear(changed(word, registers=content + content[3:])) == 1
+    assert three.hear(word) == 0
+    assert three.replica.registers.values[one.me].tolist() == [3]
+
+
 def test_an_own_attestation_with_a_false_signature_is_refused_whole() -> None:
     """Nobody could pass it on."""
     one, two, _ = team(*SIGNED)
@@ -345,6 +361,23 @@ def test_who_meets_both_stories_knows_the_fork(until: int, more: int) -> None:
     assert three.held_log(0) == before == one.log
     assert three.held_log(1) == two.log
     assert not two.gossip.forked
+
+
+def test_a_fork_before_what_is_brought_is_known_by_its_hash() -> None:
+    """The stories differ in their first entry alone, long before the block that r2 brings."""
+    scenario, bound = on_map(*SIGNED, "robots.count=3", "starts.random=true"), 600
+    one, other = (Member("r1", scenario, bound) for _ in range(2))
+    two, three = (Member(name, scenario, bound) for name in ("r2", "r3"))
+    one.append([1, *range(100, 100 + BLOCK)])
+    other.append([2, *range(100, 100 + 2 * BLOCK)])
+    talk([one, three], 4)
+    talk([other, two], 3 * OFTEN)
+    for _ in range(2 * OFTEN):
+        two.hear(three.speak())
+        assert three.hear(two.speak()) == 0
+
+    assert list(three.gossip.forked) == [0]
+    assert three.held_log(0) == one.log
 
 
 def test_two_stories_from_one_mouth_are_a_fork() -> None:
