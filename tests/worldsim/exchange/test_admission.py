@@ -3,12 +3,15 @@
 from collections.abc import Callable, Mapping
 
 import msgspec
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from kantor_fleet.execution.in_process_team import _key, team, team_identities
 from kantor_protocol.base.machine import Envelope, Inputs, Outputs, ParticipantId, Pose
+from kantor_protocol.base.varint import Pairs
+from kantor_protocol.replication.proofs import Chain
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import HASH_BYTES, Attestation, signed
@@ -57,6 +60,9 @@ MISSIONS = {
     "map": on_map(),
     "map-with-supervisor": on_map("coordination=centralized", "planner.name=burgard"),
     "signed": mission(SIGNED, KILLS),
+    "signed-long": mission(
+        SIGNED, KILLS, "samples.count=60", "energy.points=300", "radio.range_m=60"
+    ),
     "signed-min": mission(SIGNED, *MINIMUM),
     "signed-spectral": mission(SIGNED, "planner=spectral", "planner.modes=4", KILLS),
     "signed-map": on_map(SIGNED),
@@ -348,6 +354,39 @@ def test_what_its_origin_has_not_signed_is_refused_and_named(name: str) -> None:
     reason = admission.refusal_reason("r2", sending(honest, attestations=attestations))
 
     assert reason == f"an attestation that {origin} has not signed"
+
+
+FALSE_WORDS: dict[str, tuple[str, dict[str, object]]] = {
+    "as-it-is": ("", {}),
+    "of-an-earlier-step": ("an attestation of step 3", {"step": 3}),
+    "of-a-step-to-come": ("an attestation of step 99", {"step": 99}),
+    "shorter": ("of another log", {"length": 1}),
+    "longer": ("of another log", {"length": 40}),
+    "of-other-entries": ("of another log", {"log": bytes(HASH_BYTES)}),
+}
+
+
+@pytest.mark.parametrize("name", FALSE_WORDS)
+def test_a_robot_that_attests_what_it_has_not_done_is_refused(name: str) -> None:
+    """World-sim knows what was consumed; a refused report leaves no trace in what it knows."""
+    reason, change = FALSE_WORDS[name]
+    admission, honest = next_report("r2", SIGNED)
+    spent = Pairs().decode(honest.spent, 12)
+    written = int(admission._written[1])
+    assert spent is not None
+    log = np.concatenate([admission._logs[1, :written], np.stack(spent, axis=1)])
+    true = {
+        "step": honest.step,
+        "length": len(log),
+        "log": Chain(valued=True).hash(log.astype(np.int32), len(log)),
+    }
+
+    for _ in range(2):
+        told = attested(RUN, "r2", **(true | change))
+        told_reason = admission.refusal_reason("r2", sending(honest, attestations=(told,)))
+        assert reason in told_reason
+        assert (reason == "") == (told_reason == "")
+    assert admission.refusal_reason("r2", honest) == ""
 
 
 def test_without_identities_no_attestation_passes() -> None:

@@ -10,7 +10,8 @@ it. An honest participant never sends such a report.
 3. An envelope speaks of incarnations that were there; of logs, claims and registers as far as their origins have
    written them; and an entry of a log is the one that its origin has consumed (ledger) or has sent first (map).
    With merge = "min" no weight is below what all spending leaves.
-4. With `trust = "signed"` every attestation in an envelope is signed by its origin, in this run.
+4. With `trust = "signed"` every attestation in an envelope is signed by its origin, in this run, and the own one is of
+   this step and of the log as it was consumed (ledger).
 """
 
 import math
@@ -23,8 +24,10 @@ from kantor_protocol.base.machine import EVERYBODY, Envelope, Outputs, Participa
 from kantor_protocol.base.varint import Pairs, sum_pairs
 from kantor_protocol.replication.gossip import MessageCheck, log_length_max
 from kantor_protocol.replication.occupancy_log import entries
+from kantor_protocol.replication.proofs import Chain, blocks
+from kantor_protocol.replication.replica_kernels import BLOCK
 from kantor_protocol.scenario.schema import Scenario
-from kantor_protocol.wire.attestations import Identities, is_genuine
+from kantor_protocol.wire.attestations import Attestation, Identities, hash_of, is_genuine
 from kantor_protocol.wire.messages import (
     OUTBOX_MAX,
     GossipMessage,
@@ -92,6 +95,10 @@ class Admission:
         self._sequences = dict.fromkeys(scenario.roster, 0)
         """The number of the last envelope of each."""
         self._pairs = Pairs()
+        self._chains: dict[int, Chain] = {}
+        """By incarnation id: the hashes of its log, as far as it is settled."""
+        self._unsettled = 0
+        """Entries at the end of the own log that only the step has that is being judged."""
 
     def observe(self, record: Record) -> None:
         """Follow one record."""
@@ -149,6 +156,7 @@ class Admission:
             return "spending that does not decode"
         own = self._id_of(name)
         self._spend(own, spent)
+        self._unsettled = spent[0].size
         reasons = (self._refusal_of(envelope, own, outputs.step) for envelope in outputs.outbox)
         reason = next(filter(None, reasons), "")
         self._spend(own, spent, back=True)
@@ -166,7 +174,8 @@ class Admission:
         if not self._receivers.passes(own, message):
             return "a malformed envelope"
         arrays = (self._logs, self._written, self._consumed, self._stamps, self._settings)
-        return REASONS[int(judge(*arrays, *_parts(message), message.registers, own, step))]
+        code = int(judge(*arrays, *_parts(message), message.registers, own, step))
+        return REASONS[code] or self._refusal_of_own_word(message, own, step)
 
     def _refusal_of_attestations(self, message: GossipMessage) -> str:
         if message.attestations and self._identities is None:
@@ -176,6 +185,26 @@ class Admission:
             if self._identities is None or not is_genuine(self._identities, name, attestation):
                 return f"an attestation that {name} has not signed"
         return ""
+
+    def _refusal_of_own_word(self, message: GossipMessage, own: int, step: int) -> str:
+        for attestation in message.attestations:
+            if attestation.origin != own:
+                continue
+            if attestation.step != step:
+                return f"an attestation of step {attestation.step}"
+            if self._ledger and not self._is_log(own, attestation):
+                return "an attestation of another log than its own"
+        return ""
+
+    def _is_log(self, own: int, attestation: Attestation) -> bool:
+        """Whether an attestation is of the own log, with what this step ships."""
+        log, length = self._logs[own], int(self._written[own])
+        chain = self._chains.setdefault(own, Chain(valued=True))
+        settled = (length - self._unsettled) // BLOCK
+        link = chain.hash(log, settled * BLOCK)
+        for number in range(settled, blocks(length)):
+            link = hash_of(link, chain.block(log, number, length))
+        return (attestation.length, attestation.log) == (length, link)
 
     def _follow_event(self, event: ProcessEvent) -> None:
         if event.kind not in TAKE_OVER or event.who not in self._places:
