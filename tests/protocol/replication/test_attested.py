@@ -1,6 +1,8 @@
 """Authentic knowledge: who forwards cannot rewrite, who tells two stories is found out, and all else goes on."""
 
+import copy
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -518,6 +520,49 @@ def test_a_forwarder_is_not_blamed_for_what_another_overspends() -> None:
 
 
 # The whole.
+
+
+BROKEN: dict[str, Callable[[Member, Any], Any]] = {
+    "own-word-as-another's": lambda m, a: a.newest.__setitem__(
+        m.me, replace(a.newest[0], origin=m.me)
+    ),
+    "word-of-another": lambda _, a: a.newest.__setitem__(2, a.newest[0]),
+    "unsigned": lambda _, a: a.newest.__setitem__(0, replace(a.newest[0], signature=UNSIGNED)),
+    "word-of-more-than-is-held": lambda m, _: m.replica.store.length.__setitem__(0, 1),
+    "more-offered-than-attested": lambda m, _: m.replica.offered.__setitem__(2, 1),
+    "less-offered-than-attested": lambda m, _: m.replica.offered.__setitem__(0, 1),
+    "another-entry": lambda m, _: m.replica.store.logs.__setitem__((0, 0, 0), 7),
+    "another-claim": lambda _, a: a._claimed.__setitem__(0, 9),
+    "claim-of-nobody": lambda _, a: a._claimed.__setitem__(2, 9),
+    "fork-of-itself": lambda m, a: a.forked.__setitem__(m.me, a.newest[0]),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_each_broken_invariant_is_found(name: str) -> None:
+    """One number is wrong, and `validate` says so."""
+    _, two, _ = acquainted()
+    two.gossip.validate(two.replica)
+    held: Any = two.gossip._attested
+    kept = copy.deepcopy((two.replica.store, two.replica.offered))
+    BROKEN[name](two, held)
+
+    with pytest.raises(AssertionError):
+        two.gossip.validate(two.replica)
+    for arrays, before in ((two.replica.store, kept[0]), ((two.replica.offered,), (kept[1],))):
+        for array, content in zip(arrays, before, strict=True):
+            array[...] = content  # replicas are validated once more when the test is over
+
+
+def test_an_offered_register_is_the_attested_one() -> None:
+    """With the stamp and the numbers of the attestation."""
+    _, two, _ = acquainted(*SPECTRAL)
+    registers = two.replica.registers
+    assert registers.offered[0].tolist() == [3]
+    registers.offered[0] = 4
+
+    with pytest.raises(AssertionError):
+        two.gossip.validate(two.replica)
 
 
 def test_a_signed_mission_needs_identities() -> None:

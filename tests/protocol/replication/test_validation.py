@@ -73,6 +73,8 @@ BROKEN: dict[str, Break] = {
     "own-claim-of-the-future": lambda r: r.store.claims.__setitem__((STAMP, 0), 9),
     "claim-received-in-the-future": lambda r: r.store.claims.__setitem__((STAMP_STEP, 3), 9),
     "fallen-twice": lambda r: r.store.counters.__setitem__(LOWERED, 2),
+    "miscounted-units": lambda r: r.store.shipped.__setitem__(3, 1),
+    "offers-that-are-another": lambda r: setattr(r, "offered", r.store.length.copy()),
     "mark-of-a-later-step": lambda r: r.store.mark.__setitem__(0, 9),
     "miscounted-weights": lambda r: r.store.counters.__setitem__(HOLDING, 1),
     "steps-apart": lambda r: r.store.counters.__setitem__(STEP, 9),
@@ -80,6 +82,9 @@ BROKEN: dict[str, Break] = {
     "stamp-beyond-reason": lambda r: r.registers.stamps.__setitem__(3, STAMP_MAX + 1),
     "register-without-a-write": lambda r: r.registers.stamps.__setitem__(3, 0),
     "sum-beyond-the-count": lambda r: r.registers.add(np.array([0, 9])),
+    "register-offered-that-is-another": lambda r: setattr(
+        r.registers, "offered", r.registers.values.copy()
+    ),
     "register-known-of-itself": lambda r: r.registers._known.__setitem__((0, 0), 1),
     "register-sent-before-it-was-written": lambda r: r.registers._sent.__setitem__((0, 1), 1),
     "register-replaced-in-the-future": lambda r: r.registers._updated.__setitem__(3, 9),

@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from kantor_protocol.base.machine import Envelope, ParticipantId, Pose
+from kantor_protocol.base.machine import (
+    Envelope,
+    Inputs,
+    Outputs,
+    ParticipantId,
+    Pose,
+    StateMachine,
+)
 from kantor_protocol.replication.gossip import Gossip, build_replica
 from kantor_protocol.replication.replica_kernels import SAMPLE, SINCE_NS, STAMP, spend
 from kantor_protocol.scenario.schema import Scenario
@@ -38,6 +45,23 @@ def signed_body(name: ParticipantId, body: bytes) -> bytes:
     message = decode_gossip(body)
     *others, own = message.attestations
     return encode_gossip(replace(message, attestations=(*others, signed(RUN, own, key_of(name)))))
+
+
+class Signing:
+    """A participant, and who runs it: its outputs are signed."""
+
+    def __init__(self, name: ParticipantId, machine: StateMachine) -> None:
+        self._name, self._machine = name, machine
+
+    def step(self, inputs: Inputs, /) -> Outputs:
+        """One step."""
+        outputs = self._machine.step(inputs)
+        outbox = (replace(each, body=signed_body(self._name, each.body)) for each in outputs.outbox)
+        return replace(outputs, outbox=tuple(outbox))
+
+    def validate(self) -> None:
+        """As of the participant."""
+        self._machine.validate()  # type: ignore[attr-defined]
 
 
 class Member:
