@@ -47,6 +47,7 @@ from kantor_protocol.wire.messages import (
     decode_gossip,
     encode,
 )
+from kantor_protocol.wire.weights import Units
 from kantor_worldsim.record.journal import Journal
 from kantor_worldsim.record.records import (
     Batch,
@@ -58,6 +59,7 @@ from kantor_worldsim.record.records import (
 )
 from kantor_worldsim.world.world import WorldSetup
 from support.missions import ROOMS_MISSION, on_map, setup_of
+from support.replication.attesting import Member
 from support.strategies import SMALL, mission
 
 GOODS = 48
@@ -160,6 +162,34 @@ def files(
 def gossip(*names: str) -> Mutations:
     """Bodies of envelopes, of these missions or of all."""
     return messages(body for each in _every(names or _ALL) for body in each.bodies())
+
+
+@functools.cache
+def attesting(*overrides: str) -> tuple[Member, tuple[bytes, ...]]:
+    """r1 of a signed team in a line, and what r2 said meanwhile: it brings r3 the word of r1."""
+    scenario = mission("trust=signed", "robots.count=3", *overrides)
+    one, two, three = (Member(name, scenario, 12, Units.of(30, 12)) for name in scenario.robot_ids)
+    said = []
+    for step in range(60):
+        if step % 6 == 0:
+            one.buy(step // 6, 2)
+            two.buy(11 - step // 6, 1)
+        if scenario.register_width:
+            one.write([1 + step % 3, *[0] * (scenario.register_width - 1)])
+        else:
+            one.claim(step % 12)
+        first, second, third = one.speak(), two.speak(), three.speak()
+        one.hear(second)
+        two.hear(first, third)
+        three.hear(second)
+        said.append(second.body)
+    return one, tuple(said)
+
+
+def attested_gossip(*overrides: str) -> Mutations:
+    """Bodies of envelopes that bring the word of another."""
+    _, said = attesting(*overrides)
+    return messages(body for body in said if decode_gossip(body).attestations)
 
 
 def gossip_fields(name: str) -> Framed:

@@ -43,6 +43,12 @@ TARGETS: dict[str, Target] = {
     "learn-reborn": Target(
         lambda: corpora.gossip_fields("restarted"), replication.merging("restarted"), True
     ),
+    "attested": Target(corpora.attested_gossip, replication.attesting(), True),
+    "attested-registers": Target(
+        lambda: corpora.attested_gossip("planner=spectral", "planner.modes=2"),
+        replication.attesting("planner=spectral", "planner.modes=2"),
+        True,
+    ),
     "registers": Target(corpora.register_fields, replication.registers, True),
     "read-have": Target(
         lambda: corpora.gossip_fields("ledger"), stateless(replication.version_vector_lengths), True

@@ -10,7 +10,7 @@ from fuzz import corpora
 from fuzz.decoding import Decode
 from fuzz.mutations import unframe
 from kantor_protocol.base.grid import OCCUPIED
-from kantor_protocol.base.machine import Pose
+from kantor_protocol.base.machine import Envelope, Pose
 from kantor_protocol.base.varint import Pairs, pack_pairs, sum_pairs
 from kantor_protocol.replication.gossip import build_replica
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
@@ -20,6 +20,7 @@ from kantor_protocol.wire.version_vector import read_version_vector
 from kantor_protocol.wire.weights import Units
 from kantor_worldsim.world.world import units_of
 from support.missions import on_map
+from support.replication.attesting import Member, claim_of
 from support.strategies import mission
 
 
@@ -71,6 +72,33 @@ def merging(name: str, me: str = "r1") -> Callable[[Path], Decode]:
             _check_bounds(replica)
             assert (registers.values.sum(axis=0) == registers.total).all()
             return True
+
+        return take
+
+    return start
+
+
+def attesting(*overrides: str) -> Callable[[Path], Decode]:
+    """r3 receives what r2 brings of r1: whatever it is, nothing false of r1 is believed."""
+
+    def start(_folder: Path) -> Decode:
+        one, _ = corpora.attesting(*overrides)
+        three = Member("r3", one.scenario, 12, one.units)
+        registers = three.replica.registers
+
+        def take(content: bytes) -> bool:
+            before = _contents(three.replica)
+            taken = not three.hear(Envelope("r2", 1, "", content))
+            assert taken or _contents(three.replica) == before, (
+                "a refused message changed something"
+            )
+            held = three.held_log(0)
+            assert held == one.log[: len(held)], "entries that r1 has not written"
+            assert claim_of(three.replica, 0) in one.claims, "a claim that r1 has not made"
+            written = one.registers[int(registers.stamps[0])]
+            assert registers.values[0].tolist() == written, "a register that r1 has not written"
+            assert 0 not in three.gossip.forked, "an honest origin is blamed"
+            return taken
 
         return take
 
