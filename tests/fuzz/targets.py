@@ -13,6 +13,7 @@ from kantor_worldsim.record.run_folder import JOURNAL, MANIFEST
 
 TARGETS: dict[str, Target] = {
     "news": Target(corpora.gossip, stateless(refuses(RefusedError, messages.gossip))),
+    "signatures": Target(corpora.attested_gossip, stateless(messages.signatures)),
     "inputs": Target(corpora.inputs, stateless(refuses(RefusedError, decode_inputs))),
     "from-participant": Target(
         corpora.from_participants, stateless(refuses(RefusedError, messages.from_participant))

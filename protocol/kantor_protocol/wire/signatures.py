@@ -32,8 +32,8 @@ KEY_BYTES_MAX = 34
 _ED25519, _P256 = b"\x01", b"\x02"
 _HASH = ECDSA(SHA256(), deterministic_signing=True)
 _NUMBER_BYTES = 32
-_CHECKED_MAX = 1 << 16
-"""Answers that are remembered: in one process many participants check the same signature."""
+_CHECKED_MAX = 1 << 14
+"""Answers that are remembered: the same word comes again and again, and in one process to many participants."""
 
 
 class SigningKey(Protocol):

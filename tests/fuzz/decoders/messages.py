@@ -5,6 +5,7 @@ from pathlib import Path
 import msgspec
 
 from fuzz.decoding import Decode
+from kantor_protocol.wire.attestations import attestations_in, sign_body, without_signatures
 from kantor_protocol.wire.messages import (
     Array,
     Mission,
@@ -15,13 +16,27 @@ from kantor_protocol.wire.messages import (
     encode,
     encode_gossip,
 )
+from kantor_protocol.wire.signatures import SIGNATURE_BYTES, Ed25519Key
 from kantor_protocol.wire.weights import WeightsSubscriber
+
+_KEY = Ed25519Key(bytes(32))
 
 
 def gossip(content: bytes) -> None:
     """A gossip message that is decoded and encoded again stays as it is."""
     message = decode_gossip(content)
     assert decode_gossip(encode_gossip(message)) == message, "gossip that changes on the way"
+
+
+def signatures(content: bytes) -> bool:
+    """Signing changes the last bytes alone, and without signatures a body is the same whoever has signed it."""
+    bare = without_signatures(content)
+    assert without_signatures(bare) == bare, "signatures that are there after all"
+    signed = sign_body("run", bare, _KEY)
+    assert len(signed) == len(bare)
+    assert signed[:-SIGNATURE_BYTES] == bare[:-SIGNATURE_BYTES], "more has changed than a signature"
+    assert without_signatures(signed) == bare, "a signature that stays"
+    return bool(attestations_in(content))
 
 
 def from_participant(content: bytes) -> None:
