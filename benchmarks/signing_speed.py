@@ -48,7 +48,7 @@ def measure(*, quick: bool) -> Table:
     if not quick:
         missions += [
             ("fleet, 400 m", find("fleet", ("radio.range_m=400",))),
-            ("fleet, a line", find("fleet", ("radio.range_m=700", "radio.drop=0.3"))),
+            ("fleet, 700 m, lossy", find("fleet", ("radio.range_m=700", "radio.drop=0.3"))),
             ("centralized", find("paper-centralized-concurrent", ("merge=ledger", "claims=true"))),
             ("100 robots", crowd(150)),
         ]

@@ -3,12 +3,17 @@
 import os
 import re
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from kantor_agent.process import run as run_agent
 from kantor_fleet.security.authority import Wanted, issue, today
+from kantor_protocol.base.machine import Inputs, Outputs
+from kantor_protocol.node import runner
+from kantor_protocol.node.signing import Signing
 from kantor_protocol.transport import credentials
 from kantor_protocol.transport.endpoint import free_endpoint
 from kantor_protocol.wire.attestations import Identities
@@ -241,3 +246,40 @@ def test_a_robot_whose_certificate_was_renewed_takes_no_more_part(kantor: "Kanto
     assert one.wait(timeout=EVENT_LIMIT_S) == 0
     assert "r2 has another key than on record, and can take no more part" in err
     assert "all signed by their origins" in findings(kantor, run)
+
+
+class Mute(Signing):
+    """A robot's process that leaves its signatures empty."""
+
+    def step(self, inputs: Inputs, /) -> Outputs:
+        """Make one step."""
+        return self._machine.step(inputs)
+
+
+def test_a_robot_that_does_not_sign_is_named(
+    kantor: "Kantor", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its reports are refused, world-sim says so in one line, and the other robot goes on without it."""
+    endpoint = free_endpoint()
+    mission = (*MISSION, "limit_s=12", "radio.range_m=3000", SIGNED, "--exchange", "lockstep")
+    world = world_sim(kantor, endpoint, "secrets", *mission)
+    identity = credentials.find(kantor.folder / "secrets", "r2")
+    monkeypatch.setattr(runner, "Signing", Mute)
+    with ThreadPoolExecutor(1) as pool:
+        mute = pool.submit(
+            run_agent, endpoint, identity, EVENT_LIMIT_S, lambda _line: None, kantor.folder / "r2"
+        )
+        place = ("--connect", endpoint, "--credentials", "secrets")
+        honest = kantor.start("agent", "r1", *place)
+        out, err = world.communicate(timeout=EVENT_LIMIT_S)
+        assert mute.result(EVENT_LIMIT_S) == "limit"
+
+    assert world.returncode == 1, out + err
+    assert honest.wait(timeout=EVENT_LIMIT_S) == 0
+    reason = "an attestation that r2 has not signed"
+    assert out.count(f"r2 sends what it cannot, and it is not taken in: {reason}") == 1
+    (folder,) = kantor.runs()
+    refused = result_of(folder)["refused_reports"]
+    assert isinstance(refused, dict)
+    assert (set(refused), refused["r2"]["reasons"]) == ({"r2"}, [reason])
+    assert "all signed by their origins" in findings(kantor, folder)
