@@ -106,6 +106,10 @@ MISSIONS = {
     "claims": small("claims=true", "planner='transport'"),
     "supervised": small('coordination="centralized"'),
     "map": on_map(SIGNED),
+    "hostile": small(
+        "faults=[{kind='hostile', probability=0.8}]", "limit_s=12", "energy.steps=120"
+    ),
+    "replayed": small("faults=[{kind='replay', probability=0.8, age_s=1.0}]"),
 }
 
 

@@ -283,3 +283,30 @@ def test_a_robot_that_does_not_sign_is_named(
     assert isinstance(refused, dict)
     assert (set(refused), refused["r2"]["reasons"]) == ({"r2"}, [reason])
     assert "all signed by their origins" in findings(kantor, folder)
+
+
+def test_a_signed_run_of_one_process_does_not_go_on_over_the_bus(kantor: "Kantor") -> None:
+    """Its keys follow from the seed; nothing is written."""
+    run = kantor.start(
+        "run",
+        *MISSION,
+        "energy.points=90000",
+        "energy.steps=90000",
+        SIGNED,
+        "--exchange",
+        "in-process",
+    )
+    while not kantor.runs():
+        assert run.poll() is None
+    (folder,) = kantor.runs()
+    await_act(folder, "r1", after=5)
+    os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
+    before = (folder / "run.mcap").read_bytes()
+    refused = kantor("worldsim", "--resume", folder, "--listen", free_endpoint())
+
+    assert (refused.code, refused.err) == (
+        2,
+        f"kantor: {folder}: a signed run of one process has keys that no other process has; start it anew\n",
+    )
+    assert (folder / "run.mcap").read_bytes() == before

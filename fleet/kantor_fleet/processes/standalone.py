@@ -108,6 +108,11 @@ def _check_resumable(folder: Path, past: "Past") -> None:
     from kantor_worldsim.engine.simulation import Simulation  # noqa: PLC0415
 
     opening = past.opening
+    if past.terms.exchange == "in-process" and past.identities is not None:
+        fail(
+            Exit.USAGE,
+            f"{folder}: a signed run of one process has keys that no other process has; start it anew",
+        )
     try:
         Simulation.resumed(opening.scenario, opening.seed, opening.setup, past.records, ())
     except ValueError as error:  # of another version, or not usable

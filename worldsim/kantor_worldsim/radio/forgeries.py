@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from kantor_protocol.base.counter_rng import Purpose, uniform
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, WORLD_SIM, Envelope, ParticipantId
+from kantor_protocol.wire.attestations import without_signatures
 from kantor_protocol.wire.messages import (
     BODY_BYTES_MAX,
     VERSION,
@@ -199,7 +200,11 @@ def forge(
 
 
 def forged(forger: Forger, draws: ForgeryDraws, body: bytes) -> bytes:
-    """The forgery that a forger makes from a body, which need not be a gossip message."""
+    """The forgery that a forger makes from a body, which need not be a gossip message.
+
+    It is made without signatures, of which it could keep a part that nobody takes for one: records depend on no key.
+    """
+    body = without_signatures(body)
     try:
         message = decode_gossip(body)
     except RefusedError:
