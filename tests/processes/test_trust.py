@@ -52,6 +52,14 @@ def robots(kantor: "Kantor", endpoint: str, folder: str) -> list["Process"]:
     ]
 
 
+def begun(kantor: "Kantor", world: "Process") -> Path:
+    """The folder of the run, once it has a record."""
+    while not (found := list(kantor.folder.glob("runs/*/run.mcap"))):
+        await_line(world, "t=")
+    (record,) = found
+    return record.parent
+
+
 def trust_of(folder: Path) -> tuple[str, Identities | None]:
     """What a run has on record of trust."""
     opening, second, *_ = records_of(folder)
@@ -187,9 +195,7 @@ def test_a_signed_run_goes_on_with_its_keys(kantor: "Kantor", exchange: str) -> 
     pace = () if exchange == "lockstep" else ("--speed", 8)
     world = world_sim(kantor, endpoint, "secrets", *mission, "--exchange", exchange, *pace)
     team = robots(kantor, endpoint, "secrets")
-    while not kantor.runs():
-        await_line(world, "t=")
-    (folder,) = kantor.runs()
+    folder = begun(kantor, world)
     await_act(folder, "r1", after=40)
     os.killpg(world.pid, signal.SIGKILL)
     world.wait()
@@ -221,9 +227,7 @@ def test_a_robot_whose_certificate_was_renewed_takes_no_more_part(kantor: "Kanto
     make(folder, robots=2)
     world = world_sim(kantor, endpoint, "keys", *MISSION, "--exchange", "lockstep")
     team = robots(kantor, endpoint, "keys")
-    while not kantor.runs():
-        await_line(world, "t=")
-    (run,) = kantor.runs()
+    run = begun(kantor, world)
     await_act(run, "r2", after=20)
     for process in (world, *team):
         os.killpg(process.pid, signal.SIGKILL)
@@ -296,7 +300,7 @@ def test_a_signed_run_of_one_process_does_not_go_on_over_the_bus(kantor: "Kantor
         "--exchange",
         "in-process",
     )
-    while not kantor.runs():
+    while not list(kantor.folder.glob("runs/*/run.mcap")):
         assert run.poll() is None
     (folder,) = kantor.runs()
     await_act(folder, "r1", after=5)
