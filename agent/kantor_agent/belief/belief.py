@@ -91,7 +91,6 @@ def _ship_packed(
     claims: np.ndarray,
     lowered: np.ndarray,
     mark: np.ndarray,
-    shipped: np.ndarray,
     counters: np.ndarray,
     best: np.ndarray,
     near: np.ndarray,
@@ -117,7 +116,6 @@ def _ship_packed(
         claims,
         lowered,
         mark,
-        shipped,
         counters,
     )
     # Of the configuration, spending reads only whose log it is and whether it is a ledger.

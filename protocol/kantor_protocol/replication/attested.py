@@ -50,7 +50,7 @@ from kantor_protocol.replication.proofs import (
 )
 from kantor_protocol.replication.registers import STALE_STEPS
 from kantor_protocol.replication.replica import Replica
-from kantor_protocol.replication.replica_kernels import SAMPLE, SINCE_NS, STAMP, STEP
+from kantor_protocol.replication.replica_kernels import OFFERED, SAMPLE, SINCE_NS, STAMP, STEP
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import Attestation, Identities, statement
 from kantor_protocol.wire.messages import GossipMessage
@@ -169,7 +169,7 @@ class Attested:
         self.newest[origin] = attestation
         self._claimed[origin] = attestation.claim[0] if attestation.claim[1] else 0
         if replica.config.proving:
-            replica.offered[origin] = attestation.length
+            replica.store.sending[OFFERED, origin] = attestation.length
             replica.registers.offer(origin, attestation.register_stamp)
 
     def _held(self, replica: Replica, origin: int) -> int:
@@ -279,7 +279,7 @@ class Attested:
     def _validate_offers(self, replica: Replica) -> None:
         """Of others is offered what the newest attestations cover, and no more."""
         me, registers = replica.config.me, replica.registers
-        for origin, length in enumerate(replica.offered.tolist()):
+        for origin, length in enumerate(replica.store.sending[OFFERED].tolist()):
             newest = self.newest.get(origin)
             assert origin == me or length == (newest.length if newest else 0)
         for origin, stamp in enumerate(registers.offered_stamps.tolist()):

@@ -11,6 +11,7 @@ from kantor_protocol.replication.proofs import Rules, read_word
 from kantor_protocol.replication.registers import Registers, are_registers
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import (
+    HISTORY,
     LENGTH_MAX,
     NO_INDEX,
     UNITS_MAX,
@@ -70,6 +71,7 @@ class Gossip:
     def receive(self, inbox: Iterable[Envelope], replica: Replica) -> None:
         """Have every well-formed message of a step merged; count the others."""
         self._unheard_steps += 1
+        attested = self._attested
         for envelope in inbox:
             place = self._places.get(envelope.source)
             try:
@@ -80,17 +82,16 @@ class Gossip:
                 self.refused += 1
                 continue
             source = place + message.incarnation * self._roster
-            if not self._merge(replica, source, message):
+            if attested is None:
+                parts = (message.version_vector, message.logs, message.claims, message.registers)
+                taken = replica.merge(source, *parts)
+            else:
+                taken = attested.merge(replica, source, message)
+            if not taken:
                 self.refused += 1
             elif place == self._supervisor:
                 self._supervisor_id = max(self._supervisor_id, source)
                 self._unheard_steps = 0
-
-    def _merge(self, replica: Replica, source: int, message: GossipMessage) -> bool:
-        if self._attested is not None:
-            return self._attested.merge(replica, source, message)
-        parts = (message.version_vector, message.logs, message.claims, message.registers)
-        return replica.merge(source, *parts)
 
     def compose(self, replica: Replica, step: int, pose: Pose, *, final: bool = False) -> Envelope:
         """The envelope of one step, with what its receivers lack. final: the state of its sender is."""
@@ -240,11 +241,10 @@ def _nothing_held(origins: int) -> ReplicaArrays:
         logs=np.zeros((1, 1, 2), dtype=np.int32),
         length=np.zeros(origins, dtype=np.int64),
         known=np.zeros((1, 1), dtype=np.int32),
-        sending=np.zeros((1, 1), dtype=np.int64),
+        sending=np.zeros((HISTORY, origins), dtype=np.int64),
         claims=np.zeros((4, origins), dtype=np.int64),
         lowered=none32,
         mark=none32,
-        shipped=np.zeros(origins, dtype=np.int64),
         counters=none64,
     )
 

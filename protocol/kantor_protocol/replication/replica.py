@@ -53,10 +53,12 @@ from kantor_protocol.replication.replica_kernels import (
     MERGED,
     NO_INDEX,
     NO_ROOM_TO_PACK,
+    OFFERED,
     RECEIVED_STEP,
     REPEATED_STEP,
     SAMPLE,
     SENT,
+    SHIPPED,
     SINCE_NS,
     STAMP,
     STAMP_STEP,
@@ -134,14 +136,10 @@ class Replica:
             claims=_no_claims(origins),
             lowered=np.zeros(weighed, dtype=np.int32),
             mark=np.zeros(weighed, dtype=np.int32),
-            shipped=np.zeros(origins, dtype=np.int64),
             counters=np.array([0, 1, weighed], dtype=np.int64),
         )
         """The arrays that kernels work on. ReplicaArrays states which of them agree with which."""
         self._settings = np.array(self.config, dtype=np.int64)
-        self.offered = np.zeros(origins, dtype=np.int64) if proving else self.store.length
-        """(n,) entries of each log that may be sent: `store.length`; or when proving, of others what they have
-        attested and is held, and of the own one what was sent last."""
         self._make_scratch()
 
     def _make_scratch(self) -> None:
@@ -223,19 +221,18 @@ class Replica:
         known = np.zeros((origins, 2 * origins), dtype=np.int32)
         known[:before, :before] = old.known[:, :before]
         known[:before, origins : origins + before] = old.known[:, before:]
-        length = _extended(old.length, origins)
+        length = np.zeros(origins, dtype=np.int64)
+        length[:before] = old.length
         sending = _nothing_sent(origins, self.config.ack_timeout_steps)
         claims = _no_claims(origins)
         sending[:, :before], claims[:, :before] = old.sending, old.claims
-        shipped = _extended(old.shipped, origins)
         logs = old.logs
         if self.config.ledger:
             logs = np.zeros((origins, *old.logs.shape[1:]), dtype=np.int32)
             logs[:before] = old.logs
         self.store = old._replace(
-            logs=logs, length=length, known=known, sending=sending, claims=claims, shipped=shipped
+            logs=logs, length=length, known=known, sending=sending, claims=claims
         )
-        self.offered = _extended(self.offered, origins) if self.config.proving else length
         self._make_scratch()
         self.registers.widen(origins)
 
@@ -245,11 +242,7 @@ class Replica:
 
     def compose(self, target: int = NO_INDEX) -> tuple[bytes, bytes, bytes]:
         """(version vector, logs, claims) of one message to all in range, or to one origin."""
-        if self.config.proving:
-            self.offered[self.config.me] = self.store.length[self.config.me]
-        end_of_vector, end_of_logs, end = compose(
-            *self._fields, self._out, self._least, self.offered, target
-        )
+        end_of_vector, end_of_logs, end = compose(*self._fields, self._out, self._least, target)
         message = self._out[:end].tobytes()
         return message[:end_of_vector], message[end_of_vector:end_of_logs], message[end_of_logs:]
 
@@ -305,10 +298,6 @@ class Replica:
         assert store.claims.shape == (4, origins)
         assert store.lowered.shape == store.mark.shape == (samples,)
         assert samples in {0, config.bound}
-        assert store.shipped.shape == (origins,)
-        assert self.offered.shape == (origins,)
-        assert config.proving != (self.offered is store.length)
-        assert ((self.offered >= 0) & (self.offered <= store.length)).all()
         self._validate_logs()
         self._validate_shipped()
         self._validate_weights()
@@ -342,14 +331,12 @@ class Replica:
             assert (log[:, 1] <= config.value_max).all()
 
     def _validate_shipped(self) -> None:
-        store, config = self.store, self.config
+        config, shipped = self.config, self.store.sending[SHIPPED]
         if not config.ledger:
-            assert not store.shipped.any()
+            assert not shipped.any()
             return
-        assert store.shipped.tolist() == [
-            log[:, 1].sum(dtype=np.int64) for log in self._held_logs()
-        ]
-        by_place = store.shipped.reshape(-1, config.roster).sum(axis=0)
+        assert shipped.tolist() == [log[:, 1].sum(dtype=np.int64) for log in self._held_logs()]
+        by_place = shipped.reshape(-1, config.roster).sum(axis=0)
         others = np.arange(config.roster) != config.me % config.roster
         assert (by_place[others] <= config.spend_max).all()
 
@@ -384,7 +371,7 @@ class Replica:
         assert (store.known <= KNOWN_MAX).all()
         assert not store.known[me].any()
         assert self.config.claims or not store.known[:, origins:].any()
-        for lengths in (store.sending[SENT], *store.sending[HISTORY:]):
+        for lengths in (*store.sending[[SENT, OFFERED]], *store.sending[HISTORY:]):
             assert (lengths >= 0).all()
             assert (lengths <= store.length).all()
         for steps in store.sending[[REPEATED_STEP, RECEIVED_STEP]]:
@@ -409,11 +396,6 @@ class Replica:
         assert stamp_step[me] == 0
         others = np.arange(self.origins) != me
         assert self.config.claims or not stamp[others].any()
-
-
-def _extended(numbers: npt.NDArray[np.int64], origins: int) -> npt.NDArray[np.int64]:
-    """(origins,) the numbers, and 0 for every further origin."""
-    return np.pad(numbers, (0, origins - numbers.shape[0]))
 
 
 def _nothing_sent(origins: int, ack_timeout_steps: int) -> npt.NDArray[np.int64]:

@@ -49,7 +49,7 @@ REST_BLOCKS_MAX = 4096
 SAMPLE, SINCE_NS, STAMP, STAMP_STEP = 0, 1, 2, 3
 
 # Rows of ReplicaArrays.sending; from HISTORY on, one for each step of the acknowledgement timeout.
-SENT, REPEATED_STEP, RECEIVED_STEP, HISTORY = 0, 1, 2, 3
+SENT, REPEATED_STEP, RECEIVED_STEP, OFFERED, SHIPPED, HISTORY = 0, 1, 2, 3, 4, 5
 
 # Entries of ReplicaArrays.counters.
 LOWERED, STEP, HOLDING = 0, 1, 2
@@ -76,8 +76,11 @@ class ReplicaArrays(NamedTuple):
     sending: npt.NDArray[np.int64]
     """(HISTORY + ack_timeout_steps, n), for each origin. SENT: entries of its log that were sent. REPEATED_STEP: step
     at which they were last repeated. RECEIVED_STEP: step at which a message of it was last received; never for the
-    own id. From HISTORY on: the log lengths at each of the last `ack_timeout_steps` steps. Numbers of entries are at
-    most `length`; steps are at most the current one, or -1 - ack_timeout_steps for never."""
+    own id. OFFERED: entries of its log that could be sent when a message was last composed; when proving, of others what
+    they have attested. From HISTORY on: the same at each of the last `ack_timeout_steps` steps. Numbers of entries are
+    at most `length`; steps are at most the current one, or -1 - ack_timeout_steps for never. SHIPPED, with a ledger:
+    the sum of values of all entries held of its log, of all incarnations of another participant together at most
+    `ReplicaConfig.spend_max`; 0 otherwise."""
     claims: npt.NDArray[np.int64]
     """(4, n): sample or NO_INDEX; since_ns, never negative; stamp; own step at which the stamp was received, at most
     the current one, 0 for the own claim. An origin without a stamp has no sample and 0 in the other rows. The own
@@ -88,9 +91,6 @@ class ReplicaArrays(NamedTuple):
     mark: npt.NDArray[np.int32]
     """(N,) the step at which an index was put into `lowered`: the current one for those in it, an earlier one for all
     others."""
-    shipped: npt.NDArray[np.int64]
-    """(n,) the sum of values of all entries held of each log, with a ledger; 0 otherwise. All incarnations of another
-    participant together at most `ReplicaConfig.spend_max`."""
     counters: npt.NDArray[np.int64]
     """(3,): LOWERED, how many indices are in `lowered`; STEP, the current step; HOLDING, how many weights are
     above 0."""
@@ -145,16 +145,15 @@ def _append(store: ReplicaArrays, row: int, origin: int, index: int, value: int)
 @kernel
 def _append_spending(store: ReplicaArrays, origin: int, index: int, value: int) -> None:
     _append(store, origin, origin, index, value)
-    store.shipped[origin] += value
+    store.sending[SHIPPED, origin] += value
 
 
 @kernel
-def _unspent(store: ReplicaArrays, config: ReplicaConfig, origin: int) -> int:
+def _unspent(sending: np.ndarray, origin: int, roster: int, spend_max: int) -> int:
     """Units that the participant of an origin can have shipped beside all that is held of it."""
-    left = config.spend_max
-    for each in range(origin % config.roster, store.length.shape[0], config.roster):
-        left -= store.shipped[each]
-    return left
+    for each in range(origin % roster, sending.shape[1], roster):
+        spend_max -= sending[SHIPPED, each]
+    return spend_max
 
 
 @kernel
@@ -181,19 +180,13 @@ def _merge_entry(
 
 
 @kernel
-def _walk_suffixes(
-    store: ReplicaArrays,
-    config: ReplicaConfig,
-    suffixes: bytes,
-    source: int,
-    covered: int,
-    apply: bool,
+def _check_suffixes(
+    store: ReplicaArrays, config: ReplicaConfig, suffixes: bytes, source: int, covered: int
 ) -> int:
-    """Read all suffixes, of the first `covered` origins; apply what is new, or only check.
+    """Check all suffixes, of the first `covered` origins.
 
-    Of a log that ships more than its participant has, what is too much is not applied; it is malformed in the message of
-    its own origin, and where one suffix has more by itself.
-    Returns how many entries some log may then hold, or a negative number when malformed.
+    Returns how many entries some log may hold after them, or a negative number when malformed. In the message of its
+    own origin a log is malformed that ships more than its participant has, and elsewhere one whose suffix does by itself.
     """
     ledger = config.ledger
     origins = store.length.shape[0]
@@ -217,11 +210,6 @@ def _walk_suffixes(
             longest = store.length[config.me] + entries
         elif start <= held + entries:  # it may follow on another suffix in this message
             longest = max(longest, start + span)
-        left = _unspent(store, config, origin) if ledger else config.spend_max
-        fresh = origin != config.me and (not ledger or start <= held < start + count)
-        if apply and not fresh:
-            at = skip_numbers(suffixes, at, 2 * count if config.value_max > 0 else count)
-            continue
         index = 0
         units = 0
         for i in range(count):
@@ -232,15 +220,45 @@ def _walk_suffixes(
             index += step
             if at < 0 or index < 0 or index >= config.bound or value > config.value_max:
                 return -1
-            if not ledger or start + i >= held:
-                units += value
-                if apply and (not ledger or units <= left):
-                    _merge_entry(store, config, origin, index, value)
-        if ledger and not apply and units > (left if origin == source else config.spend_max):
+            units += value if start + i >= held else 0
+        left = config.spend_max
+        if origin == source:
+            left = _unspent(store.sending, origin, config.roster, config.spend_max)
+        if ledger and units > left:
             return -1
-        if apply and not ledger and start <= held:
-            store.length[origin] = max(held, start + span)
     return longest
+
+
+@kernel
+def _apply_suffixes(store: ReplicaArrays, config: ReplicaConfig, suffixes: bytes) -> None:
+    """Merge what is new in suffixes that have been checked, as far as its participant can have shipped it."""
+    ledger = config.ledger
+    at = 0
+    while 0 <= at < len(suffixes):
+        origin, at = read_uint(suffixes, at)
+        start, at = read_uint(suffixes, at)
+        span, at = read_uint(suffixes, at)
+        count, at = read_uint(suffixes, at)
+        held = store.length[origin]
+        fresh = origin != config.me and (not ledger or start <= held < start + count)
+        if not fresh:
+            at = skip_numbers(suffixes, at, 2 * count if config.value_max > 0 else count)
+            continue
+        left = _unspent(store.sending, origin, config.roster, config.spend_max)
+        index = 0
+        for i in range(count):
+            step, at = read_int(suffixes, at)
+            value = 0
+            if config.value_max > 0:
+                value, at = read_uint(suffixes, at)
+            index += step
+            if ledger:
+                left -= value if start + i >= held else 0
+                if start + i < held or left < 0:
+                    continue
+            _merge_entry(store, config, origin, index, value)
+        if not ledger and start <= held:
+            store.length[origin] = max(held, start + span)
 
 
 @kernel
@@ -314,7 +332,7 @@ def _check(
     covered = count_ids(version_vector, config.roster, 2 if config.claims else 1)
     if not 0 <= source < covered or source == config.me:
         return MALFORMED
-    longest = _walk_suffixes(store, config, suffixes, source, covered, False)
+    longest = _check_suffixes(store, config, suffixes, source, covered)
     if longest < 0 or _walk_claims(store, config, claimed, covered, False) < 0:
         return MALFORMED
     return longest
@@ -330,7 +348,6 @@ def is_mergeable(
     claims: np.ndarray,
     lowered: np.ndarray,
     mark: np.ndarray,
-    shipped: np.ndarray,
     counters: np.ndarray,
     settings: np.ndarray,
     version_vector: bytes,
@@ -348,7 +365,6 @@ def is_mergeable(
         claims,
         lowered,
         mark,
-        shipped,
         counters,
     )
     return _check(store, config_of(settings), version_vector, suffixes, claimed, source) >= 0
@@ -364,7 +380,6 @@ def merge(
     claims: np.ndarray,
     lowered: np.ndarray,
     mark: np.ndarray,
-    shipped: np.ndarray,
     counters: np.ndarray,
     settings: np.ndarray,
     version_vector: bytes,
@@ -387,7 +402,6 @@ def merge(
         claims,
         lowered,
         mark,
-        shipped,
         counters,
     )
     config = config_of(settings)
@@ -400,7 +414,7 @@ def merge(
     if longest > logs.shape[1]:
         return longest
     _apply_version_vector(store, config, version_vector, source, covered)
-    _walk_suffixes(store, config, suffixes, source, covered, True)
+    _apply_suffixes(store, config, suffixes)
     if config.claims:
         _walk_claims(store, config, claimed, covered, True)
     store.sending[RECEIVED_STEP, source] = store.counters[STEP]
@@ -549,18 +563,15 @@ def compose(
     claims: np.ndarray,
     lowered: np.ndarray,
     mark: np.ndarray,
-    shipped: np.ndarray,
     counters: np.ndarray,
     settings: np.ndarray,
     out: np.ndarray,
     least: np.ndarray,
-    offered: np.ndarray,
     target: int,
 ) -> tuple[int, int, int]:
     """Write version vector, logs and claims one after the other; the position at the end of each.
 
-    least: (2n,) scratch, see `_find_least`. offered: (n,) entries of each log that may be sent. Everything else: see
-    `merge`.
+    least: (2n,) scratch, see `_find_least`. Everything else: see `merge`.
     """
     store = ReplicaArrays(
         weights,
@@ -571,7 +582,6 @@ def compose(
         claims,
         lowered,
         mark,
-        shipped,
         counters,
     )
     config = config_of(settings)
@@ -580,6 +590,8 @@ def compose(
     origins = store.length.shape[0]
     at = 0
     for origin in range(origins):
+        if origin == me or not config.proving:
+            store.sending[OFFERED, origin] = store.length[origin]
         at = put_uint(out, at, store.length[origin])
     if config.claims:
         for origin in range(origins):
@@ -590,7 +602,7 @@ def compose(
     for turn in range(origins):
         origin = (me + turn) % origins
         if ledger or origin == me:
-            aged, end = store.sending[now, origin], offered[origin]
+            aged, end = store.sending[now, origin], store.sending[OFFERED, origin]
             start = _start_of_suffix(store, config, target, least[origin], origin, end, aged)
             if start < end and origin != me and config.proving:
                 start, end = _proven_part(start, end, entries_left if others_left > 0 else 0)
@@ -599,7 +611,7 @@ def compose(
                 at, written = _put_suffix(store, config, out, at, origin, start, end, entries_left)
                 entries_left -= written
     for origin in range(origins):
-        store.sending[now, origin] = offered[origin]
+        store.sending[now, origin] = store.sending[OFFERED, origin]
     end_of_logs = at
     if config.claims:
         at = _put_claims(store, config, out, at, least)

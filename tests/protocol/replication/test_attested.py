@@ -17,7 +17,7 @@ from kantor_protocol.replication import attested
 from kantor_protocol.replication.attested import attested_every
 from kantor_protocol.replication.gossip import Gossip, MessageCheck
 from kantor_protocol.replication.occupancy_log import entries as entries_on
-from kantor_protocol.replication.replica_kernels import BLOCK, ENTRIES_MAX
+from kantor_protocol.replication.replica_kernels import BLOCK, ENTRIES_MAX, OFFERED, SHIPPED
 from kantor_protocol.wire.attestations import UNSIGNED, Attestation, hash_of, signed
 from kantor_protocol.wire.weights import Units
 from support.missions import on_map
@@ -486,7 +486,7 @@ def test_overspending_is_malformed(trust: tuple[str, ...]) -> None:
     assert check.passes(0, message_of(all_it_has))
     assert two.hear(all_it_has) == 0
     assert two.hear(shipping(one, [(11, 1)], start=10)) == 1
-    assert two.replica.store.shipped.tolist() == [20, 0, 0]
+    assert two.replica.store.sending[SHIPPED].tolist() == [20, 0, 0]
 
 
 def test_all_incarnations_together_have_one_budget() -> None:
@@ -502,7 +502,7 @@ def test_all_incarnations_together_have_one_budget() -> None:
 
     assert two.hear(words(3)) == 1
     assert two.hear(words(2)) == 0
-    assert two.replica.store.shipped.tolist() == [18, 0, 0, 2, 0, 0]
+    assert two.replica.store.sending[SHIPPED].tolist() == [18, 0, 0, 2, 0, 0]
 
 
 def test_a_forwarder_is_not_blamed_for_what_another_overspends() -> None:
@@ -515,7 +515,7 @@ def test_a_forwarder_is_not_blamed_for_what_another_overspends() -> None:
         two.hear(three.speak())
         assert three.hear(two.speak()) == 0
 
-    assert three.replica.store.shipped[0] == 20
+    assert three.replica.store.sending[SHIPPED, 0] == 20
     assert three.held_log(two.me) == two.log
 
 
@@ -529,8 +529,8 @@ BROKEN: dict[str, Callable[[Member, Any], Any]] = {
     "word-of-another": lambda _, a: a.newest.__setitem__(2, a.newest[0]),
     "unsigned": lambda _, a: a.newest.__setitem__(0, replace(a.newest[0], signature=UNSIGNED)),
     "word-of-more-than-is-held": lambda m, _: m.replica.store.length.__setitem__(0, 1),
-    "more-offered-than-attested": lambda m, _: m.replica.offered.__setitem__(2, 1),
-    "less-offered-than-attested": lambda m, _: m.replica.offered.__setitem__(0, 1),
+    "more-offered-than-attested": lambda m, _: m.replica.store.sending.__setitem__((OFFERED, 2), 1),
+    "less-offered-than-attested": lambda m, _: m.replica.store.sending.__setitem__((OFFERED, 0), 1),
     "another-entry": lambda m, _: m.replica.store.logs.__setitem__((0, 0, 0), 7),
     "another-claim": lambda _, a: a._claimed.__setitem__(0, 9),
     "claim-of-nobody": lambda _, a: a._claimed.__setitem__(2, 9),
@@ -544,14 +544,13 @@ def test_each_broken_invariant_is_found(name: str) -> None:
     _, two, _ = acquainted()
     two.gossip.validate(two.replica)
     held: Any = two.gossip._attested
-    kept = copy.deepcopy((two.replica.store, two.replica.offered))
+    kept = copy.deepcopy(two.replica.store)
     BROKEN[name](two, held)
 
     with pytest.raises(AssertionError):
         two.gossip.validate(two.replica)
-    for arrays, before in ((two.replica.store, kept[0]), ((two.replica.offered,), (kept[1],))):
-        for array, content in zip(arrays, before, strict=True):
-            array[...] = content  # replicas are validated once more when the test is over
+    for array, content in zip(two.replica.store, kept, strict=True):
+        array[...] = content  # replicas are validated once more when the test is over
 
 
 def test_an_offered_register_is_the_attested_one() -> None:
