@@ -193,20 +193,20 @@ def hostile_message_taken_in(patch: Patch) -> None:
 def sound_message_refused(patch: Patch) -> None:
     due = now_and_then(100)
 
-    def make(hear: Any) -> Any:
-        def heard(self: Gossip, inbox: Any, learn: Any) -> None:
-            hear(self, inbox, lambda *parts: not due() and learn(*parts))
+    def make(merge: Any) -> Any:
+        def merged(self: Replica, *parts: Any) -> bool:
+            return not due() and merge(self, *parts)
 
-        return heard
+        return merged
 
-    wrap(patch, Gossip, "receive", make)
+    wrap(patch, Replica, "merge", make)
 
 
 @mutant("a new incarnation counts its messages from 1 again", has(Kill, disk=("torn", "lost")))
 def sequences_used_again(patch: Patch) -> None:
     def make(say: Any) -> Any:
-        def said(self: Gossip, *arguments: Any) -> Any:
-            envelope = say(self, *arguments)
+        def said(self: Gossip, *arguments: Any, **options: Any) -> Any:
+            envelope = say(self, *arguments, **options)
             self._said = getattr(self, "_said", 0) + 1
             return msgspec.structs.replace(envelope, sequence=self._said)
 
@@ -218,9 +218,9 @@ def sequences_used_again(patch: Patch) -> None:
 @mutant("a robot that has lost its supervisor talks to it for ever", supervised)
 def supervisor_never_given_up(patch: Patch) -> None:
     def make(say: Any) -> Any:
-        def said(self: Gossip, *arguments: Any) -> Any:
+        def said(self: Gossip, *arguments: Any, **options: Any) -> Any:
             self._unheard_steps = 0
-            return say(self, *arguments)
+            return say(self, *arguments, **options)
 
         return said
 
@@ -230,10 +230,10 @@ def supervisor_never_given_up(patch: Patch) -> None:
 @mutant("a robot that has given its supervisor up never returns to it", supervised)
 def supervisor_never_heard_again(patch: Patch) -> None:
     def make(say: Any) -> Any:
-        def said(self: Gossip, *arguments: Any) -> Any:
+        def said(self: Gossip, *arguments: Any, **options: Any) -> Any:
             if getattr(self, "_lonely", False):
                 self._unheard_steps = 1000
-            envelope = say(self, *arguments)
+            envelope = say(self, *arguments, **options)
             self._lonely = self._supervisor >= 0 and envelope.target == EVERYBODY
             return envelope
 
