@@ -11,7 +11,8 @@ Theory of operation
    every message; a longer suffix is sent once, and again only when the acknowledgement has not come within
    `ack_timeout_steps`.
 4. Entries of other origins are forwarded, so that they travel over several hops. A robot holds them back for
-   `ack_timeout_steps`, since its neighbours most likely received them themselves; a relay does not.
+   `ack_timeout_steps`, since its neighbours most likely received them themselves; a relay does not. When *proving*,
+   as far as they have attested them (`attested.py`).
 5. What a planner shares beside weights and claims is in `registers.py` and travels in the same message.
 6. Merging is idempotent: a suffix that starts beyond what is held is dropped (it will come again), what is held
    already is skipped. Loss, duplication, delay and reordering cost time, never correctness.
@@ -20,7 +21,8 @@ Two meanings of the log of a mission that explores a density, by `merge`:
 
 ledger
     An entry is (sample, units spent by the origin). The weight of a sample is its initial weight minus the spending
-    of all origins, never below 0. Nothing is lost and nothing is counted twice.
+    of all origins, never below 0. Nothing is lost and nothing is counted twice. No log ships more than its
+    participant's energy allows.
 min
     An entry is (sample, units left in the origin's vector) and is merged by the minimum (Kabir & Lee, eq. 8-10). An
     origin's log holds all that ever fell in its vector, what it merged included, so that nothing needs forwarding.

@@ -38,7 +38,7 @@ class Attestation(msgspec.Struct, frozen=True, array_like=True, gc=False):
     length: int
     """Entries of its log."""
     log: bytes
-    """Hash of these entries, HASH_BYTES long; see `replication/attested.py`."""
+    """Hash of these entries, HASH_BYTES long; see `replication/proofs.py`."""
     claim: tuple[int, int, int] = (0, 0, 0)
     """Stamp, sample + 1 (0: none), since_ns; as in `GossipMessage.claims`."""
     register_stamp: int = 0

@@ -102,7 +102,7 @@ class GossipMessage(_Message, frozen=True, array_like=True, tag=1, gc=False):
     """The sender's incarnation."""
     proofs: tuple[bytes, ...] = ()
     """For each attestation of another, in order: hashes by which it covers the suffix of its log that comes with it;
-    see `replication/attested.py`."""
+    see `replication/proofs.py`."""
     attestations: tuple[Attestation, ...] = ()
     """Of the state of origins, signed by them, with `trust = "signed"`; see `replication/attested.py`. The sender's own
     one comes last, and its signature ends the message."""
