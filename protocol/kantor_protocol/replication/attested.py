@@ -134,7 +134,7 @@ class Attested:
         """Whether a suffix contradicts what is held of its origin's log."""
         origin, start = suffix.part.origin, suffix.part.first
         held = self._held(replica, origin)
-        if origin == replica.config.me or start > held:
+        if origin == replica.config.me or origin >= replica.origins or start > held:
             return False
         both = suffix.entries[: held - start]
         log = replica.store.logs[origin, start : start + both.shape[0]]

@@ -319,6 +319,29 @@ def test_what_is_newer_than_an_attestation_is_taken_from_its_origin_alone() -> N
     assert len(three.held_log(one.me)) > 2
 
 
+def test_the_log_of_a_new_incarnation_is_forwarded_to_who_knows_the_first_alone() -> None:
+    """r1 has lost its log and goes on; r3 makes room for it when it is brought its word."""
+    one, two, three = acquainted()
+    three.hear(forwarded(two, three))
+    again = Member("r1", one.scenario, N, UNITS, incarnation=1)
+    again.buy(7, 2)
+    brought = []
+    for _ in range(9):
+        two.hear(again.speak())
+        word = two.speak()
+        again.hear(word)
+        two.hear(three.speak())
+        brought += (
+            [word] if any(each.origin == again.me for each in message_of(word).attestations) else []
+        )
+
+    assert three.hear(brought[0]) == 0
+    assert three.held_log(again.me) == again.log
+    assert three.held_log(one.me) == one.log
+    assert again.held_log(one.me) == one.log
+    assert not three.gossip.forked
+
+
 def test_claims_travel_in_attestations() -> None:
     """r3 heads for nothing that r1 has claimed; the claims of a message are its sender's."""
     one, two, three = acquainted()
