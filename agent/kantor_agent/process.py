@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from kantor_agent.robots.byzantine import HonestRobot, as_declared
 from kantor_agent.robots.density import DensityRobot
 from kantor_protocol.base.machine import Body, StateMachine
 from kantor_protocol.node.runner import participate
@@ -24,11 +25,14 @@ def run(
 
     def build(mission: Mission, body: Body) -> StateMachine:
         me, scenario, seed = identity.user, mission.scenario, mission.seed
-        identities = mission.identities
+        robot: HonestRobot
         if mission.frame is not None:
             from kantor_agent.robots.mapping import MappingRobot  # noqa: PLC0415  only where there is a map
 
-            return MappingRobot(me, scenario, seed, body, mission.frame, identities)
-        return DensityRobot(me, scenario, seed, body, mission.samples.open("<f8", 2), identities)
+            robot = MappingRobot(me, scenario, seed, body, mission.frame, mission.identities)
+        else:
+            samples_m = mission.samples.open("<f8", 2)
+            robot = DensityRobot(me, scenario, seed, body, samples_m, mission.identities)
+        return as_declared(me, scenario, seed, robot)
 
     return participate(connect, identity, build, connect_timeout_s, say, state)

@@ -11,6 +11,7 @@ from kantor_protocol.base.counter_rng import Purpose
 from kantor_protocol.base.machine import Body, Inputs, Observation, Outputs, ParticipantId, State
 from kantor_protocol.base.random_walk import RandomWalk
 from kantor_protocol.replication.gossip import Gossip, build_replica
+from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import NO_INDEX
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import Identities
@@ -76,6 +77,11 @@ class DensityRobot:
         self._now_ns, self._step = inputs.now_ns, self._step + 1
         spent = self._explore(elapsed_s) if self._state is State.EXPLORING else b""
         return self._publish(spent)
+
+    @property
+    def replica(self) -> Replica:
+        """What it knows of all participants; for reading."""
+        return self._replica
 
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""

@@ -43,6 +43,7 @@ from kantor_protocol.replication.occupancy_log import (
     given_up_frontier,
     retried_frontier,
 )
+from kantor_protocol.replication.replica import Replica
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import Identities
 
@@ -127,6 +128,11 @@ class MappingRobot:
         if not self._resting:
             self._move(elapsed_s)
         return self._publish()
+
+    @property
+    def replica(self) -> Replica:
+        """What it knows of all participants; for reading."""
+        return self._replica
 
     def validate(self) -> None:
         """Assert what the parts say of themselves and of one another; true between two steps."""

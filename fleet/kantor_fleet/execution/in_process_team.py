@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
+from kantor_agent.robots.byzantine import as_declared
 from kantor_agent.robots.density import DensityRobot
 from kantor_agent.robots.mapping import MappingRobot
 from kantor_protocol.base.machine import SUPERVISOR, Body, ParticipantId, StateMachine
@@ -76,9 +77,12 @@ def participant(
         if frame is not None:
             return MappingSupervisor(name, scenario, seed, body, frame, identities)
         return DensitySupervisor(name, scenario, body, setup.samples_m.shape[0], identities)
+    robot: DensityRobot | MappingRobot
     if frame is not None:
-        return MappingRobot(name, scenario, seed, body, frame, identities)
-    return DensityRobot(name, scenario, seed, body, setup.samples_m, identities)
+        robot = MappingRobot(name, scenario, seed, body, frame, identities)
+    else:
+        robot = DensityRobot(name, scenario, seed, body, setup.samples_m, identities)
+    return as_declared(name, scenario, seed, robot)
 
 
 def play(

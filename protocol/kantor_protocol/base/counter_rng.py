@@ -53,6 +53,7 @@ class Purpose(enum.IntEnum):
     FAULT_HOSTILE = 25
     FORGERY = 26
     CAMPAIGN = 27
+    LIE = 28
 
 
 @kernel

@@ -5,8 +5,9 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations
 from typing import Any
 
-from kantor_protocol.base.machine import WORLD_SIM
+from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM
 from kantor_protocol.scenario.faults.base import Fault, Names
+from kantor_protocol.scenario.faults.liars import Byzantine
 from kantor_protocol.scenario.faults.links import (
     Bandwidth,
     Clog,
@@ -203,6 +204,21 @@ def _of_impostor(fault: Impostor, _scenario: Scenario) -> Iterable[str]:
         yield "until_s: an impostor asks once, at from_s; leave it out"
 
 
+def _of_byzantine(fault: Byzantine, scenario: Scenario) -> Iterable[str]:
+    yield from _of_names("who", fault.who, scenario)
+    if SUPERVISOR in fault.who:
+        yield "who: a supervisor is believed without proof and must not lie; name robots"
+    if fault.lie == "overstate" and (scenario.mapping or scenario.merge != "ledger"):
+        yield 'lie: overstate is about spending in a ledger; explore a density with merge = "ledger"'
+    if fault.lie == "fork" and not (scenario.mapping or scenario.merge == "ledger"):
+        yield 'lie: nobody compares logs of minima; fork needs merge = "ledger" or a map'
+    shares = scenario.claiming or scenario.register_width
+    if fault.lie == "claim" and not shares:
+        yield "lie: nobody claims samples or shares registers in this mission; tell another"
+    if fault.lie == "rewrite" and not (shares or scenario.merge == "ledger"):
+        yield 'lie: nobody passes on what others say in this mission; rewrite needs merge = "ledger"'
+
+
 _CHECKS: dict[type, Callable[[Any, Scenario], Iterable[str]]] = {
     Fault: _of_window,
     OnLinks: _of_robots,
@@ -218,6 +234,7 @@ _CHECKS: dict[type, Callable[[Any, Scenario], Iterable[str]]] = {
     Late: _of_late,
     ClockFault: _of_clock,
     Impostor: _of_impostor,
+    Byzantine: _of_byzantine,
 }
 """The checks of each class of faults, beyond those of its base classes."""
 

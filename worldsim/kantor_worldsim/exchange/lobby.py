@@ -12,6 +12,7 @@ import msgspec
 
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX
 from kantor_protocol.base.machine import EVERYBODY, WORLD_SIM, Body, Outputs, ParticipantId
+from kantor_protocol.scenario.faults.liars import lies_of
 from kantor_protocol.transport.events import Flooded, Joined, Left, Received
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import LEASE_MS, BusError
@@ -329,13 +330,15 @@ class Lobby:
                 self._brief(Joined(name, nonce))
 
     def _brief(self, event: Joined) -> None:
-        """Send a process its mission, without the faults: no participant knows them ahead."""
+        """Send a process its mission, without faults, which no participant knows ahead, but with its own lies."""
         config = self._config
         self._briefed_s[event.name] = time.monotonic()
         mission = Mission(
             VERSION,
             event.nonce,
-            msgspec.structs.replace(config.scenario, faults=()),
+            msgspec.structs.replace(
+                config.scenario, faults=lies_of(event.name, config.scenario.faults)
+            ),
             config.seed,
             self._starts,
             self._samples,

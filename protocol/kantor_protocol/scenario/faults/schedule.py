@@ -5,11 +5,12 @@ from typing import Annotated, get_args
 from msgspec import Meta
 
 from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.liars import Byzantine
 from kantor_protocol.scenario.faults.links import LinkFault
 from kantor_protocol.scenario.faults.processes import ProcessFault
 from kantor_protocol.scenario.types import ScenarioTable
 
-AnyFault = LinkFault | ProcessFault
+AnyFault = LinkFault | ProcessFault | Byzantine
 """The faults that a list may hold."""
 
 
