@@ -141,6 +141,7 @@ class Recording:
             refused_reports=self.refused_reports,
             record=self.journal.cut or "whole",
             complaints=tuple(self.checker.violations),
+            lies=self.checker.lies,
         )
         if self._folder is not None:
             self._manifest |= {

@@ -76,6 +76,7 @@ def check_batch(
     virtual: bool,
     clocks: bool,
     signal_slack_ns: int,
+    false_logs: bool,
     cut: np.ndarray,
     range_m: np.ndarray,
     now_ns: int,
@@ -119,6 +120,7 @@ def check_batch(
         virtual,
         clocks,
         signal_slack_ns,
+        false_logs,
     )
     missing = missing_capacity(state, columns)
     if missing < 0:

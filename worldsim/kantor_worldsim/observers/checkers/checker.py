@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
+from kantor_protocol.scenario.faults.liars import liars_of
 from kantor_protocol.scenario.faults.links import Hostile
 from kantor_protocol.scenario.faults.processes import Kill, Late
 from kantor_protocol.wire.attestations import Identities
 from kantor_protocol.wire.weights import WeightsSubscriber
 from kantor_worldsim.observers.checkers.batch_pass import check_batch
 from kantor_worldsim.observers.checkers.delivery_index import index_deliveries
+from kantor_worldsim.observers.checkers.lies import LiarChecker
 from kantor_worldsim.observers.checkers.links import Links
 from kantor_worldsim.observers.checkers.mapping import MapChecker
 from kantor_worldsim.observers.checkers.outages import WrongClocks, caused_events
@@ -26,6 +28,7 @@ from kantor_worldsim.observers.checkers.state import (
     FORGED_FIRST,
     INCARNATION_ID,
     KEYFRAME,
+    LIES,
     NOT_STOPPED,
     NOTED,
     REFUSALS_SO_FAR,
@@ -40,6 +43,7 @@ from kantor_worldsim.observers.checkers.state import (
     arguments,
 )
 from kantor_worldsim.observers.checkers.violations import (
+    FOREIGN_LOG,
     NOT_ITS_OWN,
     NOT_REBUILT,
     TEXTS,
@@ -64,7 +68,8 @@ from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent,
 class Checker:
     """Follows the records of one run and collects violations.
 
-    A mission on a map has no weights, energy or ledger; it has rules of its own, see `MapChecker`.
+    A mission on a map has no weights, energy or ledger; it has rules of its own, see `MapChecker`. Where robots lie
+    by a fault, what they say counts as their lies, and there are rules beside, see `LiarChecker`.
 
     Rules
     -----
@@ -123,11 +128,17 @@ class Checker:
         self._virtual = virtual
         self._map_checker: MapChecker | None = None
         self._register_checker: RegisterChecker | None = None
+        self._liar_checker: LiarChecker | None = None
         self._opening: Opening | None = None
         self._unidentified = False
         """The opening is of a signed run, and the next record must be its identities."""
         self._ended = False
         self._now_ns = 0
+
+    @property
+    def lies(self) -> dict[ParticipantId, int]:
+        """How often each declared liar has said what is against the rules."""
+        return {} if self._liar_checker is None else dict(sorted(self._liar_checker.told.items()))
 
     def observe(self, decoded: DecodedRecord, /) -> None:
         """Check one record."""
@@ -173,6 +184,8 @@ class Checker:
                 )
 
     def _report(self, rule: str, who: str, what: str) -> None:
+        if self._liar_checker is not None and self._liar_checker.takes(rule, who):
+            return
         self.count += 1
         if len(self.violations) < VIOLATIONS_MAX:
             self.violations.append(f"{rule}: t={self._now_ns * 1e-9:.3f} s: {who}: {what}")
@@ -187,8 +200,17 @@ class Checker:
         self._hostile = [fault for fault in scenario.faults if isinstance(fault, Hostile)]
         self._clocks = WrongClocks(scenario, virtual=self._virtual)
         self._links = Links(scenario, opening.seed)
-        self._limits = Limits.of(opening, virtual=self._virtual, clocks=bool(self._clocks))
+        if liars_of(scenario.faults):
+            self._liar_checker = LiarChecker(opening, self._report)
+        self._limits = Limits.of(
+            opening,
+            virtual=self._virtual,
+            clocks=bool(self._clocks),
+            false_logs=self._liar_checker is not None and bool(self._liar_checker.false_logs),
+        )
         self._keep(CheckerState.of(opening))
+        if self._liar_checker is not None:
+            self._state.participants[self._liar_checker.liar_places, LIES] = 1
         if scenario.planner.name == "spectral":
             self._register_checker = RegisterChecker(scenario, self._report)
         self._due = {
@@ -204,7 +226,8 @@ class Checker:
             for name in fault.who if isinstance(fault, Late) else ():
                 self._stop(name, ProcessEventKind.KILL, 0)
         if scenario.mapping:
-            self._map_checker = MapChecker(self._map_tracker, self._report)
+            false = self._liar_checker.is_false if self._liar_checker is not None else None
+            self._map_checker = MapChecker(self._map_tracker, self._report, false)
             self._map_checker.open(opening)
 
     def _keep(self, state: CheckerState) -> None:
@@ -227,6 +250,8 @@ class Checker:
         if noted:
             self._report_noted(batch, self._state.counts.item(NOTED))
             self._check_keyframes(batch)
+        if self._liar_checker is not None:
+            self._check_beside_liars(batch, self._liar_checker)
         if self._register_checker is not None:
             self._check_registers(batch, self._register_checker)
         if self._map_checker is not None:
@@ -363,8 +388,30 @@ class Checker:
         noted = min(count, VIOLATIONS_MAX)
         rows, lengths_m = self._state.violations[:noted], self._state.lengths_m[:noted]
         for row, lengths in zip(rows.tolist(), lengths_m.tolist(), strict=True):
-            self._report(*describe(batch, self._names, row, lengths))
+            if not self._is_in_good_faith(row):
+                self._report(*describe(batch, self._names, row, lengths))
         self.count += count - noted
+
+    def _is_in_good_faith(self, noted: list[int]) -> bool:
+        """Whether a noted violation is the log of a liar in the message of another, who cannot know it."""
+        kind, _, origin, *_ = noted
+        return (
+            kind == FOREIGN_LOG
+            and self._liar_checker is not None
+            and self._liar_checker.is_false(origin)
+        )
+
+    def _check_beside_liars(self, batch: Batch, checker: LiarChecker) -> None:
+        consumed = self._state.consumed
+        checker.check(batch, consumed)
+        for step_record in batch.step_records if checker.false_logs else ():
+            place = self._places.get(step_record.name)
+            if (
+                place is not None
+                and step_record.outputs is not None
+                and step_record.outputs.lowered
+            ):
+                checker.check_view(place, self._state.views[place], consumed)
 
     def _check_keyframes(self, batch: Batch) -> None:
         participants, subscriber = self._state.participants, self._subscriber
@@ -403,17 +450,32 @@ class Checker:
 
     def _check_view(self, name: ParticipantId, place: int) -> None:
         """A view is exactly what the entries leave that its participant says it holds."""
-        state = self._state
+        state, liars = self._state, self._liar_checker
         spent = np.zeros(state.consumed.shape[0], dtype=np.int64)
+        doubtful = 0
         for incarnation_id, length in enumerate(state.version_vector[place].tolist()):
             entries = state.shipped.item(incarnation_id, ENTRIES)
             if length > entries:
                 origin = origin_of(incarnation_id, self._names)
                 self._report("ledger", name, f"holds {length} entries of {origin}'s {entries}")
                 return
+            if liars is not None and incarnation_id % len(self._names) in liars.false_logs - {
+                place
+            }:
+                doubtful += length
+                continue
             log = state.logs[incarnation_id, :length]
             np.add.at(spent, log[:, 0], log[:, 1])
-        wrong = np.flatnonzero(state.views[place] != np.maximum(self._units.sample - spent, 0))
+        left = np.maximum(self._units.sample - spent, 0)
+        wrong = np.flatnonzero(state.views[place] != left)
+        if liars is not None and doubtful:
+            wrong = np.flatnonzero(state.views[place] > left)
+            lost = int((left - state.views[place]).sum())
+            if not wrong.size and lost > liars.allowance(place):
+                what = (
+                    f"false logs took {lost} units, and liars could take {liars.allowance(place)}"
+                )
+                self._report("ledger", name, what)
         if wrong.size:
             what = f"its view of sample {wrong[0]} is not what its logs leave"
             self._report("ledger", name, what)

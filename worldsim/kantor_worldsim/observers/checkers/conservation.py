@@ -78,7 +78,7 @@ def check_weights(state: CheckerState, limits: Limits, columns: ColumnarBatch, r
         sample, left = columns.pairs[i, of.SAMPLE], columns.pairs[i, of.UNITS]
         if left >= view[sample]:
             note_violation(state, RISE, row, sample, view[sample], left, 0.0, 0.0)
-        if left < limits.sample_units - state.consumed[sample]:
+        if not limits.false_logs and left < limits.sample_units - state.consumed[sample]:
             note_violation(state, BELOW, row, sample, 0, 0, 0.0, 0.0)
         published = state.published[step_record[of.PLACE], sample]
         participant[DIFFERING] += (published != left) - (published != view[sample])

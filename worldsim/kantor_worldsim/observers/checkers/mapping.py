@@ -65,17 +65,30 @@ class MapChecker:
     finish      a robot that reports that it has finished can reach no frontier by what it holds (without noise)
     """
 
-    def __init__(self, map_tracker: MapTracker | None, report: Report) -> None:
-        """map_tracker: one that an earlier observer of the same run keeps; None: one of its own."""
+    def __init__(
+        self,
+        map_tracker: MapTracker | None,
+        report: Report,
+        is_false: Callable[[int], bool] | None = None,
+    ) -> None:
+        """map_tracker: one that an earlier observer of the same run keeps; None: one of its own.
+
+        is_false: whether the log of an incarnation id is a liar's, which others pass on in good faith; see `lies.py`.
+        """
         self._own_tracker = map_tracker is None
         self._map_tracker = map_tracker or MapTracker()
-        self._report = report
+        self._report, self._is_false = report, is_false
 
     def open(self, opening: Opening) -> None:
         """Begin with the first record."""
         if self._own_tracker:
             self._map_tracker.open(opening)
-        self._exact = opening.scenario.sensor.noise_m == 0.0
+        exact = opening.scenario.sensor.noise_m == 0.0
+        known = self._is_false is None or not any(
+            map(self._is_false, range(len(opening.scenario.roster)))
+        )
+        self._shows_ends = exact and known
+        """Whether it is known what robots hold, entry for entry."""
         self._names = opening.scenario.roster
         self._poses_m = dict(zip(self._names, self._map_tracker.poses_m, strict=False))
         self._senders_m = dict(self._poses_m)
@@ -115,6 +128,8 @@ class MapChecker:
         return count - len(noted)
 
     def _describe(self, batch: Batch, kind: int, row: int, a: int, b: int) -> None:
+        if kind == FOREIGN and self._is_false is not None and self._is_false(a):
+            return
         rule, text = _TEXTS[kind]
         origin = self._names[a % len(self._names)] if kind == FOREIGN else ""
         seen = "occupied" if b else "free"
@@ -166,6 +181,6 @@ class MapChecker:
         if step_record.outputs.state is not State.FINISHED or step_record.name in self._finished:
             return
         self._finished.add(step_record.name)
-        cell = self._map_tracker.reachable(step_record.name) if self._exact else NEVER
+        cell = self._map_tracker.reachable(step_record.name) if self._shows_ends else NEVER
         if cell != NEVER:
             self._report("finish", step_record.name, f"could go to the frontier in cell {cell}")

@@ -5,6 +5,7 @@ import math
 from kantor_protocol.base.kernels import kernel
 from kantor_worldsim.observers.checkers.state import (
     FORGED_FIRST,
+    LIES,
     MOVED_NS,
     NOT_STOPPED,
     REFUSALS_SO_FAR,
@@ -74,14 +75,18 @@ def check_order(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
 
 @kernel
 def check_refusals(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
-    """A participant refuses what is forged, and nothing else."""
+    """A participant refuses what is forged, and nothing else but what liars say."""
     step_record = columns.step_records[row]
     participant = state.participants[step_record[of.PLACE]]
-    forged = 0
+    forged, of_liars = 0, 0
     for item in range(step_record[of.HEARD], step_record[of.HEARD] + step_record[of.HEARD_COUNT]):
-        forged += columns.heard[item, of.SEQUENCE] >= FORGED_FIRST
+        source = columns.heard[item, of.SOURCE]
+        if columns.heard[item, of.SEQUENCE] >= FORGED_FIRST:
+            forged += 1
+        elif source >= 0:
+            of_liars += state.participants[source, LIES]
     refused = step_record[of.REFUSED] - participant[REFUSALS_SO_FAR]
-    if refused != forged:
+    if not forged <= refused <= forged + of_liars:
         note_violation(state, REFUSALS, row, 0, refused, forged, 0.0, 0.0)
     participant[REFUSALS_SO_FAR] = step_record[of.REFUSED]
 

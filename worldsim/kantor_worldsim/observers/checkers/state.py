@@ -25,8 +25,8 @@ NOT_STOPPED = -1
 # Columns of CheckerState.participants.
 STEPS, INCARNATION_ID, MOVED_NS, POINTS, ASKED, POSTED, UNDER_WAY, VECTOR_SENT = range(8)
 SEQUENCE, DIFFERING, _COMING, KEYFRAME, STOPPED_NS = 8, 9, 10, 13, 14
-REFUSALS_SO_FAR, NUMBER, SKEW_BEFORE_NS = 15, 16, 17
-_PARTICIPANT_COLUMNS = 18
+REFUSALS_SO_FAR, NUMBER, SKEW_BEFORE_NS, LIES = 15, 16, 17, 18
+_PARTICIPANT_COLUMNS = 19
 
 # Columns of CheckerState.shipped.
 ENTRIES, WRITES = 0, 1
@@ -48,12 +48,13 @@ class CheckerState(NamedTuple):
     """The run so far, for the kernels. n participants, N samples; ids: incarnation ids, see `incarnations.py`."""
 
     participants: npt.NDArray[np.int64]
-    """(n, 18): last step; incarnation id; time of the last move; points shipped by all its incarnations;
+    """(n, 19): last step; incarnation id; time of the last move; points shipped by all its incarnations;
     whether it was asked for a step and has not answered; rows used of posted and deliveries; whether this
     incarnation has sent a version vector; sequence of its last publication, entries in which that
     differs from its view; rows that this batch brings to logs, posted and deliveries; 1 + the step record
     with which it publishes a keyframe in this batch; since when it is stopped, or NOT_STOPPED; messages it
-    has refused; the highest number of an envelope it has sent; how far its clock was ahead in its last step."""
+    has refused; the highest number of an envelope it has sent; how far its clock was ahead in its last step;
+    whether the scenario has it lie."""
     poses_m: npt.NDArray[np.float64]
     """(n, 2) world frame."""
     views: npt.NDArray[np.int64]
@@ -162,9 +163,13 @@ class Limits(NamedTuple):
     signal_slack_ns: int
     """In real time: how much later than the event that stops a process its last step may be, since signals
     take a while."""
+    false_logs: bool
+    """Some logs are not what was consumed, and views may be below what all spending leaves; see `lies.py`."""
 
     @classmethod
-    def of(cls, opening: Opening, *, virtual: bool, clocks: bool) -> "Limits":
+    def of(
+        cls, opening: Opening, *, virtual: bool, clocks: bool, false_logs: bool = False
+    ) -> "Limits":
         """Those of a run."""
         scenario, units = opening.scenario, opening.units
         return cls(
@@ -179,6 +184,7 @@ class Limits(NamedTuple):
             virtual=virtual,
             clocks=clocks,
             signal_slack_ns=scenario.period_ns,
+            false_logs=false_logs,
         )
 
 

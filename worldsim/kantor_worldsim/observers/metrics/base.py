@@ -10,6 +10,7 @@ import numpy as np
 from kantor_protocol.base.counter_rng import Purpose
 from kantor_protocol.base.machine import ParticipantId
 from kantor_protocol.base.random_walk import RandomWalk
+from kantor_protocol.scenario.faults.liars import liars_of
 from kantor_protocol.scenario.faults.schedule import kind_of
 from kantor_protocol.transport.rate_limit import Excess
 from kantor_worldsim.observers.metrics.result import (
@@ -108,7 +109,7 @@ class RunMetrics:
         self._tally = RunTally(
             counts=np.zeros(11, dtype=np.int64),
             shipped=np.zeros(2),
-            standing=np.zeros((len(names), 4), dtype=np.int64),
+            standing=np.zeros((len(names), 5), dtype=np.int64),
             shipped_by=np.zeros(robots),
             xy_m=setup.starts_m.copy(),
             views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
@@ -118,6 +119,8 @@ class RunMetrics:
         self._tally.counts[FIRST_CONTACT] = NEVER
         self._tally.counts[LEAST] = self._units.whole
         self._tally.standing[:, 2] = NEVER
+        liars = liars_of(scenario.faults)
+        self._tally.standing[:, 4] = [name in liars for name in names]
         self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
         self._out_of_range = self._absences = 0
         self._fault_counts = Counter[tuple[int, str]]()
@@ -263,8 +266,12 @@ class RunMetrics:
         refused_reports: Mapping[ParticipantId, RefusedReports] = MappingProxyType({}),
         record: str,
         complaints: tuple[str, ...],
+        lies: Mapping[ParticipantId, int] = MappingProxyType({}),
     ) -> Result:
-        """The summary; call it after the last record. complaints: the violations that checkers found."""
+        """The summary; call it after the last record. complaints: the violations that checkers found.
+
+        lies: how often each declared liar has said what is against the rules.
+        """
         scenario, counts = self._scenario, self._tally.counts.tolist()
         robots = scenario.robots.count
         finished = self._tally.standing[:robots, 2].tolist()
@@ -313,5 +320,6 @@ class RunMetrics:
             rejoin_s=Rejoining.of(self._rejoined_ns),
             excess=dict(excess),
             refused_reports=dict(refused_reports),
+            lies=dict(lies),
             **self._measured(),
         )

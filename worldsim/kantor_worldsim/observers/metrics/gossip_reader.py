@@ -105,3 +105,37 @@ def read_register(
     register = np.zeros(width, dtype=np.int64)
     stamp = int(_find_register(registers, origins, wanted, register))
     return None if stamp < 0 else (stamp, register)
+
+
+def claims_of(claims: bytes) -> list[tuple[int, int, int, int]]:
+    """The whole claims in a message: incarnation id of the origin, stamp, sample + 1, since_ns."""
+    numbers, at = [], 0
+    while 0 <= at < len(claims):
+        number, at = read_uint(claims, at)
+        numbers.append(number)
+    whole = len(numbers) - len(numbers) % 4
+    return [
+        (numbers[i], numbers[i + 1], numbers[i + 2], numbers[i + 3]) for i in range(0, whole, 4)
+    ]
+
+
+def registers_of(registers: bytes, origins: int) -> list[tuple[int, ...]]:
+    """The registers in a message: incarnation id of the origin, stamp, then the numbers; up to where it is malformed.
+
+    origins: the incarnations that the version vector beside it is about.
+    """
+    at = 0
+    for _ in range(origins):
+        _stamp, at = read_uint(registers, at)
+    found = []
+    while 0 <= at < len(registers):
+        origin, at = read_uint(registers, at)
+        stamp, at = read_uint(registers, at)
+        count, at = read_uint(registers, at)
+        numbers: list[int] = []
+        while 0 <= at <= len(registers) and len(numbers) < count:
+            number, at = read_int(registers, at)
+            numbers.append(number)
+        if at >= 0:
+            found.append((origin, stamp, *numbers))
+    return found

@@ -17,6 +17,7 @@ from kantor_protocol.base.grid import FREE, NOWHERE
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX
 from kantor_protocol.base.machine import Observation, ParticipantId, Pose
 from kantor_protocol.replication.occupancy_log import OccupancyLog, entries
+from kantor_protocol.scenario.faults.liars import liars_of
 from kantor_protocol.wire.messages import RefusedError
 from kantor_worldsim.observers.metrics.map_tracker_kernels import (
     AS_SENT,
@@ -79,6 +80,7 @@ class MapTracker:
         self.tick = 0
         robots, cells, count = scenario.robots.count, self.frame.cells, len(scenario.roster)
         assert entries(self.frame) < 2**31
+        liars = liars_of(scenario.faults)
         self.state = MapTrackerState(
             first_tick=np.full(cells, NEVER, dtype=np.int32),
             frontier=np.zeros(cells, dtype=np.bool_),
@@ -93,6 +95,7 @@ class MapTracker:
             stood=np.full((robots, 256), NEVER, dtype=np.int32),
             totals=np.zeros(4, dtype=np.int64),
             violations=np.zeros((VIOLATIONS_MAX, 5), dtype=np.int64),
+            lies=np.array([name in liars for name in scenario.roster]),
         )
         self._ground = GroundTruth(
             np.ascontiguousarray(self.ground.cells),

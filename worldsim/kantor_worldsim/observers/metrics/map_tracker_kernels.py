@@ -82,6 +82,8 @@ class MapTrackerState(NamedTuple):
     batch."""
     violations: npt.NDArray[np.int64]
     """(rows, 5): kind of the violation, step record, envelope of it, two numbers."""
+    lies: npt.NDArray[np.bool_]
+    """(p,) whether the scenario has each lie: what it sends is then its log, whatever its scans say."""
 
 
 class GroundTruth(NamedTuple):
@@ -197,6 +199,7 @@ def take_scan(
     stood: np.ndarray,
     totals: np.ndarray,
     violations: np.ndarray,
+    lies: np.ndarray,
     truth: np.ndarray,
     counting: np.ndarray,
     exact: bool,
@@ -220,6 +223,7 @@ def take_scan(
         stood,
         totals,
         violations,
+        lies,
     )
     ground = GroundTruth(truth, counting, exact)
     cells, columns = first_tick.shape[0], truth.shape[1]
@@ -262,7 +266,7 @@ def _is_given_up(state: MapTrackerState, cell: int) -> bool:
 @kernel
 def _append(state: MapTrackerState, ground: GroundTruth, who: int, entry: int) -> int:
     """A robot sends the next entry of its log: the kind of a violation, or NEVER."""
-    cells, own = state.first_tick.shape[0], state.incarnation_ids[who]
+    cells, own, found = state.first_tick.shape[0], state.incarnation_ids[who], NEVER
     written = state.written[own]
     about, cell = part_of(entry, cells)
     if about not in (OF_CELL, OF_RANGE):
@@ -277,11 +281,14 @@ def _append(state: MapTrackerState, ground: GroundTruth, who: int, entry: int) -
         _hold(state, ground, who, entry)
     elif written[MATCHED] < written[SCANNED] and state.scanned[own, written[MATCHED]] == entry:
         written[MATCHED] += 1
+    elif state.lies[who]:
+        written[MATCHED] += 1
+        found = NOT_ITS_SCANS
     else:
         return NOT_ITS_SCANS
     state.as_sent[own, written[AS_SENT]] = entry
     written[AS_SENT] += 1
-    return NEVER
+    return found
 
 
 @kernel
@@ -337,8 +344,9 @@ def _follow_logs(
     at: int,
     end: int,
 ) -> None:
-    """Follow the suffixes in payload[at:end], up to the first violation."""
+    """Follow the suffixes in payload[at:end], up to the first violation; of a liar all, and the first is noted."""
     who, payload = columns.step_records[row, of.PLACE], columns.payload
+    lied = False
     while at < end:
         origin, at = read_uint(payload, at)
         position, at = read_uint(payload, at)
@@ -349,9 +357,11 @@ def _follow_logs(
             step, at = read_int(payload, at)
             entry += step
             kind = _follow_entry(state, ground, who, origin, position, entry)
-            if kind != NEVER:
+            if kind != NEVER and not lied:
                 _note(state, kind, row, item, origin, position)
-                return
+                if not state.lies[who]:
+                    return
+                lied = True
             position += 1
 
 
@@ -407,6 +417,7 @@ def follow(
     stood: np.ndarray,
     totals: np.ndarray,
     violations: np.ndarray,
+    lies: np.ndarray,
     truth: np.ndarray,
     counting: np.ndarray,
     exact: bool,
@@ -426,6 +437,7 @@ def follow(
         stood,
         totals,
         violations,
+        lies,
     )
     ground = GroundTruth(truth, counting, exact)
     columns = ColumnarBatch(

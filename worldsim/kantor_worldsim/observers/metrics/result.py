@@ -201,3 +201,5 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     figure."""
     refused_reports: dict[ParticipantId, RefusedReports] = {}
     """Participants that sent unsound or impossible reports."""
+    lies: dict[ParticipantId, int] = {}
+    """Robots that lie by a fault of the scenario, and how often checkers have found that; no violations."""

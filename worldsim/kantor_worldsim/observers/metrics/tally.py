@@ -34,8 +34,8 @@ class RunTally(NamedTuple):
     shipped: npt.NDArray[np.float64]
     """(2,) mass times metres: since the start, in this tick."""
     standing: npt.NDArray[np.int64]
-    """(n, 4): refused messages; whether it rests; step in which it saw no weight left, or NEVER; how far
-    its clock was ahead in its last step."""
+    """(n, 5): refused messages; whether it rests; step in which it saw no weight left, or NEVER; how far
+    its clock was ahead in its last step; whether the scenario has it lie."""
     shipped_by: npt.NDArray[np.float64]
     """(m,) since the start."""
     xy_m: npt.NDArray[np.float64]
@@ -133,8 +133,8 @@ def follow(
         if place < 0 or not step_record[of.PRESENT]:
             continue
         counts[VIOLATIONS] += step_record[of.VIOLATIONS]
-        if (
-            step_record[of.TOO_FAST] > 0 and step_record[of.SKEW_NS] > standing[place, 3]
+        if step_record[of.TOO_FAST] > 0 and (
+            standing[place, 4] or step_record[of.SKEW_NS] > standing[place, 3]
         ):  # as in the rule `ruling` of the checker
             counts[VIOLATIONS] -= 1
         standing[place, 3] = step_record[of.SKEW_NS]
