@@ -12,6 +12,10 @@ it. An honest participant never sends such a report.
    With merge = "min" no weight is below what all spending leaves.
 4. With `trust = "signed"` every attestation in an envelope is signed by its origin, in this run, and the own one is of
    this step and of the log as it was consumed (ledger).
+
+A robot that lies by a fault of the scenario is let through with its lies, and so are those who pass them on in good
+faith. But nobody, a liar neither, sends what could break a record or a resumption: what is too large, malformed, or about
+incarnations that never were.
 """
 
 import math
@@ -26,6 +30,7 @@ from kantor_protocol.replication.gossip import MessageCheck, log_length_max
 from kantor_protocol.replication.occupancy_log import entries
 from kantor_protocol.replication.proofs import Chain, blocks
 from kantor_protocol.replication.replica_kernels import BLOCK
+from kantor_protocol.scenario.faults.liars import liars_of
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import Attestation, Identities, hash_of, is_genuine
 from kantor_protocol.wire.messages import (
@@ -36,7 +41,7 @@ from kantor_protocol.wire.messages import (
     decode_gossip,
 )
 from kantor_protocol.wire.weights import weights_bytes_max
-from kantor_worldsim.exchange.admission_kernels import BARE, REASONS, judge, learn
+from kantor_worldsim.exchange.admission_kernels import BARE, NO_INCARNATION, REASONS, judge, learn
 from kantor_worldsim.record.process_events import TAKE_OVER
 from kantor_worldsim.record.records import Batch, ProcessEvent, Record
 from kantor_worldsim.world.world import WorldSetup, rounding_m, units_of
@@ -70,6 +75,7 @@ class Admission:
         self._way_max_m = scenario.vehicle.speed_m_s * scenario.clock.period_s * (1.0 + _ROUNDING)
         self._poses = setup.poses(scenario)
         self._receivers = MessageCheck(scenario, units, indices, identities)
+        self._well_formed = MessageCheck(scenario, units, indices)
         self._settings = np.array(
             [
                 roster,
@@ -99,6 +105,12 @@ class Admission:
         """By incarnation id: the hashes of its log, as far as it is settled."""
         self._unsettled = 0
         """Entries at the end of the own log that only the step has that is being judged."""
+        self._liars = liars_of(scenario.faults)
+        forgers = liars_of(scenario.faults, "overstate", "fork")
+        self._false_logs = np.array([name in forgers for name in scenario.roster])
+        """(roster,) whose logs others may pass on that are not what was consumed, or sent first."""
+        self._spreads = not scenario.signed and bool(self._liars)
+        """Whether liars are believed in what they say of others, so that the honest say it too."""
 
     def observe(self, record: Record) -> None:
         """Follow one record."""
@@ -119,7 +131,7 @@ class Admission:
             return str(error)
         return (
             self._refusal_of_sizes(outputs)
-            or self._refusal_of_move(self._poses[name], outputs.pose)
+            or (name not in self._liars and self._refusal_of_move(self._poses[name], outputs.pose))
             or self._refusal_of_numbers(name, outputs)
             or self._refusal_of_contents(name, outputs)
         )
@@ -157,12 +169,17 @@ class Admission:
         own = self._id_of(name)
         self._spend(own, spent)
         self._unsettled = spent[0].size
-        reasons = (self._refusal_of(envelope, own, outputs.step) for envelope in outputs.outbox)
+        lenient = name in self._liars or self._spreads
+        reasons = (
+            self._refusal_of(envelope, own, outputs.step, lenient=lenient)
+            for envelope in outputs.outbox
+        )
         reason = next(filter(None, reasons), "")
         self._spend(own, spent, back=True)
         return reason
 
-    def _refusal_of(self, envelope: Envelope, own: int, step: int) -> str:
+    def _refusal_of(self, envelope: Envelope, own: int, step: int, *, lenient: bool) -> str:
+        """Why an envelope is refused. lenient: it may say what is not so."""
         try:
             message = decode_gossip(envelope.body)
         except RefusedError as error:
@@ -171,11 +188,18 @@ class Admission:
             return f"an envelope of incarnation {message.incarnation}"
         if reason := self._refusal_of_attestations(message):
             return reason
-        if not self._receivers.passes(own, message):
+        if not self._receivers_of(envelope.source).passes(own, message):
             return "a malformed envelope"
-        arrays = (self._logs, self._written, self._consumed, self._stamps, self._settings)
-        code = int(judge(*arrays, *_parts(message), message.registers, own, step))
+        arrays = (self._logs, self._written, self._consumed, self._stamps, self._false_logs)
+        content = (*_parts(message), message.registers)
+        code = int(judge(*arrays, self._settings, *content, own, step))
+        if lenient and code != NO_INCARNATION:
+            return ""
         return REASONS[code] or self._refusal_of_own_word(message, own, step)
+
+    def _receivers_of(self, name: ParticipantId) -> MessageCheck:
+        """The checks that a message has to pass; a liar may say what it cannot prove."""
+        return self._well_formed if name in self._liars else self._receivers
 
     def _refusal_of_attestations(self, message: GossipMessage) -> str:
         if message.attestations and self._identities is None:
@@ -235,7 +259,8 @@ class Admission:
             message = decode_gossip(envelope.body)
         except RefusedError:
             return
-        if message.incarnation == own // len(self._places) and self._receivers.passes(own, message):
+        receivers = self._receivers_of(envelope.source)
+        if message.incarnation == own // len(self._places) and receivers.passes(own, message):
             if self._settings[BARE]:
                 self._make_room(int(self._written[own]) + len(message.logs))
             vector, logs, _ = _parts(message)

@@ -71,6 +71,7 @@ def _check_entry(
     logs: np.ndarray,
     written: np.ndarray,
     consumed: np.ndarray,
+    false_logs: np.ndarray,
     settings: np.ndarray,
     origin: int,
     own: int,
@@ -81,6 +82,8 @@ def _check_entry(
     """An entry of a log is what its origin has written there. written: with what the sender writes in this step."""
     if not settings[LEDGER]:
         return POSSIBLE if value >= settings[SAMPLE_UNITS] - consumed[index] else BELOW
+    if origin != own and false_logs[origin % settings[ROSTER]]:
+        return POSSIBLE
     if position < written[origin]:
         same = logs[origin, position, 0] == index
         if not settings[BARE]:
@@ -96,6 +99,7 @@ def _check_logs(
     logs: np.ndarray,
     written: np.ndarray,
     consumed: np.ndarray,
+    false_logs: np.ndarray,
     settings: np.ndarray,
     suffixes: bytes,
     own: int,
@@ -117,7 +121,7 @@ def _check_logs(
                 value, at = read_uint(suffixes, at)
             index += step
             code = _check_entry(
-                logs, written, consumed, settings, origin, own, position, index, value
+                logs, written, consumed, false_logs, settings, origin, own, position, index, value
             )
             if code != POSSIBLE:
                 return code
@@ -163,6 +167,7 @@ def judge(
     written: np.ndarray,
     consumed: np.ndarray,
     stamps: np.ndarray,
+    false_logs: np.ndarray,
     settings: np.ndarray,
     version_vector: bytes,
     suffixes: bytes,
@@ -175,13 +180,13 @@ def judge(
 
     logs: (ids, rows, 2 or 1) entries as their origins wrote them; written: (ids,) how many. consumed: (N,) units.
     written and consumed include what the sender has spent in this step. stamps: (2, ids) of the newest claim and
-    register of each origin. settings: see the constants above.
+    register of each origin. false_logs: (roster,) whose entries are not compared. settings: see the constants above.
     """
     exact = settings[LEDGER] and not settings[BARE]
     own_length = written[own] if exact else settings[LENGTH_MAX]
     code = _check_version_vector(written, stamps, settings, version_vector, own, own_length, step)
     if code == POSSIBLE:
-        code = _check_logs(logs, written, consumed, settings, suffixes, own)
+        code = _check_logs(logs, written, consumed, false_logs, settings, suffixes, own)
     if code == POSSIBLE:
         code = _check_claims(stamps, claimed, own, step)
     if code == POSSIBLE:

@@ -11,7 +11,8 @@ L3  a robot that has not heard its supervisor for more than 9 of its own steps t
 I8  with a ledger every living participant holds all that its own incarnation has consumed, and those in
     touch with it hold that too (where L1 is judged)
 
-A rule is judged only where a record can show it; `judged` names those that were.
+A rule is judged only where a record can show it; `judged` names those that were. Of robots that lie by a fault none is
+judged, and what the others hold of them does not count: a liar may show everybody something else.
 """
 
 import math
@@ -22,9 +23,17 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Outputs, ParticipantId, Pose
+from kantor_protocol.base.machine import (
+    EVERYBODY,
+    SUPERVISOR,
+    Outputs,
+    ParticipantId,
+    Pose,
+    State,
+)
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.gossip import CONTACT_PERIODS, ack_timeout_steps
+from kantor_protocol.scenario.faults.liars import Byzantine, liars_of
 from kantor_protocol.scenario.faults.processes import Kill, OnProcesses
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
@@ -113,6 +122,8 @@ class LivenessChecker:
         scenario = opening.scenario
         self._opening, self._scenario = opening, scenario
         self._names = scenario.roster
+        self._liars = liars_of(scenario.faults)
+        self._forgers = liars_of(scenario.faults, "overstate", "fork")
         self._states = {
             name: _Participant(place, ack_timeout_steps(name, scenario))
             for place, name in enumerate(self._names)
@@ -169,6 +180,8 @@ class LivenessChecker:
         self, state: _Participant, step_record: StepRecord, outputs: Outputs
     ) -> None:
         """L3, for each step of a robot."""
+        if step_record.name in self._liars:
+            return
         self.judged.add("L3")
         state.unheard_steps += 1
         if any(
@@ -207,13 +220,17 @@ class LivenessChecker:
     def _end(self, ending: Ending) -> None:
         if ending.reason != "interrupted":
             self.judged.add("L2")
-            if ending.reason == "limit":
+            if ending.reason == "limit" and self._is_open:
                 self._report("L2", ending.now_ns, "record", "the mission came to no end")
         arrived_ns = (due_ns for due_ns in self._late_ns if due_ns <= ending.now_ns)
         self._changed_ns = max(self._changed_ns, *arrived_ns, 0)
         if not self._has_calmed_down(ending.now_ns):
             return
-        held = {name: self._holding(name) for name in self._names if self._states[name].alive}
+        held = {
+            name: self._holding(name)
+            for name in self._names
+            if self._states[name].alive and name not in self._liars
+        }
         for component, diameter in self._components(ending.now_ns, list(held)):
             calm_ns = ending.now_ns - max(self._changed_ns, self._quiet_ns())
             if calm_ns < settling_ns(self._scenario, diameter):
@@ -224,6 +241,19 @@ class LivenessChecker:
                 self.judged.add("I8")
                 self._check_whole(component, held, ending.now_ns)
 
+    @property
+    def _is_open(self) -> bool:
+        """Whether an honest robot that is alive does not rest; without liars: whether the mission was not over."""
+        if not self._liars:
+            return True
+        honest = (
+            self._states[name] for name in self._scenario.robot_ids if name not in self._liars
+        )
+        return any(
+            state.alive and (state.last is None or state.last.state is State.EXPLORING)
+            for state in honest
+        )
+
     def _quiet_ns(self) -> int:
         """When the last fault ends; a process that is killed for good has no part in what follows."""
         ends_ns = [0]
@@ -231,7 +261,9 @@ class LivenessChecker:
             if isinstance(fault, Kill) and fault.until_ns is None:
                 ends_ns.append(fault.from_ns)
             elif fault.until_ns is None:
-                lasts = not isinstance(fault, OnProcesses) or fault.stops
+                lasts = not isinstance(fault, OnProcesses | Byzantine) or (
+                    isinstance(fault, OnProcesses) and fault.stops
+                )
                 ends_ns.append(1 << 62 if lasts else fault.from_ns)
             else:
                 ends_ns.append(fault.until_ns)
@@ -327,17 +359,22 @@ class LivenessChecker:
                 return
             if self._scenario.merge == "ledger" or self._scenario.mapping:
                 ids = max(len(mine.version_vector), len(theirs.version_vector))
-                one, other = (
-                    each.version_vector + [0] * (ids - len(each.version_vector))
-                    for each in (mine, theirs)
-                )
+                one, other = (self._of_honest(each.version_vector, ids) for each in (mine, theirs))
                 if one != other:
                     what = f"holds {other} entries, {first} holds {one}"
                     self._report("L1", now_ns, name, what)
+            if self._forgers or (self._liars and mine.version_vector != theirs.version_vector):
+                continue
             differing = int(np.count_nonzero(mine.view != theirs.view))
             if differing:
                 what = f"its view differs from {first}'s in {differing} samples"
                 self._report("L1", now_ns, name, what)
+
+    def _of_honest(self, version_vector: list[int], ids: int) -> list[int]:
+        """The log lengths in a version vector, padded to so many ids, without those of liars."""
+        padded = version_vector + [0] * (ids - len(version_vector))
+        names = self._names
+        return [n for i, n in enumerate(padded) if names[i % len(names)] not in self._liars]
 
     def _check_whole(
         self,
