@@ -159,8 +159,7 @@ class ByzantineRobot:
         if "rewrite" in told:
             message = self._rewritten(message, step)
         bodies = [encode_gossip(self._shown(message, log)) for log in self._stated]
-        bare = msgspec.structs.replace(message, attestations=())
-        lied = _said(bare) != _said(honest)
+        lied = self._of_others(message) != self._of_others(honest)
         if not told & {"fork", "silence"}:
             return [msgspec.structs.replace(envelope, body=bodies[0])], lied or self._differs(
                 message, 0
@@ -187,24 +186,29 @@ class ByzantineRobot:
             return
         entries = self._replica.store.logs[me, known : self._replica.store.length[me]]
         stated = entries.astype(np.int64)
-        if "overstate" in told:
-            stated = self._overstated(stated, known)
-        forked = self._forked(stated, known) if self._forks else stated
+        if self._tells("overstate"):
+            stated = self._overstated(stated, known, now="overstate" in told)
+        forked = self._forked(stated, known) if self._tells("fork") else stated
         self._stated = (
             np.concatenate((self._stated[0], stated)),
             np.concatenate((self._stated[1], forked)),
         )
 
-    @property
-    def _forks(self) -> bool:
-        return any(each.lie == "fork" for each in self._lies)
+    def _tells(self, lie: Lie) -> bool:
+        """Whether it ever tells a lie."""
+        return any(each.lie == lie for each in self._lies)
 
-    def _overstated(self, entries: Log, first: int) -> Log:
-        """Whole points, shipped to samples that are drawn."""
-        config = self._replica.config
-        positions = range(first, first + entries.shape[0])
-        samples = [self._whole(config.bound, _OVERSTATED, each) for each in positions]
-        return np.array([(each, config.value_max) for each in samples]).reshape(-1, 2)
+    def _overstated(self, entries: Log, first: int, *, now: bool) -> Log:
+        """Whole points, shipped to samples that are drawn, as long as it could have energy for them."""
+        stated, config = entries.copy(), self._replica.config
+        left = self._scenario.steps_per_robot * config.value_max - int(self._stated[0][:, 1].sum())
+        for i in range(entries.shape[0]):
+            if now:
+                sample = self._whole(config.bound, _OVERSTATED, first + i)
+                stated[i] = sample, config.value_max
+            stated[i, 1] = min(stated[i, 1], left)
+            left -= int(stated[i, 1])
+        return stated
 
     def _forked(self, entries: Log, first: int) -> Log:
         """The same spending on other samples; on a map cells that repeat the entry before."""
@@ -245,15 +249,25 @@ class ByzantineRobot:
 
     # What it says of others.
 
+    def _of_others(self, message: GossipMessage) -> tuple[object, ...]:
+        """What a message says of others: a lie in it can be proven."""
+        claims = [each for each in parts.claims_in(message.claims) if self._foreign(each.origin)]
+        return message.version_vector, message.logs, claims, message.registers
+
     def _foreign(self, origin: int) -> bool:
         return origin % self._roster != self._place
 
     def _claiming(self, message: GossipMessage, step: int) -> GossipMessage:
-        """Claim what others have claimed, as if before them, and claim and write registers in their names."""
+        """Claim what others have claimed, as if before them, and claim and write registers in their names.
+
+        Every other spell only the former, since a message with the latter may be refused whole.
+        """
         claims, registers = message.claims, message.registers
+        for_others = step // SPELL_STEPS % 2 == 0
         if self._scenario.claiming:
-            claims = parts.packed_claims(self._claims(parts.claims_in(claims), step))
-        if registers:
+            told_of = self._claims(parts.claims_in(claims), step, for_others=for_others)
+            claims = parts.packed_claims(told_of)
+        if registers and for_others:
             replica = self._replica
             stamps, told = parts.registers_in(registers, replica.origins)
             for origin in np.flatnonzero(replica.registers.stamps).tolist():
@@ -264,7 +278,9 @@ class ByzantineRobot:
             registers = parts.packed_registers(stamps, _fitting(told))
         return msgspec.structs.replace(message, claims=claims, registers=registers)
 
-    def _claims(self, claims: list[parts.Claim], step: int) -> list[parts.Claim]:
+    def _claims(
+        self, claims: list[parts.Claim], step: int, *, for_others: bool
+    ) -> list[parts.Claim]:
         config, known = self._replica.config, self._replica.store.claims
         wanted = [
             int(known[SAMPLE, origin])
@@ -278,7 +294,9 @@ class ByzantineRobot:
                 told.append(each._replace(sample=sample, since_ns=0))
             elif each.origin == config.me:
                 told.append(each)
-        for origin in np.flatnonzero(known[STAMP]).tolist():
+            elif not for_others:
+                told.append(each)
+        for origin in np.flatnonzero(known[STAMP]).tolist() if for_others else ():
             if self._foreign(origin):
                 stamp = min(int(known[STAMP, origin]) + _AHEAD, config.stamp_max)
                 sample = 1 + self._whole(config.bound, _TO_CLAIM, step, 1 + origin)
@@ -338,11 +356,6 @@ class ByzantineRobot:
             for i in range(count)
         ]
         return [*rewritten, parts.Suffix(victim, start, count, entries)], {victim: count}
-
-
-def _said(message: GossipMessage) -> tuple[bytes, ...]:
-    """What a message says of others, and of claims."""
-    return message.version_vector, message.logs, message.claims, message.registers
 
 
 def _grown(numbers: list[int]) -> list[int]:
