@@ -292,9 +292,7 @@ class ByzantineRobot:
             if each.origin == config.me and wanted:
                 sample = wanted[self._whole(len(wanted), _TO_CLAIM, step)] + 1
                 told.append(each._replace(sample=sample, since_ns=0))
-            elif each.origin == config.me:
-                told.append(each)
-            elif not for_others:
+            elif each.origin == config.me or not for_others:
                 told.append(each)
         for origin in np.flatnonzero(known[STAMP]).tolist() if for_others else ():
             if self._foreign(origin):

@@ -16,6 +16,7 @@ from kantor_fleet.campaign.keyed_draws import KeyedDraws, short
 from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM, ParticipantId
 from kantor_protocol.scenario.dump import to_tree
 from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.liars import LIES, liars_of
 from kantor_protocol.scenario.faults.processes import Kill
 from kantor_protocol.scenario.faults.schedule import KINDS
 from kantor_protocol.scenario.load import from_tree
@@ -36,11 +37,12 @@ SORTS = {
 """Sorts of missions and how often each is drawn: a transport ledger with claims and without, the minimum,
 multiscale coverage, samples that walk, an unknown map."""
 
-_MISSION, _TEAM, _RADIO, _CLOCK, _FAULTS, _PUBLISH, _LINGER = range(7)
+_MISSION, _TEAM, _RADIO, _CLOCK, _FAULTS, _PUBLISH, _LINGER, _TRUST = range(8)
 _A_CLASS = 16
 """Subjects of draws; from the last one on, one for each class of faults."""
 
 _CENTRALIZED = 0.28
+_SIGNED = 0.45
 _LINGER_PERIODS = 150
 _METRICS_EVERY = 20
 """The rows are not read."""
@@ -48,6 +50,8 @@ _TRIES = 6
 """So often faults that exclude each other are drawn again."""
 _LOST_SHARE = 0.5
 """Of the robots, at most, may be lost for good."""
+_LIARS_SHARE = 0.5
+"""Of the robots, at most, may lie."""
 
 
 def sort_of(scenario: Scenario) -> str:
@@ -75,6 +79,8 @@ def draw(seed: int) -> Scenario:
         "publish": _publish(seed),
         "metrics": {"every": _METRICS_EVERY},
     }
+    if KeyedDraws(seed, _TRUST).coin(_SIGNED):
+        tree["trust"] = "signed"
     scenario = _lingering(seed, from_tree(tree, f"seed {seed}"))
     faults = tuple(_faults(seed, scenario, calm_s))
     # Once more through the parser: what a campaign runs is what a user can write.
@@ -347,6 +353,10 @@ def _clock_fault(at: FaultedMission) -> Tree:
     return tree
 
 
+def _byzantine(at: FaultedMission) -> Tree:
+    return {"who": at.draws.some_of(at.scenario.robot_ids), "lie": at.draws.one_of(LIES)}
+
+
 _DRAWN: dict[str, Callable[[FaultedMission], Tree]] = {
     "drop": lambda at: {"probability": at.draws.between(0.05, 0.6)} | at.links(),
     "burst": lambda at: _burst(at) | at.links(),
@@ -384,10 +394,11 @@ _DRAWN: dict[str, Callable[[FaultedMission], Tree]] = {
     "full-disk": lambda at: at.window(0.3 * at.calm_s) | at.who(),
     "clock": _clock_fault,
     "impostor": lambda at: {"from_s": short(at.draws.unit() * at.calm_s), **at.who()},
+    "byzantine": _byzantine,
 }
 """The fields drawn for each class. One that sets no window gets one."""
 
-_MANY = {"kill": 6, "pause": 4, "partition": 3, "clock": 3}
+_MANY = {"kill": 6, "pause": 4, "partition": 3, "clock": 3, "byzantine": 3}
 """So often at most in one mission; any other class twice."""
 
 
@@ -396,6 +407,8 @@ def _faults(seed: int, scenario: Scenario, calm_s: float) -> Iterable[Fault]:
     bias = KeyedDraws(seed, _FAULTS).between(0.05, 0.5)
     taken: list[Fault] = []
     for number, kind in enumerate(KINDS):
+        if kind == "byzantine" and not scenario.signed:
+            continue  # it would be believed
         at = FaultedMission(scenario, calm_s, KeyedDraws(seed, _A_CLASS + number))
         if not at.draws.coin(bias):
             continue
@@ -412,8 +425,11 @@ def candidates(at: FaultedMission, kind: str, taken: list[Fault]) -> Iterator[Fa
         if "from_s" not in tree and "until_s" not in tree:
             tree |= at.window(at.calm_s)
         fault = msgspec.convert(tree, KINDS[kind])
-        if not _too_many_lost(at.scenario, [*taken, fault]) and not any(
-            complaints_of_faults([fault], at.scenario, taken)
+        together = [*taken, fault]
+        if (
+            not _too_many_lost(at.scenario, together)
+            and len(liars_of(together)) <= _LIARS_SHARE * at.scenario.robots.count
+            and not any(complaints_of_faults([fault], at.scenario, taken))
         ):
             yield fault
 

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 
 from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM, ParticipantId
 from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.liars import LIES, Byzantine
 from kantor_protocol.scenario.faults.links import Hostile, Partition
 from kantor_protocol.scenario.faults.processes import Kill, OnProcesses, Pause
 from kantor_protocol.scenario.faults.schedule import KINDS, kind_of
@@ -43,6 +44,7 @@ CLASSES: tuple[str, ...] = (
     "full-disk",
     "clock",
     "impostor",
+    *(f"byzantine {lie}" for lie in LIES),
 )
 """All classes. A fault may count for several, such as a kill of the supervisor with a torn log."""
 
@@ -50,11 +52,12 @@ _STRIKES = frozenset({"kill", "pause", "fill", "slow", "skew", "pretend"})
 
 
 class FaultCoverage:
-    """Counts, over the records of one mission, copies that link faults touched and processes that were hit."""
+    """Counts, over the records of one mission, copies that link faults touched, processes that were hit, and lies."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self._faults: tuple[Fault, ...] = ()
+        self._lies: list[Byzantine] = []
 
     def observe(self, record: Record) -> None:
         """Follow one record."""
@@ -64,6 +67,8 @@ class FaultCoverage:
                 if not isinstance(fault, Hostile):
                     hit = stats.dropped + stats.delayed + stats.doubled + stats.replayed
                     self._count(fault, "", hit)
+            if self._lies:
+                self._note_lies(record)
             if record.injected:
                 self.counts["hostile"] += len(record.injected)
         elif isinstance(record, ProcessEvent) and record.fault >= 0:
@@ -72,6 +77,14 @@ class FaultCoverage:
                 self._count(fault, record.who, 1)
         elif isinstance(record, Opening):
             self._faults = record.scenario.faults
+            self._lies = [fault for fault in self._faults if isinstance(fault, Byzantine)]
+
+    def _note_lies(self, batch: Batch) -> None:
+        """Count the steps in which liars had somebody to lie to; whether they were caught is for the checkers."""
+        for step_record in batch.step_records:
+            for fault in self._lies if step_record.outputs is not None else ():
+                if step_record.name in fault.who and fault.holds(step_record.now_ns):
+                    self.counts[f"{kind_of(fault)} {fault.lie}"] += 1
 
     def _count(self, fault: Fault, who: ParticipantId, times: int) -> None:
         for name in _classes_of(fault, who):
@@ -96,5 +109,10 @@ def _classes_of(fault: Fault, who: ParticipantId) -> Iterable[str]:
 
 
 def is_of_processes(name: str) -> bool:
-    """Whether a class is about processes, and not about links."""
+    """Whether a class is about processes."""
     return issubclass(KINDS[name.split(maxsplit=1)[0]], OnProcesses)
+
+
+def is_of_links(name: str) -> bool:
+    """Whether a class is about links, and the messages on them."""
+    return not is_of_processes(name) and KINDS[name.split(maxsplit=1)[0]] is not Byzantine

@@ -15,8 +15,9 @@ from kantor_fleet.campaign.keyed_draws import KeyedDraws
 from kantor_fleet.campaign.merge_convergence import merge_shuffled
 from kantor_fleet.campaign.rare_events import RareEvents
 from kantor_fleet.execution.experiment import Case, Outcome, reason
-from kantor_fleet.execution.in_process_team import play, team, team_identities
-from kantor_protocol.base.machine import WORLD_SIM
+from kantor_fleet.execution.in_process_team import lies_told, play, team, team_identities
+from kantor_protocol.base.machine import WORLD_SIM, ParticipantId, StateMachine
+from kantor_protocol.scenario.faults.liars import liars_of
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import Identities
 from kantor_worldsim.engine.event_loop import simulate
@@ -68,6 +69,12 @@ class Trial(Outcome, frozen=True, kw_only=True):
     """How often its journal was cut."""
     joined: int = 0
     """1: all its messages were merged in another order."""
+    lies: int = 0
+    """Times that checkers have found a declared liar to lie."""
+    liars: int = 0
+    """Robots that have told a lie, by themselves."""
+    named: int = 0
+    """Those of them that checkers have named."""
 
     @property
     def violation(self) -> str | None:
@@ -129,12 +136,13 @@ class Follower:
         """Rules of liveness that the record could have broken."""
         self._scenario, self._seed = scenario, seed
         self._invariants = Invariants() if validate else None
+        self._machines: dict[ParticipantId, StateMachine] = {}
 
     def run(self) -> str:
         """Run the mission to its end, or to the first violation; why it ended."""
         scenario, seed = self._scenario, self._seed
         setup = WorldSetup.of(scenario, seed)
-        machines = team(scenario, seed, setup)
+        machines = self._machines = team(scenario, seed, setup)
         identities = team_identities(scenario, seed)
         simulation = Simulation(scenario, seed, setup, [self.observe], identities)
         if self._invariants is not None:
@@ -164,9 +172,23 @@ class Follower:
     def _broken_invariants(self) -> list[str]:
         return self._invariants.violations if self._invariants is not None else []
 
+    @property
+    def liars(self) -> frozenset[ParticipantId]:
+        """Robots that have told a lie, as they know themselves; of a new incarnation only what it has told."""
+        return frozenset(name for name, machine in self._machines.items() if lies_told(machine))
+
+    def _unnamed(self) -> list[str]:
+        """Liars that no checker has named."""
+        named = self.recording.checker.lies
+        return [
+            f"named: {name} has lied, and was not found out"
+            for name in sorted(self.liars - set(named))
+        ]
+
     def violations(self) -> tuple[str, ...]:
         """The first violations of a mission that is over: as it ran, or by its record alone."""
-        seen = (*self.recording.checker.violations[:10], *self._broken_invariants)
+        checker = self.recording.checker
+        seen = (*checker.violations[:10], *self._broken_invariants, *self._unnamed())
         return seen[:10] or tuple(self._check_again()[:10])
 
     def _check_again(self) -> list[str]:
@@ -190,7 +212,8 @@ def _attempt(case: Case, *, validate: bool) -> dict[str, Any]:
         violations = tuple(_run_again(scenario, seed, result.digest))
     if cut and not violations:
         violations = tuple(_cut_journal(seed, follower.payloads))
-    if cut and not violations:
+    believed = cut and not liars_of(scenario.faults)
+    if believed and not violations:
         violations = tuple(merge_shuffled(scenario, seed, map(decode_record, follower.payloads)))
     return {
         "ended": ended,
@@ -203,7 +226,10 @@ def _attempt(case: Case, *, validate: bool) -> dict[str, Any]:
         | {f"{rule} judged": 1 for rule in sorted(follower.judged)},
         "twice": int(twice),
         "cut": _CUTS if cut else 0,
-        "joined": int(cut and not scenario.mapping),
+        "joined": int(believed and not scenario.mapping),
+        "lies": sum(follower.recording.checker.lies.values()),
+        "liars": len(follower.liars),
+        "named": len(follower.liars & set(follower.recording.checker.lies)),
     }
 
 

@@ -16,6 +16,7 @@ from kantor_fleet.campaign.keyed_draws import KeyedDraws, short
 from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM, ParticipantId
 from kantor_protocol.scenario.dump import to_tree
 from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.liars import LIES, Byzantine
 from kantor_protocol.scenario.faults.processes import OnProcesses
 from kantor_protocol.scenario.faults.schedule import KINDS
 from kantor_protocol.scenario.load import from_tree
@@ -63,16 +64,26 @@ def is_lockstep(seed: int) -> bool:
     return seed % LOCKSTEP_EVERY == LOCKSTEP_EVERY - 1
 
 
-def process_scenario(seed: int, speed: float = SPEED, storm_s: float = STORM_S) -> Scenario:
-    """The scenario of a seed; the mission is then run with the same seed. storm_s: real seconds."""
+def process_scenario(
+    seed: int, speed: float = SPEED, storm_s: float = STORM_S, *, byzantine: bool = False
+) -> Scenario:
+    """The scenario of a seed; the mission is then run with the same seed. storm_s: real seconds.
+
+    byzantine: one robot lies for most of the storm, and everybody signs.
+    """
     pace = speed * (_LONGER if is_lockstep(seed) else 1.0)
     scenario = _lingering(from_tree(_team(seed, speed, pace, storm_s), f"seed {seed}"), speed)
     timetable = _Timetable(KeyedDraws(seed, _SUBJECT + 1), scenario, pace, storm_s)
     faults: list[Fault] = list(timetable.draw())
     for number, kind in enumerate(KINDS):
-        if not issubclass(KINDS[kind], OnProcesses):
+        if not issubclass(KINDS[kind], (OnProcesses, Byzantine)):
             at = FaultedMission(scenario, pace * storm_s, KeyedDraws(seed, _SUBJECT + 10 + number))
             faults += _of_links(at, kind)
+    if byzantine:
+        scenario = msgspec.structs.replace(scenario, trust="signed")
+        faults.append(
+            _liar(FaultedMission(scenario, pace * storm_s, KeyedDraws(seed, _SUBJECT + 2)))
+        )
     # Once more through the parser: what a campaign runs is what a user can write.
     whole = msgspec.structs.replace(scenario, faults=tuple(faults))
     return from_tree(to_tree(whole), f"seed {seed}")
@@ -130,6 +141,22 @@ def _of_links(at: FaultedMission, kind: str) -> Iterator[Fault]:
     if at.draws.coin(_A_LINK):
         for _ in range(at.draws.whole(1, 2)):
             yield from (fault for fault in [next(candidates(at, kind, []), None)] if fault)
+
+
+def _liar(at: FaultedMission) -> Byzantine:
+    """A robot with a lie that this mission can have, from near the start to near the end of the storm."""
+    name = at.draws.one_of(at.scenario.robot_ids)
+    window = {
+        "from_s": short(at.draws.between(0.0, 0.2) * at.calm_s),
+        "until_s": short(at.draws.between(0.7, 1.0) * at.calm_s),
+    }
+    told = [
+        msgspec.convert({"kind": "byzantine", "who": [name], "lie": lie, **window}, Byzantine)
+        for lie in LIES
+    ]
+    return at.draws.one_of(
+        [each for each in told if not any(complaints_of_faults([each], at.scenario))]
+    )
 
 
 class _Timetable:

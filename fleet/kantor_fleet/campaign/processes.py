@@ -42,6 +42,7 @@ from kantor_fleet.report.progress import printable
 from kantor_fleet.report.summary import read_result
 from kantor_protocol.base.machine import WORLD_SIM, ParticipantId
 from kantor_protocol.scenario.dump import to_toml
+from kantor_protocol.scenario.faults.liars import liars_of
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.transport.session import BusError
 from kantor_worldsim.engine.process_faults import schedule_of
@@ -68,6 +69,12 @@ class SoakTerms(NamedTuple):
     """Simulated seconds in a real one."""
     storm_s: float
     """Real seconds in which anything may go wrong."""
+    byzantine: bool = False
+    """One robot lies in every mission."""
+
+    def scenario(self, seed: int) -> Scenario:
+        """The scenario of a seed."""
+        return process_scenario(seed, self.speed, self.storm_s, byzantine=self.byzantine)
 
 
 class Soak(NamedTuple):
@@ -99,6 +106,10 @@ class ProcessMission(NamedTuple):
     incarnations: int = 0
     judged: frozenset[str] = frozenset()
     """Rules of liveness that the record could have broken."""
+    liars: int = 0
+    """Robots that the scenario has lie."""
+    lies: dict[str, int] = {}  # noqa: RUF012  it is only read
+    """Times that checkers have found each of them to lie."""
     grown: dict[str, Grown] = {}  # noqa: RUF012  it is only read
 
 
@@ -149,7 +160,7 @@ def run_mission(
 ) -> ProcessMission:
     """Run and check one mission. folder: for its files, emptied before. temporary: where nothing may be left."""
     started_s = time.monotonic()
-    scenario = process_scenario(seed, terms.speed, terms.storm_s)
+    scenario = terms.scenario(seed)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     exchange = "lockstep" if is_lockstep(seed) else "wall"
@@ -257,6 +268,8 @@ def _check(config: FleetConfig, failures: list[str]) -> ProcessMission:
         ),
         result.incarnations,
         frozenset(liveness.judged),
+        len(liars_of(scenario.faults)),
+        result.lies,
     )
 
 
@@ -325,6 +338,7 @@ class SoakTotals:
         self._grown: dict[str, Grown] = {}
         self._lasting = Lasting()
         self._steps = self._incarnations = 0
+        self._liars = self._named = self._lies = 0
 
     def add(self, mission: ProcessMission) -> None:
         """One more mission."""
@@ -339,6 +353,9 @@ class SoakTotals:
         self._resumed_s += mission.resumed_s
         self._steps += mission.steps
         self._incarnations += mission.incarnations
+        self._liars += mission.liars
+        self._named += len(mission.lies)
+        self._lies += sum(mission.lies.values())
         for kind, grown in mission.grown.items():
             self._grown[kind] = self._grown.get(kind, Grown()) + grown
         self._lasting.sample()
@@ -388,6 +405,8 @@ class SoakTotals:
             f"  disks      {', '.join(kinds)}, {self.struck['kill for good']} killed for good; "
             f"{self._incarnations} new incarnations"
         )
+        if self._liars:
+            yield f"  lies       {self._lies} found, {self._named} of {self._liars} liars named, and nobody else"
         yield f"  rejoined   {_quantiles(self._rejoined_s, self._rejoin_s)}"
         yield f"  resumed    world-sim {_quantiles(self._resumed_s)}"
         yield f"  liveness   {', '.join(f'{rule} judged {n}' for rule, n in sorted(self._judged.items()))}"
@@ -440,14 +459,14 @@ def _report(mission: ProcessMission, config: Soak) -> None:
     """Print all that is needed to repeat a violation."""
     terms = config.terms
     place = config.folder / FOLDER / f"seed-{mission.seed}"
-    (place / SCENARIO).write_text(to_toml(process_scenario(mission.seed, *terms)), encoding="utf-8")
+    (place / SCENARIO).write_text(to_toml(terms.scenario(mission.seed)), encoding="utf-8")
     print(f"VIOLATION  seed {mission.seed} ({mission.exchange})")
     for violation in mission.complaints:
         print(f"  {printable(violation)}")
     print(f"  commit     {commit()}, sources {code()[:16]}")
     print(
         f"  replay     kantor campaign --processes --replay {mission.seed} "
-        f"--speed {terms.speed:g} --storm {terms.storm_s:g}"
+        f"--speed {terms.speed:g} --storm {terms.storm_s:g}{' --byzantine' if terms.byzantine else ''}"
     )
     print(f"  kept       {place}/")
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from rich.table import Table
 
 from kantor_fleet.campaign.draw import SORTS
-from kantor_fleet.campaign.fault_coverage import CLASSES, is_of_processes
+from kantor_fleet.campaign.fault_coverage import CLASSES, is_of_links, is_of_processes
 from kantor_fleet.campaign.mission import Trial
 from kantor_fleet.campaign.rare_events import RARE_EVENTS
 
@@ -28,6 +28,9 @@ class Totals:
         self.twice = 0
         self.cuts = 0
         self.joined = 0
+        self.lies = 0
+        self.liars = 0
+        self.named = 0
         self.sorts: Counter[str] = Counter()
         self.planners: Counter[str] = Counter()
         self.ended: Counter[str] = Counter()
@@ -48,6 +51,9 @@ class Totals:
         self.twice += trial.twice
         self.cuts += trial.cut
         self.joined += trial.joined
+        self.lies += trial.lies
+        self.liars += trial.liars
+        self.named += trial.named
         self.sorts[trial.sort] += 1
         self.planners[trial.planner + ("*" if trial.centralized else "")] += 1
         self.ended[trial.ended] += 1
@@ -67,7 +73,7 @@ class Totals:
     def lines(self, wall_s: float) -> Iterator[str]:
         """The totals as text. wall_s: real time of this command."""
         cpu_s = max(self.cpu_s, 1e-9)
-        on_links = sum(n for name, n in self.struck.items() if not is_of_processes(name))
+        on_links = sum(n for name, n in self.struck.items() if is_of_links(name))
         on_processes = sum(n for name, n in self.struck.items() if is_of_processes(name))
         yield f"{self.missions} missions, {self.violations} with violations; ended: {_listed(self.ended)}"
         yield f"  sorts      {_listed(self.sorts, tuple(SORTS))}"
@@ -81,6 +87,7 @@ class Totals:
             f"  faults     {on_links} copies of messages touched, {on_processes} processes hit, "
             f"{sum(1 for name in CLASSES if self.struck[name])} of {len(CLASSES)} classes"
         )
+        yield f"  lies       {self.lies} found, {self.named} of {self.liars} liars named, and nobody else"
         yield (
             f"  speed      {self.steps / cpu_s:.0f} robot-steps per CPU second with every check on "
             f"({cpu_s:.0f} CPU s of all workers, {wall_s:.0f} s here); "
@@ -89,7 +96,7 @@ class Totals:
 
     def tables(self) -> Iterator[Table]:
         """Classes of faults, and rare situations."""
-        yield self._table("class of faults", "copies or processes", CLASSES, self.struck)
+        yield self._table("class of faults", "copies, processes or steps", CLASSES, self.struck)
         yield self._table("sometimes", "times", RARE_EVENTS, self.seen)
 
     def _table(self, title: str, unit: str, names: tuple[str, ...], counts: Counter[str]) -> Table:

@@ -18,6 +18,7 @@ def campaign(
     speed: float = 8.0,
     storm: float = 40.0,
     rejoin: float = 2.0,
+    byzantine: bool = False,
 ) -> int:
     """Draw missions full of faults, seed by seed, and check every event, until a rule is broken.
 
@@ -43,6 +44,8 @@ def campaign(
         speed: With --processes: simulated seconds in a real one.
         storm: With --processes: real seconds of each mission in which faults occur.
         rejoin: With --processes: real seconds within which 99 % of the restarts must have rejoined.
+        byzantine: With --processes: a robot lies in every mission, and everybody signs. Without, drawn missions have
+            liars anyway.
     """
     from kantor_fleet.campaign.run import numbered  # noqa: PLC0415
 
@@ -63,7 +66,7 @@ def campaign(
             fail(Exit.USAGE, f"--storm {storm:g}: give 10 to 600 seconds")
         if not rejoin > 0.0:
             fail(Exit.USAGE, f"--rejoin {rejoin:g}: give a time above 0")
-        terms = on_processes.SoakTerms(speed, storm)
+        terms = on_processes.SoakTerms(speed, storm, byzantine)
         if replay is not None:
             return on_processes.replay(replay, out, terms)
         drawn = numbered(seeds or ("18" if minutes is None else "1000"))

@@ -8,7 +8,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 
-from kantor_agent.robots.byzantine import as_declared
+from kantor_agent.robots.byzantine import ByzantineRobot, as_declared
 from kantor_agent.robots.density import DensityRobot
 from kantor_agent.robots.mapping import MappingRobot
 from kantor_protocol.base.machine import SUPERVISOR, Body, ParticipantId, StateMachine
@@ -83,6 +83,14 @@ def participant(
     else:
         robot = DensityRobot(name, scenario, seed, body, setup.samples_m, identities)
     return as_declared(name, scenario, seed, robot)
+
+
+def lies_told(member: StateMachine) -> int:
+    """Steps in which a member of a team has lied, by its own count; 0 for the honest and the dead."""
+    machine: object = member
+    while hasattr(machine, "machine"):
+        machine = machine.machine
+    return machine.told if isinstance(machine, ByzantineRobot) else 0
 
 
 def play(

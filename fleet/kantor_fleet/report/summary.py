@@ -83,7 +83,11 @@ def _of_faults(result: Result) -> list[str]:
     for name, counts in result.faults.items():
         by_effect = msgspec.structs.asdict(counts).items()
         effects = [f"{n} {effect.replace('_', ' ')}" for effect, n in by_effect if n]
-        lines.append(f"  fault {name:<16} {', '.join(effects) or 'no effect'}")
+        if not name.endswith(" byzantine"):  # its effects are lies
+            lines.append(f"  fault {name:<16} {', '.join(effects) or 'no effect'}")
+    if result.lies:
+        told = ", ".join(f"{name} {times}" for name, times in result.lies.items())
+        lines.append(f"  lies      {told}: found by the rules, and no violations")
     if result.restarts:
         back = f"{_counted(result.restarts, 'restart')}, {_counted(result.incarnations, 'new incarnation')}"
         if (rejoin := result.rejoin_s) is not None:

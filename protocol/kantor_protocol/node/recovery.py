@@ -74,6 +74,11 @@ class RecoverableNode:
             self._advance(decode_inputs(entry))
 
     @property
+    def machine(self) -> StateMachine:
+        """The machine as it is now."""
+        return self._machine
+
+    @property
     def last_step(self) -> tuple[Inputs, Outputs] | None:
         """Inputs and outputs of its last step, if it has made one."""
         if self._last_inputs is None or self._last_outputs is None:
@@ -143,6 +148,11 @@ class KillableNode:
         self._build = build
         self._wal = InMemoryLog()
         self._node: RecoverableNode | None = RecoverableNode(build, self._wal, body)
+
+    @property
+    def machine(self) -> StateMachine | None:
+        """The machine as it is now; None while it is killed."""
+        return None if self._node is None else self._node.machine
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """Make a step, see RecoverableNode. It must not be called while the participant is killed."""

@@ -14,6 +14,11 @@ class Signing:
         self._run = run
         self._key = key
 
+    @property
+    def machine(self) -> StateMachine:
+        """The machine within."""
+        return self._machine
+
     def step(self, inputs: Inputs, /) -> Outputs:
         """Make one step."""
         return signed_outputs(self._run, self._machine.step(inputs), self._key)

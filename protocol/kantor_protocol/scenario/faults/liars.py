@@ -4,7 +4,8 @@ Its body, its energy and its processes are as sound as ever; it lies in what it 
 process (`kantor_agent/robots/byzantine.py`). So the same lies are told in every exchange.
 """
 
-from typing import Annotated, Literal
+from collections.abc import Iterable
+from typing import Annotated, Literal, get_args
 
 from msgspec import Meta
 
@@ -12,6 +13,7 @@ from kantor_protocol.base.machine import ParticipantId
 from kantor_protocol.scenario.faults.base import Fault, Names
 
 Lie = Literal["overstate", "rewrite", "fork", "claim", "teleport", "silence"]
+LIES: tuple[Lie, ...] = get_args(Lie)
 
 
 class Byzantine(Fault, frozen=True, kw_only=True, tag="byzantine"):
@@ -27,12 +29,12 @@ class Byzantine(Fault, frozen=True, kw_only=True, tag="byzantine"):
     silence: it sends nothing to some, now to these, then to those."""
 
 
-def lies_of(who: ParticipantId, faults: tuple[Fault, ...]) -> tuple[Byzantine, ...]:
+def lies_of(who: ParticipantId, faults: Iterable[Fault]) -> tuple[Byzantine, ...]:
     """The lies that a participant tells."""
     return tuple(each for each in faults if isinstance(each, Byzantine) and who in each.who)
 
 
-def liars_of(faults: tuple[Fault, ...], *lies: Lie) -> frozenset[ParticipantId]:
+def liars_of(faults: Iterable[Fault], *lies: Lie) -> frozenset[ParticipantId]:
     """All participants that lie, or that tell one of these lies."""
     told = (each for each in faults if isinstance(each, Byzantine))
     return frozenset(name for each in told if not lies or each.lie in lies for name in each.who)
