@@ -25,11 +25,13 @@ from kantor_protocol.base.machine import (
     Pose,
     StateMachine,
 )
+from kantor_protocol.replication.attested import Chain
 from kantor_protocol.replication.occupancy_log import RANGE_BINS
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import SAMPLE, STAMP
 from kantor_protocol.scenario.faults.liars import Lie, lies_of
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Attestation
 from kantor_protocol.wire.messages import OUTBOX_MAX, GossipMessage, decode_gossip, encode_gossip
 
 SPELL_STEPS = 24
@@ -235,7 +237,23 @@ class ByzantineRobot:
             for each in suffixes
         ]
         logs = parts.packed_suffixes(shown, valued=self._valued)
-        return msgspec.structs.replace(message, logs=logs)
+        attestations = tuple(
+            self._attested(each, message, log) if each.origin == me else each
+            for each in message.attestations
+        )
+        return msgspec.structs.replace(message, logs=logs, attestations=attestations)
+
+    def _attested(self, own: Attestation, message: GossipMessage, log: Log) -> Attestation:
+        """Its attestation of what it shows, to be signed."""
+        if log.shape[0]:
+            chain = Chain(valued=self._valued)
+            own = msgspec.structs.replace(own, log=chain.hash(log.astype(np.int32), own.length))
+        for claim in parts.claims_in(message.claims):
+            if claim.origin == own.origin:
+                own = msgspec.structs.replace(
+                    own, claim=(claim.stamp, claim.sample, claim.since_ns)
+                )
+        return own
 
     def _differs(self, message: GossipMessage, version: int) -> bool:
         """Whether a message shows another log than the robot's own."""
