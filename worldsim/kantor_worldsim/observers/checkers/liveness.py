@@ -5,6 +5,8 @@ Rules
 L1  when nothing has changed for long enough (no fault, no robot moves, nothing held up arrives, and no robot with
     noisy ranges adds to its log, as it may where it stands), all participants that hear one another, over others
     if need be, hold the same entries of all logs, and have the same view
+    Of an origin that is not among them any more, in a signed mission without a supervisor, they need only hold the
+    same of what it has attested to one of them: nobody passes on the rest
 L2  a mission comes to its end before the limit of time
 L3  a robot that has not heard its supervisor for more than 9 of its own steps talks to all robots, and as
     soon as it hears it, to the supervisor alone
@@ -26,16 +28,19 @@ import numpy.typing as npt
 from kantor_protocol.base.machine import (
     EVERYBODY,
     SUPERVISOR,
+    Envelope,
     Outputs,
     ParticipantId,
     Pose,
     State,
 )
 from kantor_protocol.base.varint import Pairs
+from kantor_protocol.replication.attested import attested_every
 from kantor_protocol.replication.gossip import CONTACT_PERIODS, ack_timeout_steps
 from kantor_protocol.scenario.faults.liars import Byzantine, liars_of
 from kantor_protocol.scenario.faults.processes import Kill, OnProcesses
 from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.wire.attestations import Attestation
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
 from kantor_worldsim.observers.checkers.links import Links
 from kantor_worldsim.observers.checkers.sight import Sight
@@ -51,7 +56,10 @@ _WITHIN_STEPS = CONTACT_PERIODS + 1
 
 
 def settling_ns(scenario: Scenario, hops: int) -> int:
-    """The time that entries may take over so many links, when nothing else changes."""
+    """The time that entries may take over so many links, when nothing else changes.
+
+    Where who passes them on waits until they are attested, each link may wait for another attestation.
+    """
     radio = scenario.radio
     tries = (
         1 if radio.drop <= 0.0 else math.ceil(math.log(_UNLUCKY) / math.log(min(radio.drop, 0.99)))
@@ -60,7 +68,10 @@ def settling_ns(scenario: Scenario, hops: int) -> int:
     slowest_ns = round(scenario.period_ns * (1.0 + scenario.clock.spread)) + round(
         scenario.clock.jitter_s * 1e9
     )
-    return (hops + 1) * (tries * (timeout_steps + 2) * slowest_ns + _way_ns(scenario))
+    passed_on = scenario.signed and (scenario.merge == "ledger" or scenario.mapping)
+    attested_steps = attested_every(scenario) if passed_on else 0
+    steps = tries * (timeout_steps + 2 + attested_steps)
+    return (hops + 1) * (steps * slowest_ns + _way_ns(scenario))
 
 
 def _way_ns(scenario: Scenario) -> int:
@@ -140,6 +151,10 @@ class LivenessChecker:
         self._way_ns = _way_ns(scenario)
         self._spent: dict[int, list[bytes]] = {}
         """The packed spending of each incarnation id."""
+        self._attestations: dict[tuple[ParticipantId, int], list[tuple[int, int]]] = {}
+        """Origins and the attested lengths of their logs, by source and sequence of the envelope; of signed missions."""
+        self._attested: dict[ParticipantId, dict[int, int]] = {name: {} for name in self._names}
+        """The longest such length that each participant has heard of."""
         self._reported: set[tuple[str, ParticipantId]] = set()
         """Rules and participants of violations that last from step to step."""
 
@@ -152,6 +167,8 @@ class LivenessChecker:
             return
         outputs, pose = step_record.outputs, step_record.verdict.pose
         state.last = outputs
+        if self._scenario.signed:
+            self._note_attested(step_record, outputs)
         if outputs.lowered:
             state.lowered.append(outputs.lowered)
             self._changed_ns = now_ns if outputs.spent else self._changed_ns
@@ -164,6 +181,16 @@ class LivenessChecker:
             self._note_logging(state, outputs, now_ns)
         if step_record.name != SUPERVISOR and self._scenario.centralized:
             self._check_contact(state, step_record, outputs)
+
+    def _note_attested(self, step_record: StepRecord, outputs: Outputs) -> None:
+        known = self._attested[step_record.name]
+        for heard in step_record.heard:
+            for origin, length in self._attestations.get(heard, ()):
+                known[origin] = max(known.get(origin, 0), length)
+        for envelope in outputs.outbox:
+            attested = [(each.origin, each.length) for each in _attestations_of(envelope)]
+            if attested:
+                self._attestations[envelope.source, envelope.sequence] = attested
 
     def _note_logging(self, state: _Participant, outputs: Outputs, now_ns: int) -> None:
         version_vector = _version_vector_of(outputs, len(self._names), claims=False)
@@ -359,22 +386,38 @@ class LivenessChecker:
                 return
             if self._scenario.merge == "ledger" or self._scenario.mapping:
                 ids = max(len(mine.version_vector), len(theirs.version_vector))
-                one, other = (self._of_honest(each.version_vector, ids) for each in (mine, theirs))
+                one, other = (
+                    self._comparable(each.version_vector, ids, component) for each in (mine, theirs)
+                )
                 if one != other:
                     what = f"holds {other} entries, {first} holds {one}"
                     self._report("L1", now_ns, name, what)
-            if self._forgers or (self._liars and mine.version_vector != theirs.version_vector):
+            doubtful = self._liars or self._scenario.signed
+            if self._forgers or (doubtful and mine.version_vector != theirs.version_vector):
                 continue
             differing = int(np.count_nonzero(mine.view != theirs.view))
             if differing:
                 what = f"its view differs from {first}'s in {differing} samples"
                 self._report("L1", now_ns, name, what)
 
-    def _of_honest(self, version_vector: list[int], ids: int) -> list[int]:
-        """The log lengths in a version vector, padded to so many ids, without those of liars."""
-        padded = version_vector + [0] * (ids - len(version_vector))
+    def _comparable(
+        self, version_vector: list[int], ids: int, component: list[ParticipantId]
+    ) -> list[int]:
+        """The log lengths in a version vector, padded to so many ids, that are the same for all of a component.
+
+        Without those of liars, and of the absent only as far as they have attested.
+        """
+        lengths = version_vector + [0] * (ids - len(version_vector))
         names = self._names
-        return [n for i, n in enumerate(padded) if names[i % len(names)] not in self._liars]
+        if self._scenario.signed and SUPERVISOR not in component:
+            present = {self._states[name].incarnation_id for name in component}
+            lengths = [
+                length
+                if origin in present
+                else min(length, max(self._attested[name].get(origin, 0) for name in component))
+                for origin, length in enumerate(lengths)
+            ]
+        return [n for i, n in enumerate(lengths) if names[i % len(names)] not in self._liars]
 
     def _check_whole(
         self,
@@ -398,6 +441,14 @@ class LivenessChecker:
             if max(lengths, default=0) != entries:
                 what = f"has consumed {entries} entries, and {max(lengths, default=0)} are known"
                 self._report("I8", now_ns, name, what)
+
+
+def _attestations_of(envelope: Envelope) -> tuple[Attestation, ...]:
+    """The attestations in an envelope."""
+    try:
+        return decode_gossip(envelope.body).attestations
+    except RefusedError:
+        return ()
 
 
 def _version_vector_of(outputs: Outputs | None, roster: int, *, claims: bool) -> list[int] | None:
