@@ -154,7 +154,7 @@ class LivenessChecker:
         self._attestations: dict[tuple[ParticipantId, int], list[tuple[int, int]]] = {}
         """Origins and the attested lengths of their logs, by source and sequence of the envelope; of signed missions."""
         self._attested: dict[ParticipantId, dict[int, int]] = {name: {} for name in self._names}
-        """The longest such length that each participant has heard of."""
+        """The longest such length of a log, or of its beginning, that each participant has heard of and holds."""
         self._reported: set[tuple[str, ParticipantId]] = set()
         """Rules and participants of violations that last from step to step."""
 
@@ -183,14 +183,22 @@ class LivenessChecker:
             self._check_contact(state, step_record, outputs)
 
     def _note_attested(self, step_record: StepRecord, outputs: Outputs) -> None:
+        """What is attested to one who does not hold all of it is of no use: it has nothing to pass on with it."""
         known = self._attested[step_record.name]
-        for heard in step_record.heard:
-            for origin, length in self._attestations.get(heard, ()):
+        heard = [each for key in step_record.heard for each in self._attestations.get(key, ())]
+        lengths = self._lengths_of(outputs) if heard else []
+        for origin, length in heard:
+            if origin < len(lengths) and length <= lengths[origin]:
                 known[origin] = max(known.get(origin, 0), length)
         for envelope in outputs.outbox:
             attested = [(each.origin, each.length) for each in _attestations_of(envelope)]
             if attested:
                 self._attestations[envelope.source, envelope.sequence] = attested
+
+    def _lengths_of(self, outputs: Outputs) -> list[int]:
+        """The log lengths that a participant holds by its last message; none if that does not say."""
+        claims = self._scenario.claiming
+        return _version_vector_of(outputs, len(self._names), claims=claims) or []
 
     def _note_logging(self, state: _Participant, outputs: Outputs, now_ns: int) -> None:
         version_vector = _version_vector_of(outputs, len(self._names), claims=False)
