@@ -59,10 +59,8 @@ class LiarChecker:
         self._scenario, self._sample_units = scenario, opening.units.sample
         self._energy_units = scenario.steps_per_robot * opening.units.point
         """What one robot can ship."""
-        self._shipped = {
-            place: np.zeros(opening.samples_m.shape[0], dtype=np.int64) for place in self.false_logs
-        }
-        """(N,) units that each robot with a false log has shipped."""
+        self._false = np.zeros(opening.samples_m.shape[0], dtype=np.int64)
+        """(N,) units shipped by robots with false logs."""
         self._pairs = Pairs()
         self._finished: set[ParticipantId] = set()
         self._sent: tuple[dict[int, set[Word]], dict[int, set[Word]]] = ({}, {})
@@ -90,7 +88,8 @@ class LiarChecker:
             outputs = step_record.outputs
             if outputs is None or step_record.name not in self._names:
                 continue
-            self._note_shipped(self._names.index(step_record.name), outputs)
+            if self._names.index(step_record.name) in self.false_logs:
+                self._note_false(outputs)
         left = self._left(consumed)
         for step_record in batch.step_records:
             if step_record.outputs is not None and step_record.name in self._names:
@@ -100,27 +99,36 @@ class LiarChecker:
     def check_view(
         self, place: int, view: npt.NDArray[np.int64], consumed: npt.NDArray[np.int64]
     ) -> None:
-        """The rule `credit` beside false logs: a view has lost no more than these could take, of all samples together."""
-        left = self._left(consumed, place)
-        missing = int(np.maximum(left - view, 0).sum())
-        if missing > self.allowance(place):
-            what = f"its view lacks {missing} units, and liars could take {self.allowance(place)}"
+        """The rule `credit` beside false logs: a view has lost no more than these could take, of all samples together.
+
+        Not of a robot with a false log: after a restart its own lies may come back to it.
+        """
+        if place in self.false_logs:
+            return
+        missing = int(np.maximum(self._left(consumed) - view, 0).sum())
+        if missing > self.allowance:
+            what = f"its view lacks {missing} units, and liars could take {self.allowance}"
             self._report("credit", self._names[place], what)
 
-    def allowance(self, place: int) -> int:
-        """Units that the false logs of others can have taken from a participant's view."""
-        return len(self.false_logs - {place}) * self._energy_units
+    def check_lost(self, who: ParticipantId, units: int) -> None:
+        """The rule `ledger` beside false logs, whose entries nobody else knows: they took no more than they could."""
+        if units > self.allowance:
+            what = f"false logs took {units} units, and liars could take {self.allowance}"
+            self._report("ledger", who, what)
 
-    def _note_shipped(self, place: int, outputs: Outputs) -> None:
-        shipped = self._shipped.get(place)
-        spent = None if shipped is None else self._pairs.decode(outputs.spent, shipped.shape[0])
-        if shipped is not None and spent is not None:
-            np.add.at(shipped, *spent)
+    @property
+    def allowance(self) -> int:
+        """Units that false logs can have taken from a view."""
+        return len(self.false_logs) * self._energy_units
 
-    def _left(self, consumed: npt.NDArray[np.int64], viewer: int = -1) -> npt.NDArray[np.int64]:
-        """(N,) units left by all but robots with false logs; a viewer knows its own spending."""
-        others = (shipped for place, shipped in self._shipped.items() if place != viewer)
-        return np.maximum(self._sample_units - consumed + sum(others), 0)
+    def _note_false(self, outputs: Outputs) -> None:
+        spent = self._pairs.decode(outputs.spent, self._false.shape[0])
+        if spent is not None:
+            np.add.at(self._false, spent[0], spent[1])
+
+    def _left(self, consumed: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(N,) units left by all but robots with false logs."""
+        return np.maximum(self._sample_units - consumed + self._false, 0)
 
     def _check_end(self, step_record: StepRecord, outputs: Outputs, left: int) -> None:
         """The rule `early`. left: units that honest spending leaves."""
@@ -128,9 +136,8 @@ class LiarChecker:
         if outputs.state is not State.FINISHED or name in self._finished or name in self._liars:
             return
         self._finished.add(name)
-        allowance = len(self.false_logs) * self._energy_units
-        if left > allowance:
-            what = f"finishes with {left} units left, and liars could take {allowance}"
+        if left > self.allowance:
+            what = f"finishes with {left} units left, and liars could take {self.allowance}"
             self._report("early", name, what)
 
     def _check_words(self, step_record: StepRecord, outputs: Outputs) -> None:
