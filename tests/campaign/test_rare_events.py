@@ -9,6 +9,7 @@ from support.strategies import mission
 
 TEAM = ("energy.points=240", "samples.count=60")
 CENTRALIZED = ("coordination=centralized",)
+SIGNED = ("trust=signed",)
 
 
 def seen(*overrides: str, seed: int = 1) -> dict[str, int]:
@@ -23,6 +24,10 @@ def faults(*tables: str) -> str:
 
 def kill(who: str, more: str = "", from_s: float = 2.0, until_s: float = 3.0) -> str:
     return f'kind="kill", who=["{who}"], from_s={from_s}, until_s={until_s} {more}'
+
+
+def lie(told: str) -> str:
+    return f'kind="byzantine", who=["r2"], lie="{told}", from_s=1.0, until_s=5.0'
 
 
 WHERE: dict[str, tuple[str, ...]] = {
@@ -67,6 +72,9 @@ WHERE: dict[str, tuple[str, ...]] = {
         *CENTRALIZED,
         faults(kill("supervisor", until_s=5.0)),
     ),
+    "message of a liar refused": (*SIGNED, faults(lie("rewrite"))),
+    "word of a liar passed on": (*SIGNED, "radio.drop=0.5", faults(lie("overstate"))),
+    "finished beside a liar": (*SIGNED, "energy.steps=200", faults(lie("teleport"))),
     "L1 judged": ("linger_s=10.0",),
     "L2 judged": (),
     "L3 judged": CENTRALIZED,

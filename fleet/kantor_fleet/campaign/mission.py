@@ -72,7 +72,7 @@ class Trial(Outcome, frozen=True, kw_only=True):
     lies: int = 0
     """Times that checkers have found a declared liar to lie."""
     liars: int = 0
-    """Robots that have told a lie, by themselves."""
+    """Robots that have told a lie, as they know themselves or checkers do."""
     named: int = 0
     """Those of them that checkers have named."""
 
@@ -228,8 +228,8 @@ def _attempt(case: Case, *, validate: bool) -> dict[str, Any]:
         "cut": _CUTS if cut else 0,
         "joined": int(believed and not scenario.mapping),
         "lies": sum(follower.recording.checker.lies.values()),
-        "liars": len(follower.liars),
-        "named": len(follower.liars & set(follower.recording.checker.lies)),
+        "liars": len(follower.liars.union(follower.recording.checker.lies)),
+        "named": len(follower.recording.checker.lies),
     }
 
 

@@ -17,6 +17,7 @@ from kantor_protocol.base.machine import (
     State,
 )
 from kantor_protocol.base.varint import Pairs
+from kantor_protocol.scenario.faults.liars import liars_of
 from kantor_protocol.scenario.faults.links import FORGED_SEQUENCE_MIN, OneWay, Partition
 from kantor_protocol.scenario.faults.processes import ClockFault, Kill, Late
 from kantor_protocol.scenario.schema import Scenario
@@ -348,7 +349,40 @@ class _Losses(_Detector):
         self._read_ns[step_record.name] = read_ns
 
 
-_DETECTORS = (_Goals, _Partitions, _Restarts, _Deliveries, _Recoveries, _Losses)
+class _Liars(_Detector):
+    """What the honest do beside a robot that lies."""
+
+    names = ("message of a liar refused", "word of a liar passed on", "finished beside a liar")
+
+    @classmethod
+    def applies(cls, scenario: Scenario) -> bool:
+        return bool(liars_of(scenario.faults))
+
+    def __init__(self, opening: Opening) -> None:
+        super().__init__(opening)
+        self._names, self._liars = self.scenario.roster, liars_of(self.scenario.faults)
+        self._refused = dict.fromkeys(self._names, 0)
+        self._finished: set[ParticipantId] = set()
+
+    def step_record(self, step_record: StepRecord, outputs: Outputs) -> None:
+        name = step_record.name
+        if name in self._liars:
+            return
+        if outputs.refused > self._refused[name]:
+            forged = any(number >= FORGED_SEQUENCE_MIN for _, number in step_record.heard)
+            heard = any(source in self._liars for source, _ in step_record.heard)
+            self.seen["message of a liar refused"] += heard and not forged
+        self._refused[name] = outputs.refused
+        for envelope in outputs.outbox:
+            origins = [each.origin for each in decode_gossip(envelope.body).attestations]
+            told = any(self._names[origin % len(self._names)] in self._liars for origin in origins)
+            self.seen["word of a liar passed on"] += told
+        if outputs.state is State.FINISHED and name not in self._finished:
+            self._finished.add(name)
+            self.seen["finished beside a liar"] += 1
+
+
+_DETECTORS = (_Goals, _Partitions, _Restarts, _Deliveries, _Recoveries, _Losses, _Liars)
 
 JUDGED = ("L1 judged", "L2 judged", "L3 judged", "I8 judged")
 """Missions in which a rule of liveness could have been broken; see `LivenessChecker`."""

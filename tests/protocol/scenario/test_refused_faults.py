@@ -196,6 +196,14 @@ REFUSED = {
         {"kind": "clock", "who": ["r1"], "offset_s": 4000.0},
         "faults[0].offset_s: expected `float` <= 3600.0",
     ),
+    "unknown lie": (
+        {"kind": "byzantine", "who": ["r1"], "lie": "murder"},
+        "faults[0].lie: 'murder' is not known; known: overstate, rewrite, fork, claim, teleport",
+    ),
+    "liar of another team": (
+        {"kind": "byzantine", "who": ["r9"], "lie": "fork"},
+        "faults[0].who: r9 is not in the team; known: r1 to r3",
+    ),
     "impostor with an end": (
         {"kind": "impostor", "who": ["r1"], "from_s": 1, "until_s": 2},
         "faults[0].until_s: an impostor asks once, at from_s; leave it out",
@@ -246,3 +254,34 @@ def test_a_range_fault_needs_a_place_of_the_supervisor() -> None:
     """On a map the range of the supervisor counts from its place, which this one lacks."""
     with pytest.raises(ScenarioError, match="the supervisor has no place on the map"):
         exploration("coordination=centralized", fault(kind="range", range_m=5.0))
+
+
+LIES_WITHOUT_EFFECT = {
+    "overstate": (("merge=min", "claims=false"), "is about spending in a ledger"),
+    "fork": (("merge=min", "claims=false"), "nobody compares logs of minima"),
+    "claim": (("claims=false",), "nobody claims samples or shares registers"),
+    "rewrite": (("merge=min", "claims=false"), "nobody passes on what others say"),
+}
+
+
+@pytest.mark.parametrize("lie", LIES_WITHOUT_EFFECT)
+def test_a_lie_that_nobody_could_hear_is_refused(lie: str) -> None:
+    overrides, why = LIES_WITHOUT_EFFECT[lie]
+
+    refused = refusal("", *overrides, fault(kind="byzantine", who=["r1"], lie=lie))
+    assert refused.startswith("faults[0].lie: ")
+    assert why in refused
+
+
+def test_a_map_has_no_spending_to_overstate() -> None:
+    with pytest.raises(ScenarioError, match="overstate is about spending"):
+        exploration(fault(kind="byzantine", who=["r1"], lie="overstate"))
+
+
+def test_a_supervisor_does_not_lie() -> None:
+    """It is believed without proof."""
+    liar = fault(kind="byzantine", who=["supervisor"], lie="silence")
+
+    assert refusal("", "coordination=centralized", liar).startswith(
+        "faults[0].who: a supervisor is"
+    )

@@ -108,6 +108,13 @@ who = ["r2"]
 from_s = 3.0
 
 [[faults]]
+kind = "byzantine"
+who = ["r2"]
+lie = "fork"
+from_s = 1.0
+until_s = 7.0
+
+[[faults]]
 kind = "kill"
 who = ["worldsim"]
 from_s = 8.0

@@ -12,6 +12,7 @@ from kantor_fleet.execution.in_process_team import _key, team, team_identities
 from kantor_protocol.base.machine import Envelope, Inputs, Outputs, ParticipantId, Pose
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.proofs import Chain
+from kantor_protocol.scenario.faults.liars import LIES
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import HASH_BYTES, Attestation, signed
@@ -69,6 +70,21 @@ MISSIONS = {
 }
 
 
+def lying(lie: str) -> str:
+    """The override that has r2 lie."""
+    return f'faults=[{{kind="byzantine", who=["r2"], lie="{lie}", from_s=0.2}}]'
+
+
+LIARS = {
+    **{lie: mission(SIGNED, "energy.points=90", lying(lie)) for lie in LIES},
+    "rewrite, believed": mission("energy.points=90", lying("rewrite")),
+    "claim, believed": mission("energy.points=90", lying("claim")),
+    "registers": mission(SIGNED, "planner=spectral", "planner.modes=4", lying("claim")),
+    "fork on a map": on_map(SIGNED, lying("fork")),
+    "rewrite on a map": on_map(SIGNED, lying("rewrite")),
+}
+
+
 class Judged(InProcessExchange):
     """An exchange that has every report judged before it is settled."""
 
@@ -103,6 +119,52 @@ def test_an_honest_report_is_never_refused(name: str) -> None:
 
     assert len(exchange.reasons) > STEPS
     assert set(exchange.reasons) == {""}
+
+
+@pytest.mark.parametrize("name", LIARS)
+def test_a_declared_liar_is_let_through_and_so_are_those_who_believe_it(name: str) -> None:
+    exchange, _ = played(LIARS[name])
+
+    assert len(exchange.reasons) > STEPS
+    assert set(exchange.reasons) == {""}
+
+
+@pytest.mark.parametrize("lie", ["rewrite", "claim", "overstate", "fork", "teleport"])
+def test_the_same_lie_is_refused_of_one_who_is_not_declared(lie: str) -> None:
+    """World-sim knows better, whatever is signed."""
+    scenario = LIARS[lie]
+    honest = msgspec.structs.replace(scenario, faults=())
+    setup = WorldSetup.of(scenario, 3)
+    exchange, identities = Judged(team(scenario, 3, setup)), team_identities(scenario, 3)
+    exchange.admission, exchange.reasons = Admission(honest, setup, identities), []
+    simulation = Simulation(scenario, 3, setup, [exchange.admission.observe], identities)
+    simulate(simulation, exchange, 3, lambda: any(exchange.reasons), exchange)
+
+    assert any(exchange.reasons)
+
+
+def test_a_declared_liar_does_not_break_the_record() -> None:
+    """What is malformed, or about incarnations that never were, is refused of everybody."""
+    scenario = LIARS["rewrite"]
+    setup = WorldSetup.of(scenario, 3)
+    admission = Admission(scenario, setup, team_identities(scenario, 3))
+    outputs = Outputs(step=1, pose=setup.poses(scenario)["r2"])
+    message = GossipMessage(1, 1, 0.0, 0.0, bytes(6), b"", b"")
+    cases = {
+        "a malformed envelope": message_with(message, logs=b"\x01"),
+        "an envelope about an incarnation that never was": message_with(
+            message, version_vector=bytes(12)
+        ),
+        "an envelope of incarnation 1": message_with(message, incarnation=1),
+    }
+    for reason, body in cases.items():
+        sent = msgspec.structs.replace(outputs, outbox=(Envelope("r2", 1, "", body),))
+        assert admission.refusal_reason("r2", sent) == reason
+
+
+def message_with(message: GossipMessage, **values: object) -> bytes:
+    """The body of a message with other values."""
+    return encode_gossip(msgspec.structs.replace(message, **values))
 
 
 def next_report(name: ParticipantId = "r2", *overrides: str) -> tuple[Admission, Outputs]:
