@@ -25,8 +25,8 @@ from kantor_protocol.base.machine import (
     Pose,
     StateMachine,
 )
-from kantor_protocol.replication.attested import Chain
 from kantor_protocol.replication.occupancy_log import RANGE_BINS
+from kantor_protocol.replication.proofs import Chain
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.replication.replica_kernels import SAMPLE, STAMP
 from kantor_protocol.scenario.faults.liars import Lie, lies_of

@@ -19,7 +19,7 @@ from kantor_protocol.base.machine import (
     StateMachine,
 )
 from kantor_protocol.node.recovery import KillableNode
-from kantor_protocol.replication.attested import Chain
+from kantor_protocol.replication.proofs import Chain
 from kantor_protocol.scenario.faults.liars import LIES, Lie
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import attestations_in
