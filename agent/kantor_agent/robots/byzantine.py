@@ -28,11 +28,12 @@ from kantor_protocol.base.machine import (
 from kantor_protocol.replication.occupancy_log import RANGE_BINS
 from kantor_protocol.replication.proofs import Chain
 from kantor_protocol.replication.replica import Replica
-from kantor_protocol.replication.replica_kernels import SAMPLE, STAMP
+from kantor_protocol.replication.replica_kernels import BLOCK, SAMPLE, STAMP
 from kantor_protocol.scenario.faults.liars import Lie, lies_of
 from kantor_protocol.scenario.schema import Scenario
-from kantor_protocol.wire.attestations import Attestation
+from kantor_protocol.wire.attestations import HASH_BYTES, UNSIGNED, Attestation
 from kantor_protocol.wire.messages import OUTBOX_MAX, GossipMessage, decode_gossip, encode_gossip
+from kantor_protocol.wire.signatures import SIGNATURE_BYTES
 
 SPELL_STEPS = 24
 """For so many steps the same receivers are deceived, or met with silence."""
@@ -46,13 +47,16 @@ _JUMP_STEPS = 1e6
 """How far, in steps at full speed: nobody has been away for so long."""
 _AHEAD = 16
 """By so much a stamp in another's name is ahead of those that are known."""
+_BOLD_SHARE = 0.5
+"""Of the robots that overstate, so many do it beyond their energy."""
+_BOUNDLESS = 1 << 62
 _INVENTED = 3
 """Entries that are invented at the end of another's log, at most."""
 
-_OVERSTATED, _FORKED, _FORK_ENTRY, _SPELL, _JUMP, _TO_CLAIM, _VICTIM, _MADE_UP = range(8)
+_OVERSTATED, _FORKED, _FORK_ENTRY, _SPELL, _JUMP, _TO_CLAIM, _VICTIM, _MADE_UP, _BOLD = range(9)
 """Subjects of draws."""
 
-Log = npt.NDArray[np.int64]
+Log = npt.NDArray[np.signedinteger]
 """(length, 2) entries: index and value."""
 
 
@@ -201,9 +205,11 @@ class ByzantineRobot:
         return any(each.lie == lie for each in self._lies)
 
     def _overstated(self, entries: Log, first: int, *, now: bool) -> Log:
-        """Whole points, shipped to samples that are drawn, as long as it could have energy for them."""
+        """Whole points, shipped to samples that are drawn; of a careful one as long as it could have energy for them."""
         stated, config = entries.copy(), self._replica.config
         left = self._scenario.steps_per_robot * config.value_max - int(self._stated[0][:, 1].sum())
+        if self._draw(_BOLD, 0) < _BOLD_SHARE:
+            left = _BOUNDLESS
         for i in range(entries.shape[0]):
             if now:
                 sample = self._whole(config.bound, _OVERSTATED, first + i)
@@ -229,9 +235,7 @@ class ByzantineRobot:
         me = self._replica.config.me
         suffixes = parts.suffixes_in(message.logs, valued=self._valued)
         shown = [
-            each._replace(
-                entries=list(map(tuple, log[each.start : each.start + each.span].tolist()))
-            )
+            each._replace(entries=_entries(log[each.start : each.start + each.span]))
             if each.origin == me and log.shape[0]
             else each
             for each in suffixes
@@ -320,58 +324,91 @@ class ByzantineRobot:
         return told
 
     def _rewritten(self, message: GossipMessage, step: int) -> GossipMessage:
-        """Change what others have said, and make up what they have not."""
-        replica = self._replica
-        logs, vector = message.logs, message.version_vector
-        if replica.config.ledger:
-            suffixes, longer = self._rewritten_suffixes(logs, step)
-            logs = parts.packed_suffixes(suffixes, valued=self._valued)
-            lengths = parts.uints_in(vector)
-            for origin, more in longer.items():
-                lengths[origin] += more
-            vector = parts.packed_uints(lengths)
+        """Change what others have said, or make up what they have not, and attest it for them."""
+        if self._replica.config.ledger:
+            suffixes = parts.suffixes_in(message.logs, valued=self._valued)
+            if any(self._foreign(each.origin) for each in suffixes):
+                changed = [self._changed(each) for each in suffixes]
+                logs = parts.packed_suffixes(changed, valued=self._valued)
+                message = msgspec.structs.replace(message, logs=logs)
+            else:
+                message = self._inventing(message, suffixes, step)
         claims = parts.packed_claims(
-            each._replace(sample=1 + each.sample % replica.config.bound)
+            each._replace(sample=1 + each.sample % self._replica.config.bound)
             if self._foreign(each.origin)
             else each
             for each in parts.claims_in(message.claims)
         )
         registers = message.registers
         if registers:
-            stamps, told = parts.registers_in(registers, replica.origins)
-            changed = [
-                each._replace(numbers=_grown(each.numbers)) if self._foreign(each.origin) else each
-                for each in told
-            ]
-            registers = parts.packed_registers(stamps, changed)
-        return msgspec.structs.replace(
-            message, logs=logs, version_vector=vector, claims=claims, registers=registers
-        )
+            stamps, told = parts.registers_in(registers, self._replica.origins)
+            registers = parts.packed_registers(
+                stamps,
+                (
+                    each._replace(numbers=_grown(each.numbers))
+                    if self._foreign(each.origin)
+                    else each
+                    for each in told
+                ),
+            )
+        return msgspec.structs.replace(message, claims=claims, registers=registers)
 
-    def _rewritten_suffixes(
-        self, logs: bytes, step: int
-    ) -> tuple[list[parts.Suffix], dict[int, int]]:
-        """Suffixes with other entries of others, or with invented ones, and by how much that makes logs longer."""
-        config, suffixes = self._replica.config, parts.suffixes_in(logs, valued=self._valued)
-        rewritten = [
-            each._replace(entries=[((i + 1) % config.bound, value) for i, value in each.entries])
-            if self._foreign(each.origin)
-            else each
-            for each in suffixes
-        ]
-        if any(self._foreign(each.origin) for each in suffixes):
-            return rewritten, {}
+    def _changed(self, suffix: parts.Suffix) -> parts.Suffix:
+        """A suffix of another's log with other entries."""
+        if not self._foreign(suffix.origin):
+            return suffix
+        bound = self._replica.config.bound
+        return suffix._replace(entries=[((i + 1) % bound, value) for i, value in suffix.entries])
+
+    def _inventing(
+        self, message: GossipMessage, suffixes: list[parts.Suffix], step: int
+    ) -> GossipMessage:
+        """A message with a log of another that is longer than it is; in a signed mission with a forged attestation."""
+        replica, config = self._replica, self._replica.config
         others = [place for place in range(self._roster) if place != self._place]
         victim = others[self._whole(len(others), _VICTIM, step)]
-        start = int(self._replica.store.length[victim])
-        count = 1 + self._whole(_INVENTED, _MADE_UP, step)
-        if start + count > config.length_max:
-            return rewritten, {}
-        entries = [
-            (self._whole(config.bound, _MADE_UP, step, 1 + i), config.value_max)
-            for i in range(count)
-        ]
-        return [*rewritten, parts.Suffix(victim, start, count, entries)], {victim: count}
+        held, count = int(replica.store.length[victim]), 1 + self._whole(_INVENTED, _MADE_UP, step)
+        if held + count > config.length_max:
+            return message
+        samples = [self._whole(config.bound, _MADE_UP, step, 1 + i) for i in range(count)]
+        invented = np.array([(sample, config.value_max) for sample in samples], dtype=np.int32)
+        log = np.concatenate((replica.store.logs[victim, :held], invented))
+        start = held - held % BLOCK if self._scenario.signed else held
+        suffix = parts.Suffix(victim, start, held + count - start, _entries(log[start:]))
+        lengths = parts.uints_in(message.version_vector)
+        lengths[victim] += count
+        logs = parts.packed_suffixes([*suffixes, suffix], valued=self._valued)
+        longer = msgspec.structs.replace(
+            message, logs=logs, version_vector=parts.packed_uints(lengths)
+        )
+        forges = self._scenario.signed and victim not in {i.origin for i in message.attestations}
+        return self._forging(longer, victim, log, start) if forges else longer
+
+    def _forging(self, message: GossipMessage, victim: int, log: Log, start: int) -> GossipMessage:
+        """A message with an attestation in another's name, and the proof that goes with it.
+
+        At its end it is signed with the liar's own key; before its own one it has a signature of nobody.
+        """
+        chain, me = Chain(valued=self._valued), self._replica.config.me
+        own = tuple(each for each in message.attestations if each.origin == me)
+        forged = Attestation(
+            origin=victim,
+            step=message.step,
+            length=log.shape[0],
+            log=chain.hash(log, log.shape[0]),
+            register=bytes(HASH_BYTES) if self._scenario.register_width else b"",
+            signature=bytes([1]) * SIGNATURE_BYTES if own else UNSIGNED,
+        )
+        others = message.attestations[: len(message.attestations) - len(own)]
+        return msgspec.structs.replace(
+            message,
+            proofs=(*message.proofs, chain.hash(log, start)),
+            attestations=(*others, forged, *own),
+        )
+
+
+def _entries(log: Log) -> list[tuple[int, int]]:
+    return [(index, value) for index, value in log.tolist()]
 
 
 def _grown(numbers: list[int]) -> list[int]:

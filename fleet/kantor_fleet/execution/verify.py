@@ -14,6 +14,7 @@ from kantor_fleet.exits import Exit, fail
 from kantor_protocol.base.machine import WORLD_SIM, Envelope, Outputs, ParticipantId, StateMachine
 from kantor_protocol.files.reading import UnreadableError, read_text
 from kantor_protocol.scenario.errors import ScenarioError
+from kantor_protocol.scenario.faults.liars import liars_of
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import (
     Attestation,
@@ -174,23 +175,31 @@ def _finding_of_checker(manifest: Manifest, records: list[tuple[bytes, Record]])
 
 
 def _finding_on_signatures(_manifest: Manifest, records: list[tuple[bytes, Record]]) -> Finding:
-    """Whether every attestation that a participant has sent is signed by its origin, with the keys on record."""
+    """Whether every attestation that a participant has sent is signed by its origin, with the keys on record.
+
+    A robot that the scenario has lie may forge them.
+    """
     opening, identities = records[0][1], _identities_in(records)
     assert isinstance(opening, Opening)
     if identities is None:
         return False, "signatures: the record does not say whose word counts"
-    roster, count = opening.scenario.roster, 0
+    roster, count, forged = opening.scenario.roster, 0, 0
+    liars = liars_of(opening.scenario.faults)
     for _, record in records:
         for step_record in record.step_records if isinstance(record, Batch) else ():
             for envelope in step_record.outputs.outbox if step_record.outputs else ():
                 for attestation in _attestations_in(envelope):
                     count += 1
                     origin = roster[attestation.origin % len(roster)]
-                    if not is_genuine(identities, origin, attestation):
+                    genuine = is_genuine(identities, origin, attestation)
+                    if not genuine and step_record.name in liars:
+                        forged += 1
+                    elif not genuine:
                         at_s = f"t={step_record.now_ns * 1e-9:.3f} s"
                         what = f"{step_record.name} sends what {origin} has not signed"
                         return False, f"signatures: {at_s}: {what}, step {attestation.step}"
-    return True, f"signatures: {count} attestations, all signed by their origins"
+    but = f" but {forged} forged by {', '.join(sorted(liars))}" if forged else ""
+    return True, f"signatures: {count} attestations, all signed by their origins{but}"
 
 
 def _attestations_in(envelope: Envelope) -> tuple[Attestation, ...]:

@@ -110,12 +110,16 @@ class ClockOptions(ScenarioTable, frozen=True, kw_only=True):
     """Each step is late by a time drawn from [0, jitter_s]; below the period."""
 
 
+ENERGY_MAX = 2_000_000_000
+"""Points of a mission, or of a robot, at most."""
+
+
 class Energy(ScenarioTable, frozen=True, kw_only=True):
     """The energy budget, eq. 7."""
 
-    points: Annotated[int, Meta(ge=0, le=2_000_000_000)] = 0
+    points: Annotated[int, Meta(ge=0, le=ENERGY_MAX)] = 0
     """M: robot points of the whole team; each ships 1/M of the mass. 0 in a mission with a map."""
-    steps: Annotated[int, Meta(ge=1, le=2_000_000_000)] | None = None
+    steps: Annotated[int, Meta(ge=1, le=ENERGY_MAX)] | None = None
     """Points that one robot may ship; by default t_e = M / n_a."""
 
 

@@ -20,6 +20,7 @@ incarnations that never were.
 
 import math
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -31,7 +32,7 @@ from kantor_protocol.replication.occupancy_log import entries
 from kantor_protocol.replication.proofs import Chain, blocks
 from kantor_protocol.replication.replica_kernels import BLOCK
 from kantor_protocol.scenario.faults.liars import liars_of
-from kantor_protocol.scenario.schema import Scenario
+from kantor_protocol.scenario.schema import ENERGY_MAX, Scenario
 from kantor_protocol.wire.attestations import Attestation, Identities, hash_of, is_genuine
 from kantor_protocol.wire.messages import (
     OUTBOX_MAX,
@@ -75,7 +76,10 @@ class Admission:
         self._way_max_m = scenario.vehicle.speed_m_s * scenario.clock.period_s * (1.0 + _ROUNDING)
         self._poses = setup.poses(scenario)
         self._receivers = MessageCheck(scenario, units, indices, identities)
-        self._well_formed = MessageCheck(scenario, units, indices)
+        boundless = msgspec.structs.replace(scenario.energy, steps=ENERGY_MAX)
+        self._well_formed = MessageCheck(
+            msgspec.structs.replace(scenario, energy=boundless), units, indices
+        )
         self._settings = np.array(
             [
                 roster,
@@ -186,7 +190,7 @@ class Admission:
             return f"a malformed envelope ({error})"
         if message.incarnation != own // len(self._places):
             return f"an envelope of incarnation {message.incarnation}"
-        if reason := self._refusal_of_attestations(message):
+        if reason := self._refusal_of_attestations(envelope.source, message):
             return reason
         if not self._receivers_of(envelope.source).passes(own, message):
             return "a malformed envelope"
@@ -201,9 +205,11 @@ class Admission:
         """The checks that a message has to pass; a liar may say what it cannot prove."""
         return self._well_formed if name in self._liars else self._receivers
 
-    def _refusal_of_attestations(self, message: GossipMessage) -> str:
+    def _refusal_of_attestations(self, source: ParticipantId, message: GossipMessage) -> str:
         if message.attestations and self._identities is None:
             return "an attestation, and trust is open"
+        if source in self._liars:
+            return ""
         for attestation in message.attestations:
             name = self._roster[attestation.origin % len(self._roster)]
             if self._identities is None or not is_genuine(self._identities, name, attestation):
