@@ -43,6 +43,9 @@ _A_CLASS = 16
 
 _CENTRALIZED = 0.28
 _SIGNED = 0.45
+"""So many missions are signed."""
+_LYING = 0.5
+"""Of these so many have liars."""
 _LINGER_PERIODS = 150
 _METRICS_EVERY = 20
 """The rows are not read."""
@@ -410,7 +413,7 @@ def _faults(seed: int, scenario: Scenario, calm_s: float) -> Iterable[Fault]:
         if kind == "byzantine" and not scenario.signed:
             continue  # it would be believed
         at = FaultedMission(scenario, calm_s, KeyedDraws(seed, _A_CLASS + number))
-        if not at.draws.coin(bias):
+        if not at.draws.coin(_LYING if kind == "byzantine" else bias):
             continue
         for _ in range(at.draws.whole(1, _MANY.get(kind, 2))):
             fault = next(candidates(at, kind, taken), None)
