@@ -7,8 +7,10 @@ all of them from seed 0 on and writes docs/mutants.md, where the suite finds the
 
 from __future__ import annotations
 
+import functools
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,13 +25,21 @@ from campaign import (
     bugs_in_radio,
     bugs_in_replication,
     bugs_in_robots,
+    bugs_in_trust,
 )
 from campaign.planting import MUTANTS, Mutant
 from kantor_fleet.campaign.draw import draw
 from kantor_fleet.campaign.mission import Trial, attempt
 from kantor_fleet.execution.experiment import Case
 
-BUGS = (bugs_in_replication, bugs_in_radio, bugs_in_robots, bugs_in_maps, bugs_in_processes)
+BUGS = (
+    bugs_in_replication,
+    bugs_in_radio,
+    bugs_in_robots,
+    bugs_in_maps,
+    bugs_in_processes,
+    bugs_in_trust,
+)
 """The modules that plant them."""
 
 LIMIT = 200
@@ -40,8 +50,9 @@ TABLE = Path(__file__).parents[2] / "docs" / "mutants.md"
 _HEAD = """\
 # Planted bugs, and the rules that catch them
 
-{caught} of {all} caught within {limit} missions of `kantor campaign`, from seed 0 on. Written by
-`python tests/campaign/mutants.py`; `tests/campaign/test_mutants.py` plants every one of them.
+{caught} of {all} caught: {hunted} within {limit} missions of `kantor campaign`, from seed 0 on, and {tested} that no
+mission meets by the test that is named. Written by `python tests/campaign/mutants.py`;
+`tests/campaign/test_mutants.py` plants every one of them.
 
 | mutant | what it does | caught at seed | by rule | violation |
 |---|---|---:|---|---|
@@ -63,6 +74,8 @@ def hunt(one: Mutant, first: int = 0, limit: int = LIMIT) -> Catch | None:
     started_s = time.monotonic()
     with pytest.MonkeyPatch.context() as patch:
         one.plant(patch)
+        if one.test is not None:
+            return _tested(one.test, started_s)
         for seed in range(first, limit):
             scenario = draw(seed)
             if not one.touches(scenario):
@@ -74,20 +87,35 @@ def hunt(one: Mutant, first: int = 0, limit: int = LIMIT) -> Catch | None:
     return None
 
 
+def _tested(test: Callable[[], None], started_s: float) -> Catch | None:
+    """Run the test that has to fail."""
+    try:
+        test()
+    except (AssertionError, pytest.fail.Exception):
+        function = test.func if isinstance(test, functools.partial) else test
+        name = getattr(function, "__wrapped__", function).__name__
+        return Catch(0, f"test: {name.strip('_')}", 0, time.monotonic() - started_s)
+    return None
+
+
 def recorded_seeds(path: Path = TABLE) -> dict[str, int]:
-    """The seeds at which mutants were caught when the table was written."""
+    """The seeds at which mutants were caught when the table was written; 0 for those that a test catches."""
     rows = [line.split(" | ") for line in path.read_text(encoding="utf-8").splitlines()]
     return {
-        row[0].removeprefix("| "): int(row[2]) for row in rows if len(row) > 4 and row[2].isdigit()
+        row[0].removeprefix("| "): int(row[2] or 0)
+        for row in rows
+        if len(row) > 4 and (row[2].isdigit() or row[3] == "test")
     }
 
 
 def write(hunted: list[tuple[Mutant, Catch | None]], path: Path = TABLE) -> None:
     """Write the table for the repository."""
-    caught = sum(catch is not None for _, catch in hunted)
-    lines = [_HEAD.format(caught=caught, all=len(hunted), limit=LIMIT)]
+    caught = [one for one, catch in hunted if catch is not None]
+    tested = sum(one.test is not None for one in caught)
+    counts = {"caught": len(caught), "all": len(hunted), "tested": tested}
+    lines = [_HEAD.format(**counts, hunted=len(caught) - tested, limit=LIMIT)]
     for one, catch in hunted:
-        seed = catch.seed if catch else ""
+        seed = catch.seed if catch and one.test is None else ""
         rule, _, text = catch.violation.partition(": ") if catch else ("**none**", "", "")
         shown = text.replace("|", "\\|")[:90]
         lines.append(f"| {one.name} | {one.does} | {seed} | {rule} | {shown} |\n")

@@ -1,5 +1,7 @@
 """How bugs are planted: the list of them, the missions that each can change, and where to put a patch.
 
+A bug that no mission meets, not even one with a liar, names the test that has to fail.
+
 A bug is a mistake that one could make in this system. Those in Python are planted at a seam; one in a compiled
 kernel replaces the kernel, and every kernel that calls it is compiled anew.
 """
@@ -28,18 +30,20 @@ class Mutant(NamedTuple):
     plant: Callable[[Patch], None]
     touches: Touches
     """Missions that it can change at all; the others count, and need not run."""
+    test: Callable[[], None] | None = None
+    """A test of the suite that has to catch it, since no mission meets it."""
 
 
 MUTANTS: list[Mutant] = []
 
 
 def mutant(
-    does: str, touches: Touches = lambda _: True
+    does: str, touches: Touches = lambda _: True, *, test: Callable[[], None] | None = None
 ) -> Callable[[Callable[[Patch], None]], Callable[[Patch], None]]:
     """Add a bug to the list under the name of the function that plants it."""
 
     def add(plant: Callable[[Patch], None]) -> Callable[[Patch], None]:
-        MUTANTS.append(Mutant(plant.__name__.replace("_", "-"), does, plant, touches))
+        MUTANTS.append(Mutant(plant.__name__.replace("_", "-"), does, plant, touches, test))
         return plant
 
     return add

@@ -10,8 +10,8 @@ _RECORDED = recorded_seeds()
 
 
 def test_there_are_enough_of_them() -> None:
-    assert len(BUGS) == 5
-    assert len(MUTANTS) >= 70
+    assert len(BUGS) == 6
+    assert len(MUTANTS) >= 84
     assert len({mutant.name for mutant in MUTANTS}) == len(MUTANTS)
 
 

@@ -115,6 +115,14 @@ def test_work_is_charged_as_messages_are(said: list[tuple[float, float]]) -> Non
         assert bucket.excess.messages == refused
 
 
+def test_work_beyond_the_quota_is_refused() -> None:
+    """A report that causes as much as eight messages empties a full bucket eight times as fast."""
+    bucket = TokenBucket(RateLimit.of(0.0))
+    admitted = sum(bucket.admit(10, 0.0) and bucket.charge(8.0, 0.0) for _ in range(1000))
+
+    assert admitted == BURST_MESSAGES // 8
+
+
 def test_one_envelope_to_the_whole_team_costs_nothing_more() -> None:
     """So does a report without any: a full bucket is as empty as after as many messages."""
     bucket = TokenBucket(RateLimit.of(0.0))

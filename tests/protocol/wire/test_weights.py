@@ -1,6 +1,7 @@
 """Integer mass, and weight vectors that observers rebuild exactly."""
 
 import math
+import tracemalloc
 import zlib
 
 import msgpack
@@ -237,6 +238,20 @@ def test_bomb_is_not_inflated() -> None:
     subscriber = WeightsSubscriber()
 
     assert not subscriber.apply(message(1, 0, 3, zlib.compress(bytes(50_000_000))))
+
+
+def test_no_more_is_inflated_than_there_can_be() -> None:
+    """Not even for a moment."""
+    subscriber = WeightsSubscriber()
+    bomb = message(1, 0, 3, zlib.compress(bytes(50_000_000)))
+    tracemalloc.start()
+    try:
+        assert not subscriber.apply(bomb)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+
+    assert peak < 1_000_000
 
 
 @pytest.mark.parametrize("size", [1, 2, 4, 50_000_000])
