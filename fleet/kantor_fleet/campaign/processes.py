@@ -406,7 +406,7 @@ class SoakTotals:
             f"{self._incarnations} new incarnations"
         )
         if self._liars:
-            yield f"  lies       {self._lies} found, {self._named} of {self._liars} liars named, and nobody else"
+            yield f"  lies       {self._lies} found, {self._named} of {self._liars} liars named, and no other robot"
         yield f"  rejoined   {_quantiles(self._rejoined_s, self._rejoin_s)}"
         yield f"  resumed    world-sim {_quantiles(self._resumed_s)}"
         yield f"  liveness   {', '.join(f'{rule} judged {n}' for rule, n in sorted(self._judged.items()))}"

@@ -87,7 +87,7 @@ class Totals:
             f"  faults     {on_links} copies of messages touched, {on_processes} processes hit, "
             f"{sum(1 for name in CLASSES if self.struck[name])} of {len(CLASSES)} classes"
         )
-        yield f"  lies       {self.lies} found, {self.named} of {self.liars} liars named, and nobody else"
+        yield f"  lies       {self.lies} found, {self.named} of {self.liars} liars named, and no other robot"
         yield (
             f"  speed      {self.steps / cpu_s:.0f} robot-steps per CPU second with every check on "
             f"({cpu_s:.0f} CPU s of all workers, {wall_s:.0f} s here); "
