@@ -8,6 +8,7 @@ from hypothesis import given
 from kantor_fleet.campaign.draw import SORTS, draw, sort_of
 from kantor_fleet.campaign.keyed_draws import KeyedDraws
 from kantor_protocol.scenario.dump import to_toml, to_tree
+from kantor_protocol.scenario.faults.liars import LIES, Byzantine, liars_of
 from kantor_protocol.scenario.faults.processes import Kill
 from kantor_protocol.scenario.faults.schedule import KINDS, kind_of
 from kantor_protocol.scenario.load import from_tree, parse
@@ -43,6 +44,20 @@ def test_the_second_phase_is_without_faults() -> None:
             lost = isinstance(fault, Kill) and fault.until_s is None
             assert fault.until_ns is not None or lost or kind_of(fault) == "impostor"
             assert (fault.until_ns or fault.from_ns) < 0.75 * scenario.limit_ns
+
+
+def test_liars_are_drawn_where_all_sign_and_never_all_of_a_team() -> None:
+    """Every lie is told somewhere; the honest are at least as many as the liars."""
+    told = set()
+    signed = 0
+    for scenario in map(draw, range(MANY // 2)):
+        liars = liars_of(scenario.faults)
+        assert scenario.signed or not liars
+        assert 2 * len(liars) <= scenario.robots.count
+        signed += scenario.signed
+        told |= {fault.lie for fault in scenario.faults if isinstance(fault, Byzantine)}
+    assert told == set(LIES)
+    assert 0.4 < signed / (MANY // 2) < 0.5
 
 
 def test_the_same_seed_gives_the_same_scenario() -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from msgspec.structs import replace
 
 from kantor_fleet.campaign import processes
 from kantor_fleet.campaign.process_scenarios import (
@@ -18,6 +19,7 @@ from kantor_fleet.campaign.rss_monitor import Grown
 from kantor_fleet.execution.in_process_team import play
 from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM
 from kantor_protocol.scenario.faults.base import Fault
+from kantor_protocol.scenario.faults.liars import Byzantine, liars_of
 from kantor_protocol.scenario.faults.processes import Impostor, Kill, OnProcesses, Pause
 from kantor_worldsim.world.world import WorldSetup
 from support.limits import EVENT_LIMIT_S
@@ -49,6 +51,22 @@ def test_any_fifteen_missions_in_a_row_have_every_signal_often_enough() -> None:
     assert missions * min(of_kind(faults, Pause, "r") for faults in walls) >= 100
     assert missions * min(of_kind(faults, Kill, SUPERVISOR) for faults in walls) >= 20
     assert missions * min(of_kind(faults, Kill, WORLD_SIM) for faults in walls) >= 10
+
+
+def test_a_hostile_robot_is_in_every_mission_if_wanted() -> None:
+    """One of the team, with one lie or another; everybody signs, and nothing else is drawn differently."""
+    told = set()
+    for seed in range(12):
+        plain, hostile = process_scenario(seed), process_scenario(seed, byzantine=True)
+        (fault,) = hostile.faults[len(plain.faults) :]
+        assert isinstance(fault, Byzantine)
+        assert set(fault.who) <= set(plain.robot_ids)
+        assert len(fault.who) == 1
+        assert hostile.signed
+        assert not liars_of(plain.faults)
+        assert replace(hostile, faults=plain.faults, trust=plain.trust) == plain
+        told.add(fault.lie)
+    assert len(told) >= 3
 
 
 @pytest.mark.parametrize("storm_s", [10.0, STORM_S, 120.0])
