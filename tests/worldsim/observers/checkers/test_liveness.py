@@ -6,9 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from kantor_fleet.execution.in_process_team import team
-from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR
+from kantor_fleet.execution.in_process_team import team, team_identities
+from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, State
 from kantor_protocol.base.varint import put_uint
+from kantor_protocol.scenario.faults.liars import LIES
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.messages import decode_gossip, encode_gossip
 from kantor_protocol.wire.version_vector import read_version_vector
@@ -27,6 +28,12 @@ LOST = "faults=[{kind='kill', who=['r2'], from_s=0.75, until_s=1.5, disk='lost'}
 CUT = "faults=[{kind='partition', shape='halves', from_s=0.3, until_s=3.0}]"
 AWAY = "faults=[{kind='kill', who=['supervisor'], from_s=0.5, until_s=2.0}]"
 GUIDED = "coordination=centralized"
+SIGNED = "trust=signed"
+GONE = "faults=[{kind='kill', who=['r2'], from_s=2.05}]"
+
+
+def lying(lie: str) -> str:
+    return f"faults=[{{kind='byzantine', who=['r2'], lie='{lie}', from_s=0.3, until_s=2.0}}]"
 
 
 class _Patient(Simulation):
@@ -48,7 +55,8 @@ def rested(*overrides: str, seed: int = 1) -> list[Record]:
     scenario: Scenario = mission(*SIZE, *overrides)
     setup = WorldSetup.of(scenario, seed)
     records: list[Record] = []
-    simulation = _Patient(scenario, seed, setup, [records.append])
+    identities = team_identities(scenario, seed)
+    simulation = _Patient(scenario, seed, setup, [records.append], identities)
     exchange = InProcessExchange(team(scenario, seed, setup))
     simulate(simulation, exchange, seed, lambda: False, exchange)
     return records
@@ -220,3 +228,56 @@ def test_what_a_fault_has_held_up_still_merges_when_it_arrives() -> None:
         checker = judged([*records[:sent], held_up, *records[sent + 1 :]])
 
         assert ("L1" in checker.judged) == rules_judged
+
+
+# Signed missions, and liars.
+
+
+@pytest.mark.parametrize("guided", [(), (GUIDED,)])
+@pytest.mark.parametrize("lie", LIES)
+def test_beside_a_liar_the_honest_come_to_know_the_same(lie: str, guided: tuple[str, ...]) -> None:
+    """Rules of the honest are judged as ever, and none is broken."""
+    checker = judged(rested(SIGNED, lying(lie), *guided))
+
+    assert checker.violations == []
+    assert {"L1", "L2", "I8"} <= checker.judged
+
+
+def test_what_the_honest_hold_of_a_liar_does_not_count() -> None:
+    records = rested(SIGNED, lying("overstate"))
+    last = step_records(records, "r1")[-1]
+    honest, liar, other = have_of(last)
+
+    assert rules(returning(records, "r1", outbox=said([honest, liar - 1, other], last))) == set()
+    assert rules(returning(records, "r1", outbox=said([honest, liar, other - 1], last))) == {"L1"}
+
+
+def test_a_mission_that_only_a_liar_keeps_open_has_come_to_its_end() -> None:
+    records = rested(SIGNED, lying("teleport"))
+    ending = records[-1]
+    assert isinstance(ending, Ending)
+    cut = [*records[:-1], Ending(ending.now_ns, "limit")]
+
+    assert rules(returning(cut, "r2", state=State.EXPLORING)) == set()
+    assert rules(returning(cut, "r1", state=State.EXPLORING)) == {"L2"}
+
+
+def test_of_the_dead_only_what_they_have_attested_is_passed_on() -> None:
+    """What r2 has said after its last attestation who was there may know, and nobody else."""
+    records = rested(SIGNED, GONE)
+    attested = max(
+        each.length
+        for step_record in step_records(records, "r2")
+        if step_record.outputs is not None
+        for envelope in step_record.outputs.outbox
+        for each in decode_gossip(envelope.body).attestations
+        if each.origin == 1
+    )
+    last = step_records(records, "r1")[-1]
+    mine, gone, other = have_of(last)
+
+    assert 0 < attested < gone
+    assert rules(records) == set()
+    assert rules(returning(records, "r1", outbox=said([mine, attested, other], last))) == set()
+    less = said([mine, attested - 1, other], last)
+    assert rules(returning(records, "r1", outbox=less)) == {"L1"}
