@@ -183,14 +183,17 @@ class LivenessChecker:
             self._check_contact(state, step_record, outputs)
 
     def _note_attested(self, step_record: StepRecord, outputs: Outputs) -> None:
-        """What is attested to one who does not hold all of it is of no use: it has nothing to pass on with it."""
+        """What is attested to one who does not hold all of it is of no use: it has nothing to pass on with it.
+
+        What a liar brings may be forged, and does not count.
+        """
         known = self._attested[step_record.name]
         heard = [each for key in step_record.heard for each in self._attestations.get(key, ())]
         lengths = self._lengths_of(outputs) if heard else []
         for origin, length in heard:
             if origin < len(lengths) and length <= lengths[origin]:
                 known[origin] = max(known.get(origin, 0), length)
-        for envelope in outputs.outbox:
+        for envelope in outputs.outbox if step_record.name not in self._liars else ():
             attested = [(each.origin, each.length) for each in _attestations_of(envelope)]
             if attested:
                 self._attestations[envelope.source, envelope.sequence] = attested
