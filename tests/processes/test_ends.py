@@ -116,6 +116,22 @@ def test_a_signal_ends_a_run_at_any_moment(
         assert len(kantor.runs()) == 1
 
 
+@pytest.mark.parametrize("exchange", ["lockstep", "realtime"])
+def test_a_mission_that_is_interrupted_while_it_waits_was_not_deserted(
+    kantor: "Kantor", exchange: str
+) -> None:
+    """Whoever was not there yet has not left."""
+    world = kantor.start(
+        "worldsim", "paper-single", "--listen", free_endpoint(), "--exchange", exchange
+    )
+    await_line(world, "t=", "waiting")
+    world.send_signal(signal.SIGINT)
+    world.communicate()
+
+    assert world.returncode == 130
+    assert result_of(kantor.runs()[0])["ended"] == "interrupted"
+
+
 def test_no_password_of_a_local_fleet_is_on_a_disk(kantor: "Kantor", temporary: Path) -> None:
     """While it runs, there is nothing in the temporary folder but the fork server's socket."""
     process = started(kantor, temporary, *FLEET)

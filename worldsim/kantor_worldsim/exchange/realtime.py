@@ -76,7 +76,8 @@ class RealtimeExchange:
     def run(self) -> str:
         """Relay until the mission is over; the reason."""
         lobby, injector = self._lobby, self._injector
-        lobby.open(lambda: self._now_ns)
+        if not self._stopped():  # who is not there yet has not left an interrupted mission
+            lobby.open(lambda: self._now_ns)
         injector.advance(self._now_ns)
         lobby.announce_all()
         self._welcome_newcomers()
