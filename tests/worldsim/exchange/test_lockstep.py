@@ -23,6 +23,7 @@ class Team:
         self.reports: list[tuple[str, Report]] = []
         self.asked: list[tuple[str, bool]] = []
         """Who was asked, and whether that waited."""
+        self.silences: list[str] = []
 
     def monotonic(self) -> float:
         """The simulated time in seconds."""
@@ -40,6 +41,10 @@ class Team:
 
     def grant_reply(self, name: str) -> None:
         """Replies are not counted here."""
+
+    def note_silence(self, name: str) -> None:
+        """Keep the name."""
+        self.silences.append(name)
 
     def forget_newcomers(self) -> None:
         """There are none."""
@@ -90,6 +95,7 @@ def test_a_silent_participant_is_waited_for_once(team: Team) -> None:
 
     assert BARRIER_S <= team.now_s <= BARRIER_S + 1.0
     assert len([name for name, _ in team.asked if name == "r2"]) <= 2 * BARRIER_S
+    assert team.silences == ["r2"]
     assert all(blocking for name, blocking in team.asked if name != "r2")
 
 

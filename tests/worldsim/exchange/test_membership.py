@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kantor_worldsim.exchange.membership import REFUSALS, JoinDecision, Membership
+from kantor_worldsim.exchange.membership import FENCED_MAX, REFUSALS, JoinDecision, Membership
 from support.strategies import examples
 
 
@@ -33,6 +33,18 @@ def test_a_frozen_predecessor_is_refused_forever() -> None:
     membership.leave("r1", "two")
     assert membership.join("r1", "one") is JoinDecision.FENCED
     assert membership.join("r1", "two") is JoinDecision.BACK
+
+
+def test_not_all_predecessors_are_remembered() -> None:
+    """Who replaces itself again and again fills no memory; the newest predecessors are refused."""
+    membership = Membership(("r1",))
+    for i in range(FENCED_MAX + 10):
+        assert membership.join("r1", f"{i}") is JoinDecision.NEW
+        membership.leave("r1", f"{i}")
+
+    assert len(membership._fenced) == FENCED_MAX
+    assert membership.join("r1", f"{FENCED_MAX + 8}") is JoinDecision.FENCED
+    assert membership.join("r1", "9") is JoinDecision.FENCED
 
 
 def test_an_unknown_participant_is_refused() -> None:

@@ -85,6 +85,7 @@ class Lobby:
         self._admission = admission or Admission(config.scenario, config.setup, identities)
         self._keys = identities.keys if identities is not None else {}
         self._refused_reports: dict[ParticipantId, RefusedReports] = {}
+        self._silences: dict[ParticipantId, int] = {}
         self._unsound: set[ParticipantId] = set()
         """Participants whose last report was refused."""
         self._membership = Membership(config.scenario.roster)
@@ -100,8 +101,6 @@ class Lobby:
         """Participants that a fault has killed or frozen, or that are late: their absence is no event."""
         self._newcomers: deque[ParticipantId] = deque()
         """Participants that became ready, until the exchange asks for them."""
-        self._met: set[str] = set()
-        """Nonces of the processes that have been ready."""
         self._briefed_s: dict[ParticipantId, float] = {}
         """Time at which each present participant that is not ready was sent its mission."""
         self._away: set[ParticipantId] = set()
@@ -275,6 +274,17 @@ class Lobby:
         """The reports that were refused, of each participant that sent any."""
         return dict(self._refused_reports)
 
+    @property
+    def silences(self) -> dict[ParticipantId, int]:
+        """How often each participant did not answer in time, of those that ever did not."""
+        return dict(self._silences)
+
+    def note_silence(self, name: ParticipantId) -> None:
+        """Count that a participant did not answer in time, and name it, once."""
+        if name not in self._silences:
+            self._say(f"{name} does not answer; the others go on without it until it does")
+        self._silences[name] = self._silences.get(name, 0) + 1
+
     def grant_reply(self, name: ParticipantId) -> None:
         """Let a participant answer its next step request, whatever its quota says."""
         self._host.grant_reply(name)
@@ -304,7 +314,8 @@ class Lobby:
     def _join(self, event: Joined) -> None:
         name, nonce = event
         decision = self._membership.join(name, nonce)
-        has_mission = nonce in self._met  # it was frozen or disconnected
+        ready = self._last_ready.get(name)
+        has_mission = ready is not None and ready.nonce == nonce  # it was frozen or disconnected
         if decision is JoinDecision.UNKNOWN:
             self.refused += 1
         elif decision is JoinDecision.BACK and has_mission:
@@ -427,7 +438,6 @@ class Lobby:
             self._lose(name)  # its predecessor has left, and that was not seen
         self._ready[name] = nonce
         self._briefed_s.pop(name, None)
-        self._met.add(nonce)
         self._arrivals[name] += 1
         self._doubtful.discard(name)
         if self._clock is not None and name in self._away:

@@ -62,6 +62,7 @@ class LockstepExchange:
         for name in inputs:
             if name not in outputs and lobby.is_expected(name) and name not in self._silent:
                 self._silent.add(name)
+                lobby.note_silence(name)
                 self._patience_s[name] = max(_PATIENCE_MIN_S, self._patience_s[name] / 2.0)
         lobby.forget_newcomers()
         return outputs

@@ -76,6 +76,7 @@ def run(
     lobby.dismiss(reason, 0.0 if past is None else COME_BACK_S)
     recording.refused_at_door = lobby.refused
     recording.excess, recording.refused_reports = host.excess, lobby.refused_reports
+    recording.silences = lobby.silences
     result = recording.finish()
     reporter.report("over", reason, at_once=True)
     return result

@@ -11,6 +11,9 @@ from enum import Enum, auto
 
 from kantor_protocol.base.machine import ParticipantId
 
+FENCED_MAX = 65_536
+"""Replaced processes that are remembered: a participant that replaces itself again and again fills no memory."""
+
 
 class JoinDecision(Enum):
     """Decision on a process that asks to join."""
@@ -43,8 +46,8 @@ class Membership:
         """Nonce of the process that plays each participant or played it last; empty: none has."""
         self._present: set[ParticipantId] = set()
         """Participants whose process is on the bus; each has a nonce."""
-        self._fenced: set[str] = set()
-        """Nonces of replaced processes; none of them plays a participant."""
+        self._fenced: dict[str, None] = {}
+        """Nonces of the last replaced processes, in order; none of them plays a participant."""
 
     def join(self, name: ParticipantId, nonce: str) -> JoinDecision:
         """Decide on a process that asks to join."""
@@ -59,10 +62,15 @@ class Membership:
         if name in self._present:
             return JoinDecision.TAKEN
         if last:
-            self._fenced.add(last)
+            self._fence(last)
         self._last[name] = nonce
         self._present.add(name)
         return JoinDecision.NEW
+
+    def _fence(self, nonce: str) -> None:
+        self._fenced[nonce] = None
+        if len(self._fenced) > FENCED_MAX:
+            del self._fenced[next(iter(self._fenced))]
 
     def leave(self, name: ParticipantId, nonce: str) -> bool:
         """Note that a process has left; whether it was the one that plays the participant."""

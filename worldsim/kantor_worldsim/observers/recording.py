@@ -77,6 +77,8 @@ class Recording:
         """Messages beyond each participant's quota; set likewise."""
         self.refused_reports: dict[ParticipantId, RefusedReports] = {}
         """Unsound reports of each participant that sent any; set likewise."""
+        self.silences: dict[ParticipantId, int] = {}
+        """How often each participant did not answer in time; set likewise."""
         self.run = secrets.token_hex(8) if past is None else past.terms.run
         """Names the run."""
         self._scenario = scenario
@@ -139,6 +141,7 @@ class Recording:
             refused_at_door=self.refused_at_door,
             excess=self.excess,
             refused_reports=self.refused_reports,
+            silences=self.silences,
             record=self.journal.cut or "whole",
             complaints=tuple(self.checker.violations),
             lies=self.checker.lies,

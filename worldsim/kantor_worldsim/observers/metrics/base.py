@@ -264,6 +264,7 @@ class RunMetrics:
         refused_at_door: int = 0,
         excess: Mapping[ParticipantId, Excess] = MappingProxyType({}),
         refused_reports: Mapping[ParticipantId, RefusedReports] = MappingProxyType({}),
+        silences: Mapping[ParticipantId, int] = MappingProxyType({}),
         record: str,
         complaints: tuple[str, ...],
         lies: Mapping[ParticipantId, int] = MappingProxyType({}),
@@ -321,5 +322,6 @@ class RunMetrics:
             excess=dict(excess),
             refused_reports=dict(refused_reports),
             lies=dict(lies),
+            silences=dict(silences),
             **self._measured(),
         )

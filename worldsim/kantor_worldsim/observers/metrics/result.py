@@ -203,3 +203,5 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     """Participants that sent unsound or impossible reports."""
     lies: dict[ParticipantId, int] = {}
     """Robots that lie by a fault of the scenario, and how often checkers have found that; no violations."""
+    silences: dict[ParticipantId, int] = {}
+    """Lockstep: how often each participant that was on the bus did not answer until its time was over."""
