@@ -24,6 +24,7 @@ from kantor_protocol.transport.rate_limit import BURST_BYTES, BURST_MESSAGES, Ra
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.zenoh_config import POSE_BYTES_MAX, SHOWN_PER_S
 from kantor_protocol.wire import keys
+from kantor_protocol.wire.messages import NONCE_MAX
 from support.limits import EVENT_LIMIT_S
 
 if TYPE_CHECKING:
@@ -108,6 +109,19 @@ def test_long_messages_beyond_the_quota_are_dropped(tmp_path: Path) -> None:
 
         waiting = sum(len(event.payload) for event in before)
         assert waiting <= BURST_BYTES + elapsed_s * QUOTA.bytes_per_s
+
+
+def test_a_token_with_a_longer_nonce_than_any_is_no_event(tmp_path: Path) -> None:
+    """World-sim remembers nonces, and messages have none that is so long."""
+    with hosted(tmp_path) as (host, _, hostile, _):
+        liveliness = hostile._session.liveliness()
+        tokens = [
+            liveliness.declare_token(keys.alive(FLEET, "r2", nonce))
+            for nonce in ((NONCE_MAX + 1) * "n", NONCE_MAX * "n")
+        ]
+
+        assert next_of(host, Joined).nonce == NONCE_MAX * "n"
+        assert len(tokens) == 2
 
 
 def test_what_observers_see_is_limited_by_the_router(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import signal
 import socket
 import time
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +18,11 @@ from kantor_protocol.transport.client import ParticipantSession, client, partici
 from kantor_protocol.transport.endpoint import free_endpoint, parse_endpoint
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import BusError
-from kantor_protocol.transport.zenoh_config import ACCEPT_PENDING
+from kantor_protocol.transport.zenoh_config import (
+    ACCEPT_PENDING,
+    SESSIONS_MORE,
+    SESSIONS_OF_EACH,
+)
 from kantor_protocol.wire.messages import (
     VERSION,
     Mission,
@@ -131,6 +136,24 @@ def test_a_run_resumes_after_unsound_reports(kantor: "Kantor") -> None:
     assert result_of(run)["violations"] == 0
 
 
+def test_a_silent_robot_is_named(kantor: "Kantor") -> None:
+    """In lockstep: it is ready and does not answer; the other one goes on without it, and is not blamed."""
+    endpoint = free_endpoint()
+    world = host(kantor, endpoint, "lockstep")
+    identity = credentials.find(kantor.folder / "credentials", "r2")
+    with participant_session(endpoint, identity, "hostile", EVENT_LIMIT_S) as hostile:
+        await_message(hostile, Mission)
+        honest = kantor.start("agent", "r1", "--connect", endpoint)
+        hostile.send(encode(Ready(VERSION, "hostile")), blocking=True)
+        await_message(hostile, Stop)
+        assert honest.wait(timeout=EVENT_LIMIT_S) == 0
+        out, err = world.communicate(timeout=EVENT_LIMIT_S)
+
+    assert out.count("r2 does not answer") == 1, out + err
+    assert "r1 does not answer" not in out
+    assert result_of(kantor.runs()[0])["silences"] == {"r2": 1}
+
+
 def test_a_record_that_cannot_be_resumed_is_one_line(kantor: "Kantor") -> None:
     """Of another version, say: exit code 2, one line, and the folder is as it was."""
     kantor("run", "paper-single", "--exchange", "in-process", "--set", "limit_s=2")
@@ -173,6 +196,22 @@ def test_idle_connections_do_not_keep_others_from_joining(tmp_path: Path, idle: 
         finally:
             for connection in held:
                 connection.close()
+
+
+def test_many_sessions_of_a_certificate_do_not_keep_others_from_joining(tmp_path: Path) -> None:
+    """More than a router has room for; those that are too many are closed, and their holder is named."""
+    issue(tmp_path / "keys", Wanted("demo", 2), datetime.now(UTC))
+    hub, r1, r2 = (credentials.find(tmp_path / "keys", name) for name in ("worldsim", *ROSTER))
+    endpoint = free_endpoint("tls")
+    lines: list[str] = []
+    with HubRouter(hub, endpoint, None, ROSTER, lines.append), ExitStack() as stack:
+        for _ in range(SESSIONS_OF_EACH + SESSIONS_MORE + 10):
+            stack.enter_context(plain_session(endpoint, zenoh_config.client_config(r1)))
+        with participant_session(endpoint, r2, "n", EVENT_LIMIT_S):
+            pass
+
+    assert lines
+    assert all(line.startswith("r1 opens too many sessions") for line in lines)
 
 
 def test_wrong_credentials_are_still_told_at_once(tmp_path: Path) -> None:

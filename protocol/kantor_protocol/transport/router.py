@@ -36,7 +36,9 @@ from kantor_protocol.transport.session import (
     one_line,
     open_session,
 )
+from kantor_protocol.transport.session_limit import SessionLimit
 from kantor_protocol.wire import keys
+from kantor_protocol.wire.messages import NONCE_MAX
 
 _SLOW_S = 0.1
 """A participant whose queue was full for so long does not read."""
@@ -53,7 +55,7 @@ class Router:
     def __init__(self) -> None:
         """No session yet."""
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
-        self._refusal_responder: RefusalResponder | None = None
+        self._guards: list[RefusalResponder | SessionLimit] = []
 
     def __enter__(self) -> Self:
         return self
@@ -70,8 +72,8 @@ class Router:
 
     def close(self) -> None:
         """Leave the bus."""
-        if self._refusal_responder is not None:
-            self._refusal_responder.close()
+        for guard in self._guards:
+            guard.close()
         close_session(self._session, self._declared)
 
 
@@ -89,8 +91,8 @@ class HubRouter(Router):
         """Listen.
 
         listen: an endpoint such as `tcp/127.0.0.1:7447`. users_file: of passwords, for an identity that is one.
-        notify: takes a line about each client that shows a certificate of the fleet's authority and is refused;
-        called from a thread. Raises BusError if the endpoint is not free, CredentialsError if it is not of the
+        notify: takes a line about each client that shows a certificate of the fleet's authority and is refused, or has
+        too many sessions; called from a thread. Raises BusError if the endpoint is not free, CredentialsError if it is not of the
         identity's kind.
         """
         super().__init__()
@@ -114,7 +116,10 @@ class HubRouter(Router):
         self._progress = keys.progress(fleet)
         if isinstance(identity, Certificate):
             wanted = (*roster, *identity.sites, OBSERVER)
-            self._refusal_responder = RefusalResponder(self._session, identity, wanted, notify)
+            self._guards = [
+                RefusalResponder(self._session, identity, wanted, notify),
+                SessionLimit(self._session, notify),
+            ]
         self._declared: list[Any] = [
             self._session.declare_subscriber(keys.tx(fleet), self._on_message),
             self._session.liveliness().declare_subscriber(
@@ -167,7 +172,7 @@ class HubRouter(Router):
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
-        if key is None:
+        if key is None or len(key.nonce) > NONCE_MAX:
             return
         if sample.kind == zenoh.SampleKind.DELETE:
             self._events.put(Left(key.name, key.nonce))
@@ -265,9 +270,10 @@ class SiteRouter(Router):
             self._session = open_session("router", config, connect=connect, listen=listen)
         except zenoh.ZError as error:
             raise BusError(f"cannot connect {listen} to {connect}: {one_line(error)}") from None
-        self._refusal_responder = RefusalResponder(
-            self._session, identity, (*self.members, WORLD_SIM), notify
-        )
+        self._guards = [
+            RefusalResponder(self._session, identity, (*self.members, WORLD_SIM), notify),
+            SessionLimit(self._session, notify),
+        ]
         self._declared: list[Any] = [
             self._session.liveliness().declare_subscriber(
                 keys.alive(fleet), self._on_token, history=True

@@ -25,8 +25,10 @@ ACCEPT_TIMEOUT_MS = 2000
 """A connection that has not proved who it is by then is closed."""
 ACCEPT_PENDING = 500
 """So many connections may be about to prove who they are; more are closed at once, and try again."""
-_SESSIONS_OF_EACH, _SESSIONS_MORE = 4, 64
-"""Sessions at one time: a few of each identity, and observers."""
+SESSIONS_OF_EACH, SESSIONS_MORE = 4, 64
+"""Sessions at one time: a few of each identity, and more for all of them together, such as those of observers."""
+_SESSIONS_CLOSING = 64
+"""Sessions that were too many and are about to be closed."""
 _RECEIVE_BYTES = 32 * 1024
 _FRAME_BYTES = 64 * 1024
 
@@ -94,7 +96,9 @@ def _router(
         "open/return_conditions": {"connect_scouted": False, "declares": False},
         "transport/unicast/accept_timeout": ACCEPT_TIMEOUT_MS,
         "transport/unicast/accept_pending": ACCEPT_PENDING,
-        "transport/unicast/max_sessions": _SESSIONS_OF_EACH * len(grants) + _SESSIONS_MORE,
+        "transport/unicast/max_sessions": SESSIONS_OF_EACH * len(grants)
+        + SESSIONS_MORE
+        + _SESSIONS_CLOSING,
         # A frozen client must not hold the router for long (the unit is microseconds).
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 200_000,
         # A flood reaches the router in small portions, so that messages of others are read between them.
