@@ -4,7 +4,7 @@ from typing import cast
 
 import pytest
 
-from kantor_protocol.transport.events import Event, Joined, Received
+from kantor_protocol.transport.events import Event, Joined, Left, Received
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.wire.messages import VERSION, Mission, Ready, decode_to_participant, encode
 from kantor_worldsim.engine.simulation import Simulation
@@ -12,6 +12,8 @@ from kantor_worldsim.exchange.config import MissionConfig
 from kantor_worldsim.exchange.lobby import RETRY_S, Lobby
 from kantor_worldsim.observers.metrics.density import DensityMetrics
 from kantor_worldsim.observers.progress import ProgressReporter
+from kantor_worldsim.record.process_events import ProcessEventKind
+from kantor_worldsim.record.records import ProcessEvent, Record
 from kantor_worldsim.world.world import WorldSetup
 from support.strategies import mission
 
@@ -45,15 +47,15 @@ class Bus:
         self.sent.append((name, payload))
 
 
-def lobby_on(bus: Bus) -> Lobby:
-    """The lobby of a mission in real time."""
+def lobby_on(bus: Bus, records: list[Record] | None = None) -> Lobby:
+    """The lobby of a mission in real time. records: what goes on record."""
     scenario = mission()
     setup = WorldSetup.of(scenario, 0)
     return Lobby(
         cast("HubRouter", bus),
         MissionConfig(scenario, 0, setup, "wall"),
         "run",
-        Simulation(scenario, 0, setup, []),
+        Simulation(scenario, 0, setup, [] if records is None else [records.append]),
         ProgressReporter(DensityMetrics(), scenario, lambda _progress: None),
         lambda: False,
         lambda _line: None,
@@ -89,3 +91,31 @@ def test_clocks_run_on_while_world_sim_waits(monkeypatch: pytest.MonkeyPatch) ->
     bus.now_s += 2.5
 
     assert lobby.running_ns(4.0) == (5 + 4 * 2.5) * 10**9
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_who_leaves_after_its_answer_is_lost_in_the_next_batch(*, back: bool) -> None:
+    """Its step is on record before it leaves; and it has not left if it is back before it is asked again."""
+    bus, records = Bus(), list[Record]()
+    lobby = lobby_on(bus, records)
+    ready = Received("r1", encode(Ready(VERSION, "one")))
+    bus.events += [Joined("r1", "one"), ready]
+    lobby.next(1.0)
+    lobby.next(1.0)
+    lobby.open(lambda: 7)
+    known = len(records)
+    lobby.begin_batch()
+    lobby.count_answer("r1")
+    bus.events.append(Left("r1", "one"))
+    lobby.next(1.0)
+    assert not lobby.is_expected("r1")
+    assert records[known:] == []
+    if back:
+        bus.events += [Joined("r1", "one"), ready]
+        lobby.next(1.0)
+        lobby.next(1.0)
+
+    lobby.begin_batch()
+    assert lobby.is_expected("r1") == back
+    left = ProcessEvent(7, "r1", ProcessEventKind.LEAVE)
+    assert records[known:] == ([] if back else [left])

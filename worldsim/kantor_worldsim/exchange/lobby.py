@@ -107,6 +107,10 @@ class Lobby:
         """Participants that left without an excuse, or never came."""
         self._doubtful: set[ParticipantId] = set()
         """Participants that may only seem to have left, because world-sim itself was frozen."""
+        self._answered: set[ParticipantId] = set()
+        """Lockstep: participants that have done their step of this batch. Whether one has left shows in the next."""
+        self._gone: dict[ParticipantId, None] = {}
+        """Those of them that have left since, and are not back, in order."""
         self._checked_s = time.monotonic()
         self._certain_s = 0.0
         """Time from which on an absence is certain."""
@@ -215,6 +219,17 @@ class Lobby:
     def roster(self) -> tuple[ParticipantId, ...]:
         """All participants of the mission."""
         return self._config.scenario.roster
+
+    def begin_batch(self) -> None:
+        """Lockstep: who has left since its last step, and is not back, is lost from now on."""
+        gone, self._gone = self._gone, {}
+        self._answered.clear()
+        for name in gone:
+            self._lose(name)
+
+    def count_answer(self, name: ParticipantId) -> None:
+        """Lockstep: a participant has done its step of this batch, wherever it is when that goes on record."""
+        self._answered.add(name)
 
     def is_ready(self, name: ParticipantId) -> bool:
         """Whether a participant's process is on the bus and has its mission."""
@@ -367,7 +382,9 @@ class Lobby:
             return
         if self._clock is None or name in self._excused:
             return
-        if time.monotonic() < self._certain_s:
+        if name in self._answered:
+            self._gone[name] = None
+        elif time.monotonic() < self._certain_s:
             self._doubtful.add(name)
         else:
             self._lose(name)
@@ -440,6 +457,7 @@ class Lobby:
         self._briefed_s.pop(name, None)
         self._arrivals[name] += 1
         self._doubtful.discard(name)
+        self._gone.pop(name, None)
         if self._clock is not None and name in self._away:
             self._come_back(name)
         self._newcomers.append(name)

@@ -45,6 +45,7 @@ class LockstepExchange:
         """Step all participants of a batch. Those that return meanwhile, or are silent, are asked again."""
         lobby = self._lobby
         outputs: dict[ParticipantId, Outputs] = {}
+        lobby.begin_batch()
         for name in inputs:
             if (late := self._late.pop(name, None)) is not None:
                 self._take(name, late, inputs, outputs)
@@ -78,6 +79,7 @@ class LockstepExchange:
         if name in inputs:
             if made.step == inputs[name].observation.step + 1:
                 outputs[name] = made
+                self._lobby.count_answer(name)
                 self._silent.discard(name)
                 self._asked.pop(name, None)
         elif name in self._silent:
