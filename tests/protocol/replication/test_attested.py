@@ -17,8 +17,15 @@ from kantor_protocol.replication import attested
 from kantor_protocol.replication.attested import attested_every
 from kantor_protocol.replication.gossip import Gossip, MessageCheck
 from kantor_protocol.replication.occupancy_log import entries as entries_on
-from kantor_protocol.replication.replica_kernels import BLOCK, ENTRIES_MAX, OFFERED, SHIPPED
-from kantor_protocol.wire.attestations import UNSIGNED, Attestation, hash_of, signed
+from kantor_protocol.replication.replica_kernels import (
+    BLOCK,
+    ENTRIES_MAX,
+    OFFERED,
+    REST_BLOCKS_MAX,
+    SHIPPED,
+)
+from kantor_protocol.wire.attestations import HASH_BYTES, UNSIGNED, Attestation, hash_of, signed
+from kantor_protocol.wire.messages import BODY_BYTES_MAX
 from kantor_protocol.wire.weights import Units
 from support.missions import on_map
 from support.replication.attesting import (
@@ -478,6 +485,36 @@ def test_a_long_log_is_forwarded_part_by_part(length: int) -> None:
 
     assert three.held_log(0) == one.log
     assert all(size % BLOCK == 0 for size in sizes if size < length)
+
+
+def test_a_log_that_is_too_far_behind_comes_from_its_origin_alone() -> None:
+    """A message holds the hashes of so many blocks; what it brings is far below the longest body."""
+    scenario = on_map(*SIGNED, "robots.count=3", "starts.random=true")
+    bound = entries_on(Frame(1.0, (0.0, 0.0), 50, 60))
+    names = (*scenario.robot_ids, "r3")
+    one, two, three, late = (Member(name, scenario, bound) for name in names)
+    most = REST_BLOCKS_MAX * BLOCK + ENTRIES_MAX
+    one.append([(7 * i) % bound for i in range(most)])
+    one.validates = two.validates = False
+    talk([one, two], 3 * most // ENTRIES_MAX)
+    assert two.held_log(0) == one.log
+    for _ in range(5):
+        two.hear(three.speak())
+        word = two.speak()
+        assert three.hear(word) == 0
+        if three.held_log(0):
+            break
+
+    assert len(message_of(word).proofs[0]) == HASH_BYTES * (1 + REST_BLOCKS_MAX)
+    assert len(word.body) < BODY_BYTES_MAX // 2
+    assert len(three.held_log(0)) == ENTRIES_MAX
+
+    one.append(range(BLOCK))
+    talk([one, two], 4 * OFTEN)
+    for _ in range(9):
+        two.hear(late.speak())
+        assert late.hear(two.speak()) == 0
+    assert late.held_log(0) == []
 
 
 # Energy.
