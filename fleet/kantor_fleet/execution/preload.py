@@ -7,12 +7,24 @@ import multiprocessing
 import sys
 from multiprocessing.process import BaseProcess
 
+import numpy as np
+
 import kantor_worldsim.exchange.main  # noqa: F401
 from kantor_fleet.execution.in_process_team import play
 from kantor_fleet.execution.parent_death import die_with_parent
 from kantor_protocol.compilation import kernel_store
+from kantor_protocol.replication.parts import (
+    entries_of,
+    packed_claims,
+    registers_in,
+    speaks_of_others,
+    suffixes_in,
+)
+from kantor_protocol.replication.registers import read_register
+from kantor_protocol.replication.replica import Replica
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import MAP_PLANNERS
+from kantor_protocol.wire.weights import Units
 from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.world.world import WorldSetup
 
@@ -55,6 +67,7 @@ def warm_up() -> None:
     beside = _compile_beside() if kernel_store.is_empty() else None
     for overrides in _VARIANTS:
         _play(_TINY, [*overrides, "targets.diffusion_m=1"])
+    _prove()
     if beside is not None:
         beside.join()
     _play_on_maps()
@@ -80,6 +93,19 @@ def _be_beside() -> None:
 def _play_on_maps() -> None:
     for planner in sorted(MAP_PLANNERS):
         _play(_TINY_MAP, [f"planner='{planner}'"])
+
+
+def _prove() -> None:
+    """What signed missions need besides: with two robots none has anything to forward."""
+    replica = Replica(0, 2, 8, Units.of(8, 8), ledger=True, claims=True, proving=True)
+    replica.compose()
+    replica.claims_to_prove(np.zeros(2, dtype=np.int64), np.zeros((2, 2), dtype=np.int64))
+    logs, claims, registers = bytes([1, 0, 1, 1, 2, 1]), packed_claims([(1, 1, 1, 0)]), b"\0\0"
+    speaks_of_others(logs, claims, registers, 2, True, 0)
+    for suffix in suffixes_in(logs, valued=True) or ():
+        entries_of(logs, suffix, 8, 8)
+    registers_in(registers, 2)
+    read_register(registers, 2, 1, 0)
 
 
 def _play(text: str, overrides: list[str]) -> None:
