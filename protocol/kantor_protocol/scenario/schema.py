@@ -298,7 +298,8 @@ class Scenario(ScenarioTable, frozen=True, kw_only=True):
     publish: PublishOptions = PublishOptions()
     metrics: MetricsOptions = MetricsOptions()
     faults: Annotated[tuple[AnyFault, ...], Meta(max_length=FAULTS_MAX)] = ()
-    """Faults to inject, and when; see `faults`. Missions on the bus do not contain them."""
+    """Faults to inject, and when; see `faults`. A mission on the bus contains only the lies of the robot that it is
+    for."""
 
     @property
     def robot_ids(self) -> tuple[ParticipantId, ...]:
