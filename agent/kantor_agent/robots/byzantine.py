@@ -104,7 +104,7 @@ class ByzantineRobot:
         self._jump_m = _JUMP_STEPS * scenario.vehicle.speed_m_s * scenario.clock.period_s
         nothing = np.zeros((0, 2), dtype=np.int64)
         self._stated: tuple[Log, Log] = (nothing, nothing)
-        """Its log as it states it, and as it states it to those that it deceives by a fork."""
+        """Its log as it states it, and as it states it to those that it deceives by a fork; nothing: as it is."""
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """One step of the honest machine, and the lies about it."""
@@ -188,9 +188,10 @@ class ByzantineRobot:
     def _state_log(self, told: frozenset[Lie]) -> None:
         """Add to the stated logs what the honest machine has written, as the lies of this step have it."""
         known, me = self._stated[0].shape[0], self._replica.config.me
-        if not (self._scenario.mapping or self._replica.config.ledger):
+        length = int(self._replica.store.length[me])
+        if length == known or not (self._tells("overstate") or self._tells("fork")):
             return
-        entries = self._replica.store.logs[me, known : self._replica.store.length[me]]
+        entries = self._replica.store.logs[me, known:length]
         stated = entries.astype(np.int64)
         if self._tells("overstate"):
             stated = self._overstated(stated, known, now="overstate" in told)
