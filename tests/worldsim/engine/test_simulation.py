@@ -18,11 +18,13 @@ from kantor_protocol.base.machine import (
 )
 from kantor_protocol.wire.messages import BODY_BYTES_MAX
 from kantor_worldsim.engine.simulation import Simulation, Step
+from kantor_worldsim.record.process_events import ProcessEventKind
 from kantor_worldsim.record.records import (
     Batch,
     Ending,
     EnvelopeIndex,
     Opening,
+    ProcessEvent,
     Record,
     StepRecord,
     encode_record,
@@ -112,6 +114,28 @@ def test_an_inbox_is_handed_out_once() -> None:
 
     assert [envelope.sequence for envelope in first.inbox] == [10, 11]
     assert scripted.simulation.inputs("r2", 2 * PERIOD_NS).inbox == ()
+
+
+def test_what_arrives_while_a_process_is_away_is_lost() -> None:
+    """Without a fault as with one: from when it left until it is back, and nothing else."""
+    scripted = ScriptedMission("radio.range_m=100")
+    leave, join = (
+        ProcessEvent(at_ns, "r2", kind)
+        for at_ns, kind in (
+            (PERIOD_NS + 1, ProcessEventKind.LEAVE),
+            (2 * PERIOD_NS + 1, ProcessEventKind.JOIN),
+        )
+    )
+    scripted.play(r1=outputs(1, (0.0, 0.0), "r2"))
+    scripted.simulation.note(leave)
+    scripted.play(r1=outputs(2, (0.0, 0.0), "r2", "r3"))
+    scripted.simulation.note(join)
+    scripted.play(r1=outputs(3, (0.0, 0.0), "r2"))
+    simulation = scripted.simulation
+    received = {name: simulation.inputs(name, 4 * PERIOD_NS).inbox for name in ("r2", "r3")}
+
+    assert [envelope.sequence for envelope in received["r2"]] == [10, 30]
+    assert [envelope.sequence for envelope in received["r3"]] == [21]
 
 
 def test_a_step_record_has_the_inputs_of_the_step() -> None:

@@ -102,6 +102,8 @@ class Simulation:
         """Requests without outputs so far, none of them with outputs; their participants are asked again."""
         self._died_ns: dict[ParticipantId, int] = {}
         """Time of each process's last kill, not after now_ns."""
+        self._left_ns: dict[ParticipantId, int] = {}
+        """Time at which each process that no fault stopped left the bus, and is not back; not after now_ns."""
         self._kept: list[Record] | None = [] if _may_be_killed(scenario) else None
         """All records so far, the opening first, where the scenario kills world-sim."""
         self._gone: frozenset[ParticipantId] = frozenset()
@@ -247,6 +249,8 @@ class Simulation:
         self.now_ns, self.done_ns = max(self.now_ns, event.now_ns), event.now_ns
         if event.kind == ProcessEventKind.KILL:
             self._died_ns[event.who] = event.now_ns
+        elif event.kind == ProcessEventKind.LEAVE:
+            self._left_ns.setdefault(event.who, event.now_ns)
         fault = self.scenario.faults[event.fault] if event.fault >= 0 else None
         self.faults_done += fault is not None
         if isinstance(fault, Kill) and fault.until_ns is None:
@@ -257,8 +261,10 @@ class Simulation:
 
     def _take_over(self, event: ProcessEvent, fault: AnyFault | None) -> None:
         """A process takes over a body; messages that arrived while there was none are lost."""
+        since_ns = self._left_ns.pop(event.who, None)
         if isinstance(fault, OnProcesses):
             since_ns = self._died_ns.get(event.who, fault.from_ns)
+        if since_ns is not None:
             self.channel.lose(event.who, since_ns, event.now_ns)
         if self._world.begin(event.who, event.incarnation):
             self._resting.discard(event.who)
@@ -279,7 +285,8 @@ class Simulation:
         assert set(self._unanswered) <= roster
         assert all(step.outputs is None for step in self._unanswered.values())
         assert all(0 <= died_ns <= self.now_ns for died_ns in self._died_ns.values())
-        assert set(self._died_ns) <= processes
+        assert all(0 <= left_ns <= self.now_ns for left_ns in self._left_ns.values())
+        assert set(self._died_ns) | set(self._left_ns) <= processes
         assert self._kept is None or isinstance(self._kept[0], Opening)
         self.channel.validate()
         self._world.validate()
