@@ -24,7 +24,7 @@ from kantor_protocol.replication.attested import Attested
 from kantor_protocol.replication.parts import Part, entries_of
 from kantor_protocol.replication.proofs import ProvenSuffix, Rules
 from kantor_protocol.replication.replica import Replica
-from kantor_protocol.replication.replica_kernels import UNITS_MAX
+from kantor_protocol.replication.replica_kernels import OFFERED, UNITS_MAX
 from kantor_protocol.scenario.faults.liars import Lie, liars_of
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.transport.rate_limit import TokenBucket
@@ -128,7 +128,8 @@ def more_is_passed_on_than_attested(patch: Patch) -> None:
     def make(compose: Any) -> Any:
         def composed(self: Replica, target: int = -1) -> tuple[bytes, bytes, bytes]:
             if self.config.proving:
-                self.offered[:] = np.where(self.offered > 0, self.store.length, self.offered)
+                offered = self.store.sending[OFFERED]
+                offered[:] = np.where(offered > 0, self.store.length, offered)
             parts: tuple[bytes, bytes, bytes] = compose(self, target)
             return parts
 
