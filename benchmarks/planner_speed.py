@@ -31,7 +31,8 @@ from kantor_worldsim.world.density import samples_of, starts_of
 
 SIZES = (2_000, 20_000, 200_000, 1_000_000)
 SIZES_QUICK = (2_000, 200_000)
-TARGETS_US = {2_000: 5.0, 20_000: 8.0, 200_000: 8.0, 1_000_000: 8.0}
+TARGETS = {2_000: 30.0, 20_000: 250.0, 200_000: 2_500.0, 1_000_000: 14_000.0}
+"""By N: so many times as fast as the literal algorithm."""
 FLAT_MAX = 2.0
 """The most expensive cell of the table may cost so many times the cheapest."""
 PHASES = (0.0, 0.5, 0.9)
@@ -131,19 +132,19 @@ def measure(*, quick: bool) -> Table:
         medians = _phases(scenario, samples_m)
         with_claims = _phases(_scenario(count, claims=True), samples_m, PHASES[:1])[0]
         beside = _beside(scenario, samples_m)
-        target = TARGETS_US[count]
+        target, ratio = TARGETS[count], beside.us / medians[0]
         costs += medians
-        reached = max(medians) <= target
+        reached = ratio >= target
         met = met and reached and beside.same == beside.steps
         rows.append(
             (
                 f"{count:,}",
                 *(f"{cost:.2f}" for cost in medians),
                 f"{with_claims:.2f}",
-                f"{target:g}",
-                verdict(met=reached),
                 f"{beside.us:,.0f}",
-                f"{beside.us / medians[0]:,.0f}",
+                f"{ratio:,.0f}",
+                f"{target:,.0f}",
+                verdict(met=reached),
                 f"{beside.same}/{beside.steps}",
             )
         )
@@ -156,10 +157,10 @@ def measure(*, quick: bool) -> Table:
             "half used up",
             "90 % used up",
             "fresh, claims",
-            "target",
-            "verdict",
             "literal numpy",
             "ratio",
+            "target",
+            "",
             "same goals",
         ),
         rows,

@@ -13,7 +13,8 @@ hub       robots times rate that one world-sim relays in realtime
 wire      bytes that a robot publishes in a tick, beside its whole weight vector
 signing   bytes and CPU time that signed attestations take, beside the same missions without
 
-Exits with 1 if a target is missed. Nothing is written unless --save names a file.
+A target is a ratio within the run, and stands beside its figure; one that is missed is marked MISS, and its section is
+named in the end. Nothing is written unless --save names a file.
 """
 
 import argparse
@@ -44,7 +45,7 @@ LIBRARIES = ("kantor", "eclipse-zenoh", "numpy", "numba", "msgspec")
 
 
 def main() -> int:
-    """Measure, print, save; 1 if a target is missed."""
+    """Measure, print, save."""
     parser = argparse.ArgumentParser(description="How fast kantor is.")
     parser.add_argument("--quick", action="store_true", help="fewer sizes and shorter runs")
     parser.add_argument("--only", choices=SECTIONS, help="one section")
@@ -61,7 +62,9 @@ def main() -> int:
         tree = {"machine": machine, "quick": options.quick}
         tree |= {name: table._asdict() for name, table in tables.items()}
         options.save.write_text(json.dumps(tree, indent=2) + "\n", encoding="utf-8")
-    return 0 if all(table.met for table in tables.values()) else 1
+    missed = [name for name, table in tables.items() if not table.met]
+    print(f"\ntargets missed: {', '.join(missed) or 'none'}")
+    return 0
 
 
 def _machine() -> dict[str, Any]:
