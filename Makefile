@@ -21,7 +21,7 @@ help:
 	@echo "make mutants    planted bugs, and which checker catches each: docs/mutants.md"
 	@echo "make fuzz       a million inputs for every decoder"
 
-demo: $(VENV)/.installed $(VENV)/.kernels
+demo: $(VENV)/.installed
 	$(KANTOR) run fleet --exchange realtime --speed 4
 
 # Three workers for two cores: tests of processes wait for one another.

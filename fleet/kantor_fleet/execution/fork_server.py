@@ -84,12 +84,16 @@ def be_tied(target: Callable[..., Any], *arguments: Any) -> None:
         target(*arguments)
 
 
-def await_fork_server() -> None:
+def await_fork_server(kind: str | None = None) -> None:
     """Return when the fork server is warm: the first time, kernels are compiled for about half a minute.
+
+    kind: of the only missions that its processes have, see `preload.py`; None: they have all kinds.
 
     Ctrl-C in a terminal reaches the fork server too and ends it, so that this returns at once; a caller
     looks for signals afterwards. A fork server that failed otherwise shows it at the next start of a process.
     """
+    if kind is not None:
+        os.environ["KANTOR_PRELOADED"] = kind
     process = fork_server().Process()
     with contextlib.suppress(EOFError, OSError):  # the fork server has ended
         process.start()

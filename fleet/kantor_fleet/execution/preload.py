@@ -1,11 +1,14 @@
 """Imports and compiled kernels that every process of a local fleet shares through the fork server.
 
+Missions of one kind need the kernels of that kind only: the first mission of the other kind compiles its own.
+
 It opens nothing: Zenoh must not be open in a process that forks.
 """
 
 import multiprocessing
 import sys
-from multiprocessing.process import BaseProcess
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -23,10 +26,15 @@ from kantor_protocol.replication.parts import (
 from kantor_protocol.replication.registers import read_register
 from kantor_protocol.replication.replica import Replica
 from kantor_protocol.scenario.load import parse
-from kantor_protocol.scenario.schema import MAP_PLANNERS
+from kantor_protocol.scenario.schema import MAP_PLANNERS, Scenario
 from kantor_protocol.wire.weights import Units
 from kantor_worldsim.observers.recording import Recording
+from kantor_worldsim.record.records import Opening, Record, decode_record, encode_record
 from kantor_worldsim.world.world import WorldSetup
+
+Kind = Literal["density", "map"]
+"""What missions explore."""
+KINDS: tuple[Kind, ...] = ("density", "map")
 
 _TINY = """
 name = "warm-up"
@@ -59,40 +67,87 @@ _VARIANTS = (
 )
 
 
-def warm_up() -> None:
-    """Compile every kernel, or load it from the folder of kernels, by tiny missions.
+def kind_of(scenario: Scenario) -> Kind:
+    """What a mission explores."""
+    return "map" if scenario.mapping else "density"
 
-    The first time, another process compiles those for maps meanwhile; what both need, one of them compiles.
+
+def warm_up(kinds: Collection[Kind] = KINDS) -> None:
+    """Compile every kernel of missions of these kinds, or load it from the folder of kernels, by tiny missions.
+
+    The first time, another process compiles those of checkers and metrics meanwhile, by the records that come.
     """
-    beside = _compile_beside() if kernel_store.is_empty() else None
-    for overrides in _VARIANTS:
-        _play(_TINY, [*overrides, "targets.diffusion_m=1"])
-    _prove()
+    beside = None if all(map(kernel_store.is_complete, kinds)) else _Beside()
+    missions: list[list[Record]] = []
+    for text, overrides in _missions(kinds):
+        records: list[Record] = []
+        missions.append(records)
+        _play(text, overrides, records.append if beside is None else beside.follow(records))
+    if "density" in kinds:
+        _prove()
     if beside is not None:
         beside.join()
-    _play_on_maps()
+    for records in missions:
+        _observe(records)
+    for kind in kinds:
+        kernel_store.note_complete(kind)
     kernel_store.prune()
 
 
-def _compile_beside() -> BaseProcess:
-    print(
-        "compiling kernels: once on this machine, for less than a minute",
-        file=sys.stderr,
-        flush=True,
-    )
-    process = multiprocessing.get_context("fork").Process(target=_be_beside, daemon=True)
-    process.start()
-    return process
+def _missions(kinds: Collection[Kind]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Texts and overrides."""
+    if "density" in kinds:
+        yield from ((_TINY, (*overrides, "targets.diffusion_m=1")) for overrides in _VARIANTS)
+    if "map" in kinds:
+        yield from ((_TINY_MAP, (f"planner='{planner}'",)) for planner in sorted(MAP_PLANNERS))
 
 
-def _be_beside() -> None:
-    die_with_parent()
-    _play_on_maps()
+def _play(text: str, overrides: Sequence[str], observe: Callable[[Record], None]) -> None:
+    scenario = parse(text, "warm-up", list(overrides))
+    play(scenario, 0, WorldSetup.of(scenario, 0), [observe])
 
 
-def _play_on_maps() -> None:
-    for planner in sorted(MAP_PLANNERS):
-        _play(_TINY_MAP, [f"planner='{planner}'"])
+def _observe(records: Iterable[Record]) -> None:
+    """Have the observers of a run follow records, which begin with an opening."""
+    recording: Recording | None = None
+    for record in records:
+        if isinstance(record, Opening):
+            recording = Recording(record.scenario, record.seed, "in-process")
+        if recording is not None:
+            recording.observe(record)
+
+
+class _Beside:
+    """Another process, in which observers compile what they need while missions are played in this one."""
+
+    def __init__(self) -> None:
+        print(
+            "compiling kernels: once on this machine, for less than a minute",
+            file=sys.stderr,
+            flush=True,
+        )
+        context = multiprocessing.get_context("fork")
+        self._records = context.Queue()
+        self._process = context.Process(target=self._be_beside, daemon=True)
+        self._process.start()
+
+    def follow(self, records: list[Record]) -> Callable[[Record], None]:
+        """An observer that keeps records and has them observed there."""
+
+        def observe(record: Record) -> None:
+            records.append(record)
+            self._records.put(encode_record(record))
+
+        return observe
+
+    def join(self) -> None:
+        """Wait until all is observed."""
+        self._records.put(None)
+        self._process.join()
+
+    def _be_beside(self) -> None:
+        die_with_parent()
+        _observe(map(decode_record, iter(self._records.get, None)))
 
 
 def _prove() -> None:
@@ -106,9 +161,3 @@ def _prove() -> None:
         entries_of(logs, suffix, 8, 8)
     registers_in(registers, 2)
     read_register(registers, 2, 1, 0)
-
-
-def _play(text: str, overrides: list[str]) -> None:
-    scenario = parse(text, "warm-up", overrides)
-    recording = Recording(scenario, 0, "in-process")
-    play(scenario, 0, WorldSetup.of(scenario, 0), [recording.observe])

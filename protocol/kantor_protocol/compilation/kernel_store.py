@@ -29,7 +29,7 @@ from numba.core.serialize import dumps
 
 _KEPT_S = 30 * 86_400.0
 _TOUCHED_S = 86_400.0
-_SUFFIX = ".kernel"
+_SUFFIX, _COMPLETE = ".kernel", ".complete"
 
 
 def kernel_folder() -> Path:
@@ -40,12 +40,18 @@ def kernel_folder() -> Path:
     return folder / _compiler()
 
 
-def is_empty() -> bool:
-    """Whether no kernel is there: the first run on this machine."""
+def is_complete(set_of_kernels: str) -> bool:
+    """Whether a set of kernels has been compiled on this machine; an edited one of them may be missing again."""
     try:
-        return not any(kernel_folder().glob(f"*{_SUFFIX}"))
+        return (kernel_folder() / f"{set_of_kernels}{_COMPLETE}").exists()
     except OSError:
-        return True
+        return False
+
+
+def note_complete(set_of_kernels: str) -> None:
+    """Note that a set of kernels has been compiled."""
+    with suppress(OSError):
+        (kernel_folder() / f"{set_of_kernels}{_COMPLETE}").touch()
 
 
 def prune() -> None:
