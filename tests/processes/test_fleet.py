@@ -168,7 +168,7 @@ def test_a_robot_may_come_late(kantor: "Kantor") -> None:
     )  # fmt: skip
     await_line(world, "t=")
     robots = [kantor.start("agent", f"r{i}", "--connect", endpoint) for i in range(1, 5)]
-    while "energy 0/" in await_line(world, "t=", "energy"):
+    while float(await_line(world, "t=", "energy").split()[1]) < 2.0:  # seconds of the mission
         pass
     robots.append(kantor.start("agent", "r5", "--connect", endpoint))
     (folder,) = kantor.runs()

@@ -8,7 +8,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, ForkServerProcess
@@ -84,16 +84,16 @@ def be_tied(target: Callable[..., Any], *arguments: Any) -> None:
         target(*arguments)
 
 
-def await_fork_server(kind: str | None = None) -> None:
+def await_fork_server(kinds: Sequence[str] = ()) -> None:
     """Return when the fork server is warm: the first time, kernels are compiled for about half a minute.
 
-    kind: of the only missions that its processes have, see `preload.py`; None: they have all kinds.
+    kinds: of the only missions that its processes have, see `preload.py`; none: they have all kinds.
 
     Ctrl-C in a terminal reaches the fork server too and ends it, so that this returns at once; a caller
     looks for signals afterwards. A fork server that failed otherwise shows it at the next start of a process.
     """
-    if kind is not None:
-        os.environ["KANTOR_PRELOADED"] = kind
+    if kinds:
+        os.environ["KANTOR_PRELOADED"] = ",".join(kinds)
     process = fork_server().Process()
     with contextlib.suppress(EOFError, OSError):  # the fork server has ended
         process.start()

@@ -32,9 +32,9 @@ from kantor_worldsim.observers.recording import Recording
 from kantor_worldsim.record.records import Opening, Record, decode_record, encode_record
 from kantor_worldsim.world.world import WorldSetup
 
-Kind = Literal["density", "map"]
-"""What missions explore."""
-KINDS: tuple[Kind, ...] = ("density", "map")
+Kind = Literal["density", "map", "faults"]
+"""What missions explore, and whether anything fails in them."""
+KINDS: tuple[Kind, ...] = ("density", "map", "faults")
 
 _TINY = """
 name = "warm-up"
@@ -65,11 +65,17 @@ _VARIANTS = (
     ("merge='min'", "samples.diffusion_m=1"),
     ("planner='spectral'", "samples.diffusion_m=1"),
 )
+_FAULTS = (
+    "{ kind = 'burst', good_s = 0.2, bad_s = 0.1 }, { kind = 'delay', jitter_s = 0.1 }, "
+    "{ kind = 'duplicate', probability = 0.5, delay_s = 0.1 }, "
+    "{ kind = 'kill', who = ['r1'], from_s = 0.15, until_s = 0.35, disk = 'lost' }"
+)
 
 
-def kind_of(scenario: Scenario) -> Kind:
-    """What a mission explores."""
-    return "map" if scenario.mapping else "density"
+def kinds_of(scenario: Scenario) -> tuple[Kind, ...]:
+    """The kinds of a mission."""
+    explores: Kind = "map" if scenario.mapping else "density"
+    return (explores, "faults") if scenario.faults else (explores,)
 
 
 def warm_up(kinds: Collection[Kind] = KINDS) -> None:
@@ -98,6 +104,8 @@ def _missions(kinds: Collection[Kind]) -> Iterator[tuple[str, tuple[str, ...]]]:
     """Texts and overrides."""
     if "density" in kinds:
         yield from ((_TINY, (*overrides, "targets.diffusion_m=1")) for overrides in _VARIANTS)
+    if "faults" in kinds:
+        yield _TINY, (f"faults=[{_FAULTS}]",)
     if "map" in kinds:
         yield from ((_TINY_MAP, (f"planner='{planner}'",)) for planner in sorted(MAP_PLANNERS))
 

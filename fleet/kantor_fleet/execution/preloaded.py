@@ -1,6 +1,6 @@
 """Imported by the fork server only: warms it up, so that its children start warm.
 
-For missions of all kinds, or of the one that the environment names: a module that is preloaded takes no arguments.
+For missions of all kinds, or of those that the environment names: a module that is preloaded takes no arguments.
 """
 
 import os
@@ -11,6 +11,6 @@ _handler = signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 from kantor_fleet.execution.preload import KINDS, warm_up  # noqa: E402  importing takes a while, too
 
-_only = os.environ.get("KANTOR_PRELOADED")
-warm_up([kind for kind in KINDS if _only in {None, kind}])
+_only = os.environ.get("KANTOR_PRELOADED", ",".join(KINDS)).split(",")
+warm_up([kind for kind in KINDS if kind in _only])
 signal.signal(signal.SIGINT, _handler)

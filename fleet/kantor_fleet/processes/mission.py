@@ -11,7 +11,7 @@ from typing import NamedTuple
 from kantor_fleet.execution.fork_server import await_fork_server
 from kantor_fleet.execution.in_process_team import play
 from kantor_fleet.execution.leftovers import Leftovers
-from kantor_fleet.execution.preload import kind_of, warm_up
+from kantor_fleet.execution.preload import kinds_of, warm_up
 from kantor_fleet.exits import Exit, warn
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.processes.local import Fleet, FleetConfig, local_fleet, watch_progress
@@ -76,10 +76,10 @@ def _run_folder(
 
 def _run_in_process(terms: _Terms, setup: WorldSetup, interrupts: Interrupts) -> Exit:
     scenario, seed = terms.scenario, terms.seed
-    kind = kind_of(scenario)
-    if not is_complete(kind):  # else each kernel is loaded when it is called
+    kinds = kinds_of(scenario)
+    if not all(map(is_complete, kinds)):  # else each kernel is loaded when it is called
         with interrupts.at_once():
-            warm_up((kind,))
+            warm_up(kinds)
     with _run_folder(terms, interrupts) as (folder, _):
         with ProgressView(scenario.name) as view:
             recording = Recording(scenario, seed, terms.exchange, folder, terms.exact_every)
@@ -104,7 +104,7 @@ def _run_processes(terms: _Terms, interrupts: Interrupts) -> Exit:
         view = stack.enter_context(ProgressView(terms.scenario.name))
         view.note("starting the fleet (the first time, kernels are compiled: about half a minute)")
         with interrupts.at_once():
-            await_fork_server(kind_of(terms.scenario))
+            await_fork_server(kinds_of(terms.scenario))
         folder, lock = stack.enter_context(_run_folder(terms, interrupts, leftovers.add_run))
         scenario, seed, exchange, speed, _, exact_every = terms
         config = FleetConfig(scenario, seed, exchange, speed, folder, exact_every)

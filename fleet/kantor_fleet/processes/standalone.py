@@ -180,7 +180,7 @@ def _host(
     past: "Past | None" = None,
 ) -> Exit:
     """Host a mission. record: opens the run folder of the mission once the bus is up."""
-    from kantor_fleet.execution.preload import kind_of, warm_up  # noqa: PLC0415  standalone robots do not need these
+    from kantor_fleet.execution.preload import kinds_of, warm_up  # noqa: PLC0415  standalone robots do not need these
     from kantor_fleet.report.progress import ProgressView  # noqa: PLC0415
     from kantor_fleet.report.summary import conclude, exit_code_of, read_result  # noqa: PLC0415
     from kantor_worldsim.exchange.main import run  # noqa: PLC0415
@@ -197,7 +197,7 @@ def _host(
         ProgressView(scenario.name) as view,
     ):
         with interrupts.at_once():
-            warm_up((kind_of(scenario),))
+            warm_up(kinds_of(scenario))
         users = credentials.users_file(secrets)
         with HubRouter(identity, listen, users, scenario.roster, view.note) as host:
             folder, recording = record(scenario)
