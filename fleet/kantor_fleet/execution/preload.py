@@ -28,8 +28,9 @@ from kantor_protocol.replication.replica import Replica
 from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import MAP_PLANNERS, Scenario
 from kantor_protocol.wire.weights import Units
+from kantor_worldsim.exchange.admission import Admission
 from kantor_worldsim.observers.recording import Recording
-from kantor_worldsim.record.records import Opening, Record, decode_record, encode_record
+from kantor_worldsim.record.records import Batch, Opening, Record, decode_record, encode_record
 from kantor_worldsim.world.world import WorldSetup
 
 Kind = Literal["density", "map", "faults"]
@@ -116,13 +117,19 @@ def _play(text: str, overrides: Sequence[str], observe: Callable[[Record], None]
 
 
 def _observe(records: Iterable[Record]) -> None:
-    """Have the observers of a run follow records, which begin with an opening."""
-    recording: Recording | None = None
+    """Have the observers of a run, and its admission, follow records, which begin with an opening."""
+    follows: list[Callable[[Record], object]] = []
     for record in records:
         if isinstance(record, Opening):
             recording = Recording(record.scenario, record.seed, "in-process")
-        if recording is not None:
-            recording.observe(record)
+            admission = Admission(record.scenario, record.setup)
+            follows = [recording.observe, admission.observe]
+        elif isinstance(record, Batch):
+            for step in record.step_records:
+                if step.outputs is not None:
+                    admission.refusal_reason(step.name, step.outputs)
+        for follow in follows:
+            follow(record)
 
 
 class _Beside:
