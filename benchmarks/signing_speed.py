@@ -20,7 +20,8 @@ from kantor_fleet.execution.preload import warm_up
 from kantor_fleet.scenarios.catalog import find
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire import signatures
-from kantor_protocol.wire.signatures import CertificateKey, Ed25519Key, SigningKey
+from kantor_protocol.wire.signatures import SigningKey
+from kantor_protocol.wire.signing_keys import CertificateKey, Ed25519Key
 from kantor_worldsim.engine.event_loop import simulate
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.in_process import InProcessExchange

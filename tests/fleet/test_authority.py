@@ -17,7 +17,7 @@ from kantor_fleet.security import authority as issuing
 from kantor_fleet.security.authority import Authority, Wanted, issue, listing
 from kantor_protocol.transport import credentials
 from kantor_protocol.transport.credentials import Certificate, CredentialsError
-from kantor_protocol.wire.signatures import public_key_of
+from kantor_protocol.wire.signing_keys import public_key_of
 from support.strategies import examples
 
 if TYPE_CHECKING:

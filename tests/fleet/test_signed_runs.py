@@ -23,7 +23,7 @@ from kantor_protocol.scenario.load import parse
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import Attestation, Identities, without_signatures
 from kantor_protocol.wire.messages import decode_gossip, encode_gossip
-from kantor_protocol.wire.signatures import Ed25519Key
+from kantor_protocol.wire.signing_keys import Ed25519Key
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.observers.metrics.result import Result
 from kantor_worldsim.observers.recording import Recording

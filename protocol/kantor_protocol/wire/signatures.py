@@ -8,36 +8,14 @@ of a process: no state machine knows a private key.
 from functools import lru_cache
 from typing import Protocol
 
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ec import (
-    ECDSA,
-    SECP256R1,
-    EllipticCurvePrivateKey,
-    EllipticCurvePublicKey,
-)
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
-from cryptography.hazmat.primitives.asymmetric.utils import (
-    decode_dss_signature,
-    encode_dss_signature,
-)
-from cryptography.hazmat.primitives.hashes import SHA256
-from cryptography.hazmat.primitives.serialization import (
-    Encoding,
-    PublicFormat,
-    load_pem_private_key,
-)
-
 SIGNATURE_BYTES = 64
 KEY_BYTES_MAX = 34
-_ED25519, _P256 = b"\x01", b"\x02"
-_HASH = ECDSA(SHA256(), deterministic_signing=True)
-_NUMBER_BYTES = 32
 _CHECKED_MAX = 1 << 14
 """Answers that are remembered: the same word comes again and again, and in one process to many participants."""
 
 
 class SigningKey(Protocol):
-    """A private key."""
+    """A private key; see `signing_keys.py`."""
 
     @property
     def public(self) -> bytes:
@@ -49,65 +27,9 @@ class SigningKey(Protocol):
         ...
 
 
-class Ed25519Key:
-    """A key that is made from a secret."""
-
-    def __init__(self, secret: bytes) -> None:
-        """secret: 32 bytes."""
-        self._key = Ed25519PrivateKey.from_private_bytes(secret)
-        self.public = _ED25519 + self._key.public_key().public_bytes_raw()
-
-    def sign(self, statement: bytes, /) -> bytes:
-        """The signature of a statement."""
-        return self._key.sign(statement)
-
-
-class CertificateKey:
-    """The key of a certificate."""
-
-    def __init__(self, pem: bytes) -> None:
-        """pem: the private key, on P-256. Raises ValueError."""
-        key = load_pem_private_key(pem, None)
-        on_p256 = isinstance(key, EllipticCurvePrivateKey) and isinstance(key.curve, SECP256R1)
-        if not on_p256:
-            raise ValueError("a key that is not on P-256")
-        assert isinstance(key, EllipticCurvePrivateKey)
-        self._key = key
-        self.public = public_key_of(key.public_key())
-
-    def sign(self, statement: bytes, /) -> bytes:
-        """The signature of a statement."""
-        r, s = decode_dss_signature(self._key.sign(statement, _HASH))
-        return r.to_bytes(_NUMBER_BYTES, "big") + s.to_bytes(_NUMBER_BYTES, "big")
-
-
-def public_key_of(key: EllipticCurvePublicKey) -> bytes:
-    """The public key of a certificate."""
-    return _P256 + key.public_bytes(Encoding.X962, PublicFormat.CompressedPoint)
-
-
 @lru_cache(maxsize=_CHECKED_MAX)
 def is_signed(public: bytes, statement: bytes, signature: bytes) -> bool:
     """Whether the owner of a public key has signed a statement; False for a key or a signature that is none."""
-    if len(signature) != SIGNATURE_BYTES:
-        return False
-    try:
-        key = _opened(public)
-        if isinstance(key, Ed25519PublicKey):
-            key.verify(signature, statement)
-        else:
-            r, s = (int.from_bytes(half, "big") for half in (signature[:32], signature[32:]))
-            key.verify(encode_dss_signature(r, s), statement, _HASH)
-    except (ValueError, InvalidSignature):
-        return False
-    return True
+    from kantor_protocol.wire.signing_keys import verifies  # noqa: PLC0415  open runs need no OpenSSL
 
-
-@lru_cache(maxsize=4096)
-def _opened(public: bytes) -> Ed25519PublicKey | EllipticCurvePublicKey:
-    """Raises ValueError."""
-    if public[:1] == _ED25519:
-        return Ed25519PublicKey.from_public_bytes(public[1:])
-    if public[:1] == _P256:
-        return EllipticCurvePublicKey.from_encoded_point(SECP256R1(), public[1:])
-    raise ValueError("a public key of an unknown kind")
+    return len(signature) == SIGNATURE_BYTES and verifies(public, statement, signature)

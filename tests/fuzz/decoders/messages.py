@@ -16,7 +16,8 @@ from kantor_protocol.wire.messages import (
     encode,
     encode_gossip,
 )
-from kantor_protocol.wire.signatures import SIGNATURE_BYTES, Ed25519Key
+from kantor_protocol.wire.signatures import SIGNATURE_BYTES
+from kantor_protocol.wire.signing_keys import Ed25519Key
 from kantor_protocol.wire.weights import WeightsSubscriber
 
 _KEY = Ed25519Key(bytes(32))

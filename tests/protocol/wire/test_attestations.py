@@ -19,7 +19,7 @@ from kantor_protocol.wire.attestations import (
     without_signatures,
 )
 from kantor_protocol.wire.messages import GossipMessage, decode_gossip, encode_gossip
-from kantor_protocol.wire.signatures import Ed25519Key
+from kantor_protocol.wire.signing_keys import Ed25519Key
 from support.strategies import ATTESTATIONS, NEWS, examples
 
 KEY, OTHER = Ed25519Key(bytes(32)), Ed25519Key(bytes(31) + b"\x01")

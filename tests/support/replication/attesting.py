@@ -20,7 +20,7 @@ from kantor_protocol.replication.replica_kernels import SAMPLE, SINCE_NS, STAMP,
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import UNSIGNED, Identities, signed
 from kantor_protocol.wire.messages import GossipMessage, decode_gossip, encode_gossip
-from kantor_protocol.wire.signatures import Ed25519Key
+from kantor_protocol.wire.signing_keys import Ed25519Key
 from kantor_protocol.wire.weights import Units
 
 RUN = "a run"
