@@ -11,18 +11,17 @@ import msgspec
 from kantor_fleet.execution.experiment import reason
 from kantor_fleet.execution.in_process_team import participant, play
 from kantor_fleet.exits import Exit, fail
-from kantor_protocol.base.machine import WORLD_SIM, Envelope, Outputs, ParticipantId, StateMachine
+from kantor_protocol.base.machine import WORLD_SIM, Outputs, ParticipantId, StateMachine
 from kantor_protocol.files.reading import UnreadableError, read_text
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.faults.liars import liars_of
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.wire.attestations import (
-    Attestation,
     Identities,
     is_genuine,
     unsigned_outputs,
 )
-from kantor_protocol.wire.messages import RefusedError, decode_gossip
+from kantor_protocol.wire.messages import RefusedError, attestations_of
 from kantor_worldsim.engine.process_faults import ProcessFaults
 from kantor_worldsim.observers.checkers.checker import check
 from kantor_worldsim.record import behaviour
@@ -188,7 +187,7 @@ def _finding_on_signatures(_manifest: Manifest, records: list[tuple[bytes, Recor
     for _, record in records:
         for step_record in record.step_records if isinstance(record, Batch) else ():
             for envelope in step_record.outputs.outbox if step_record.outputs else ():
-                for attestation in _attestations_in(envelope):
+                for attestation in attestations_of(envelope):
                     count += 1
                     origin = roster[attestation.origin % len(roster)]
                     genuine = is_genuine(identities, origin, attestation)
@@ -200,14 +199,6 @@ def _finding_on_signatures(_manifest: Manifest, records: list[tuple[bytes, Recor
                         return False, f"signatures: {at_s}: {what}, step {attestation.step}"
     but = f" but {forged} forged by {', '.join(sorted(liars))}" if forged else ""
     return True, f"signatures: {count} attestations, all signed by their origins{but}"
-
-
-def _attestations_in(envelope: Envelope) -> tuple[Attestation, ...]:
-    """What a receiver finds in an envelope, which refuses a malformed one."""
-    try:
-        return decode_gossip(envelope.body).attestations
-    except RefusedError:
-        return ()
 
 
 def _identities_in(records: list[tuple[bytes, Record]]) -> Identities | None:

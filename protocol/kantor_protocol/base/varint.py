@@ -67,6 +67,21 @@ def skip_numbers(buffer: bytes | np.ndarray, at: int, count: int) -> int:
 
 
 @kernel
+def read_pair(
+    buffer: bytes | np.ndarray, at: int, before: int, valued: bool
+) -> tuple[int, int, int]:
+    """Read one of the pairs that follow each other: (index, value, position after it); see `pack_pairs`.
+
+    before: the index of the pair before, 0 for the first. valued: pairs have values; else bare indices, of value 0.
+    """
+    step, at = read_int(buffer, at)
+    value = 0
+    if valued:
+        value, at = read_uint(buffer, at)
+    return before + step, value, at
+
+
+@kernel
 def pack_pairs(index: np.ndarray, value: np.ndarray, count: int, out: np.ndarray) -> int:
     """Write `count` pairs (index as difference to the one before, value >= 0); the bytes used."""
     at = 0
@@ -88,9 +103,7 @@ def unpack_pairs(buffer: bytes, bound: int, index: np.ndarray, value: np.ndarray
     before = 0
     count = 0
     while at < len(buffer):
-        step, at = read_int(buffer, at)
-        amount, at = read_uint(buffer, at)
-        before += step
+        before, amount, at = read_pair(buffer, at, before, True)
         if at < 0 or before < 0 or before >= bound or count >= index.shape[0]:
             return MALFORMED
         index[count] = before
@@ -106,9 +119,7 @@ def sum_pairs(buffer: bytes, bound: int) -> int:
     index = 0
     total = 0
     while at < len(buffer):
-        step, at = read_int(buffer, at)
-        amount, at = read_uint(buffer, at)
-        index += step
+        index, amount, at = read_pair(buffer, at, index, True)
         if at < 0 or index < 0 or index >= bound or amount > _SUM_MAX - total:
             return MALFORMED
         total += amount

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.kernels import kernel
-from kantor_protocol.base.varint import MALFORMED, put_uint, read_int, read_uint, skip_numbers
+from kantor_protocol.base.varint import MALFORMED, put_uint, read_pair, read_uint, skip_numbers
 
 _PARTS_MAX = 512
 """More parts of one kind are in no message with proofs."""
@@ -111,11 +111,7 @@ def _read_entries(logs: bytes, at: int, bound: int, value_max: int, entries: np.
         _number, at = read_uint(logs, at)
     index = 0
     for i in range(entries.shape[0]):
-        step, at = read_int(logs, at)
-        value = 0
-        if value_max > 0:
-            value, at = read_uint(logs, at)
-        index += step
+        index, value, at = read_pair(logs, at, index, value_max > 0)
         if at < 0 or index < 0 or index >= bound or value > value_max:
             return MALFORMED
         entries[i, 0], entries[i, 1] = np.int32(index), np.int32(value)

@@ -6,7 +6,13 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.kernels import kernel
-from kantor_protocol.base.varint import put_int, put_uint, read_int, read_uint, skip_numbers
+from kantor_protocol.base.varint import (
+    put_int,
+    put_uint,
+    read_pair,
+    read_uint,
+    skip_numbers,
+)
 from kantor_protocol.replication.registers import FRESH_STEPS, OTHERS_MAX
 from kantor_protocol.wire.version_vector import count_ids, raise_entries
 
@@ -213,11 +219,7 @@ def _check_suffixes(
         index = 0
         units = 0
         for i in range(count):
-            step, at = read_int(suffixes, at)
-            value = 0
-            if config.value_max > 0:
-                value, at = read_uint(suffixes, at)
-            index += step
+            index, value, at = read_pair(suffixes, at, index, config.value_max > 0)
             if at < 0 or index < 0 or index >= config.bound or value > config.value_max:
                 return -1
             units += value if start + i >= held else 0
@@ -247,11 +249,7 @@ def _apply_suffixes(store: ReplicaArrays, config: ReplicaConfig, suffixes: bytes
         left = _unspent(store.sending, origin, config.roster, config.spend_max)
         index = 0
         for i in range(count):
-            step, at = read_int(suffixes, at)
-            value = 0
-            if config.value_max > 0:
-                value, at = read_uint(suffixes, at)
-            index += step
+            index, value, at = read_pair(suffixes, at, index, config.value_max > 0)
             if ledger:
                 left -= value if start + i >= held else 0
                 if start + i < held or left < 0:

@@ -314,6 +314,14 @@ def decode_gossip(body: bytes) -> GossipMessage:
     return message
 
 
+def attestations_of(envelope: Envelope) -> tuple[Attestation, ...]:
+    """The attestations that a receiver finds in an envelope: none in one that it refuses."""
+    try:
+        return decode_gossip(envelope.body).attestations
+    except RefusedError:
+        return ()
+
+
 def decode_from_participant(payload: bytes) -> FromParticipant:
     """A message on `<id>/tx`. Raises RefusedError; for one with too many items before any of them is decoded."""
     if len(payload) > MESSAGE_BYTES_MAX:

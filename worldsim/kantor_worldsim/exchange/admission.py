@@ -31,7 +31,7 @@ from kantor_protocol.replication.gossip import MessageCheck, log_length_max
 from kantor_protocol.replication.occupancy_log import entries
 from kantor_protocol.replication.proofs import Chain, blocks
 from kantor_protocol.replication.replica_kernels import BLOCK
-from kantor_protocol.scenario.faults.liars import liars_of
+from kantor_protocol.scenario.faults.liars import FALSE_LOGS, liars_of
 from kantor_protocol.scenario.schema import ENERGY_MAX, Scenario
 from kantor_protocol.wire.attestations import Attestation, Identities, hash_of, is_genuine
 from kantor_protocol.wire.messages import (
@@ -110,7 +110,7 @@ class Admission:
         self._unsettled = 0
         """Entries at the end of the own log that only the step has that is being judged."""
         self._liars = liars_of(scenario.faults)
-        forgers = liars_of(scenario.faults, "overstate", "fork")
+        forgers = liars_of(scenario.faults, *FALSE_LOGS)
         self._false_logs = np.array([name in forgers for name in scenario.roster])
         """(roster,) whose logs others may pass on that are not what was consumed, or sent first."""
         self._spreads = not scenario.signed and bool(self._liars)

@@ -7,7 +7,7 @@ within bounds.
 import numpy as np
 
 from kantor_protocol.base.kernels import kernel
-from kantor_protocol.base.varint import read_int, read_uint
+from kantor_protocol.base.varint import read_int, read_pair, read_uint
 from kantor_protocol.wire.version_vector import count_ids
 
 POSSIBLE, NO_INCARNATION, HELD, OWN_LENGTH, FOREIGN, OWN, BELOW, STAMP = 0, 1, 2, 3, 4, 5, 6, 7
@@ -114,12 +114,9 @@ def _check_logs(
             return NO_INCARNATION
         if settings[LEDGER] and start > written[origin]:
             return OWN if origin == own else FOREIGN
-        index, value = 0, 0
+        index = 0
         for position in range(start, start + count):
-            step, at = read_int(suffixes, at)
-            if not settings[BARE]:
-                value, at = read_uint(suffixes, at)
-            index += step
+            index, value, at = read_pair(suffixes, at, index, settings[BARE] == 0)
             code = _check_entry(
                 logs, written, consumed, false_logs, settings, origin, own, position, index, value
             )
@@ -229,8 +226,7 @@ def learn(
         count, at = read_uint(suffixes, at)
         index = 0
         for position in range(start, start + count):
-            step, at = read_int(suffixes, at)
-            index += step
+            index, _value, at = read_pair(suffixes, at, index, False)
             if origin == own and position == written[own]:
                 logs[own, position, 0] = index
                 written[own] += 1

@@ -14,6 +14,8 @@ from kantor_protocol.scenario.faults.base import Fault, Names
 
 Lie = Literal["overstate", "rewrite", "fork", "claim", "teleport", "silence"]
 LIES: tuple[Lie, ...] = get_args(Lie)
+FALSE_LOGS: tuple[Lie, ...] = ("overstate", "fork")
+"""Lies by which the own log is not what was consumed, or seen."""
 
 
 class Byzantine(Fault, frozen=True, kw_only=True, tag="byzantine"):

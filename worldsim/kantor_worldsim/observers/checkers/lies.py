@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Outputs, ParticipantId, State
 from kantor_protocol.base.varint import Pairs
-from kantor_protocol.scenario.faults.liars import liars_of
+from kantor_protocol.scenario.faults.liars import FALSE_LOGS, liars_of
 from kantor_protocol.wire.messages import GossipMessage, RefusedError, decode_gossip
 from kantor_worldsim.observers.metrics.gossip_reader import (
     claims_of,
@@ -52,7 +52,7 @@ class LiarChecker:
         self._names = scenario.roster
         self._liars = liars_of(scenario.faults)
         self._silent = liars_of(scenario.faults, "silence")
-        forgers = liars_of(scenario.faults, "overstate", "fork")
+        forgers = liars_of(scenario.faults, *FALSE_LOGS)
         self.false_logs = frozenset(self._names.index(name) for name in forgers)
         """The places of robots whose own logs are not what they have consumed, or seen."""
         self._report = report

@@ -28,7 +28,6 @@ import numpy.typing as npt
 from kantor_protocol.base.machine import (
     EVERYBODY,
     SUPERVISOR,
-    Envelope,
     Outputs,
     ParticipantId,
     Pose,
@@ -37,11 +36,10 @@ from kantor_protocol.base.machine import (
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.attested import attested_every
 from kantor_protocol.replication.gossip import CONTACT_PERIODS, ack_timeout_steps
-from kantor_protocol.scenario.faults.liars import Byzantine, liars_of
+from kantor_protocol.scenario.faults.liars import FALSE_LOGS, Byzantine, liars_of
 from kantor_protocol.scenario.faults.processes import Kill, OnProcesses
 from kantor_protocol.scenario.schema import Scenario
-from kantor_protocol.wire.attestations import Attestation
-from kantor_protocol.wire.messages import RefusedError, decode_gossip
+from kantor_protocol.wire.messages import RefusedError, attestations_of, decode_gossip
 from kantor_worldsim.observers.checkers.links import Links
 from kantor_worldsim.observers.checkers.sight import Sight
 from kantor_worldsim.observers.checkers.state import FORGED_FIRST, has_ledger
@@ -134,7 +132,7 @@ class LivenessChecker:
         self._opening, self._scenario = opening, scenario
         self._names = scenario.roster
         self._liars = liars_of(scenario.faults)
-        self._forgers = liars_of(scenario.faults, "overstate", "fork")
+        self._forgers = liars_of(scenario.faults, *FALSE_LOGS)
         self._states = {
             name: _Participant(place, ack_timeout_steps(name, scenario))
             for place, name in enumerate(self._names)
@@ -194,7 +192,7 @@ class LivenessChecker:
             if origin < len(lengths) and length <= lengths[origin]:
                 known[origin] = max(known.get(origin, 0), length)
         for envelope in outputs.outbox if step_record.name not in self._liars else ():
-            attested = [(each.origin, each.length) for each in _attestations_of(envelope)]
+            attested = [(each.origin, each.length) for each in attestations_of(envelope)]
             if attested:
                 self._attestations[envelope.source, envelope.sequence] = attested
 
@@ -299,9 +297,9 @@ class LivenessChecker:
             if isinstance(fault, Kill) and fault.until_ns is None:
                 ends_ns.append(fault.from_ns)
             elif fault.until_ns is None:
-                lasts = not isinstance(fault, OnProcesses | Byzantine) or (
-                    isinstance(fault, OnProcesses) and fault.stops
-                )
+                lasts = not isinstance(fault, Byzantine)
+                if isinstance(fault, OnProcesses):
+                    lasts = fault.stops
                 ends_ns.append(1 << 62 if lasts else fault.from_ns)
             else:
                 ends_ns.append(fault.until_ns)
@@ -452,14 +450,6 @@ class LivenessChecker:
             if max(lengths, default=0) != entries:
                 what = f"has consumed {entries} entries, and {max(lengths, default=0)} are known"
                 self._report("I8", now_ns, name, what)
-
-
-def _attestations_of(envelope: Envelope) -> tuple[Attestation, ...]:
-    """The attestations in an envelope."""
-    try:
-        return decode_gossip(envelope.body).attestations
-    except RefusedError:
-        return ()
 
 
 def _version_vector_of(outputs: Outputs | None, roster: int, *, claims: bool) -> list[int] | None:
