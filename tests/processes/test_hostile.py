@@ -3,7 +3,8 @@
 import signal
 import socket
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -67,6 +68,17 @@ def host(kantor: "Kantor", endpoint: str, exchange: str) -> "Process":
     return world
 
 
+@contextmanager
+def ready_robot(kantor: "Kantor", endpoint: str) -> Iterator[tuple[ParticipantSession, "Process"]]:
+    """The hostile r2, with its mission and ready, and the process of the honest r1."""
+    identity = credentials.find(kantor.folder / "credentials", "r2")
+    with participant_session(endpoint, identity, "hostile", EVENT_LIMIT_S) as hostile:
+        await_message(hostile, Mission)
+        honest = kantor.start("agent", "r1", "--connect", endpoint)
+        hostile.send(encode(Ready(VERSION, "hostile")), blocking=True)
+        yield hostile, honest
+
+
 def unsound(pose: Pose) -> list[Outputs]:
     """Outputs of the first step of r2 that nobody may settle."""
     many = tuple(Envelope("r2", 1 + i, "", b"") for i in range(100_000))
@@ -85,11 +97,7 @@ def test_unsound_reports_touch_nobody_in_lockstep(kantor: "Kantor") -> None:
     """The mission goes on without waiting for their sender, who alone is named, and no rule is broken."""
     endpoint = free_endpoint()
     world = host(kantor, endpoint, "lockstep")
-    identity = credentials.find(kantor.folder / "credentials", "r2")
-    with participant_session(endpoint, identity, "hostile", EVENT_LIMIT_S) as hostile:
-        await_message(hostile, Mission)
-        honest = kantor.start("agent", "r1", "--connect", endpoint)
-        hostile.send(encode(Ready(VERSION, "hostile")), blocking=True)
+    with ready_robot(kantor, endpoint) as (hostile, honest):
         request = await_message(hostile, StepRequest)
         assert isinstance(request, StepRequest)
         for outputs in unsound(request.inputs.observation.pose):
@@ -110,11 +118,7 @@ def test_a_run_resumes_after_unsound_reports(kantor: "Kantor") -> None:
     """In real time: world-sim is killed after a forged report and a sound one, and goes on from its record."""
     endpoint = free_endpoint()
     world = host(kantor, endpoint, "realtime")
-    identity = credentials.find(kantor.folder / "credentials", "r2")
-    with participant_session(endpoint, identity, "hostile", EVENT_LIMIT_S) as hostile:
-        await_message(hostile, Mission)
-        kantor.start("agent", "r1", "--connect", endpoint)
-        hostile.send(encode(Ready(VERSION, "hostile")), blocking=True)
+    with ready_robot(kantor, endpoint) as (hostile, _):
         clock = await_message(hostile, StartClock)
         assert isinstance(clock, StartClock)
         assert clock.observation is not None
@@ -140,11 +144,7 @@ def test_a_silent_robot_is_named(kantor: "Kantor") -> None:
     """In lockstep: it is ready and does not answer; the other one goes on without it, and is not blamed."""
     endpoint = free_endpoint()
     world = host(kantor, endpoint, "lockstep")
-    identity = credentials.find(kantor.folder / "credentials", "r2")
-    with participant_session(endpoint, identity, "hostile", EVENT_LIMIT_S) as hostile:
-        await_message(hostile, Mission)
-        honest = kantor.start("agent", "r1", "--connect", endpoint)
-        hostile.send(encode(Ready(VERSION, "hostile")), blocking=True)
+    with ready_robot(kantor, endpoint) as (hostile, honest):
         await_message(hostile, Stop)
         assert honest.wait(timeout=EVENT_LIMIT_S) == 0
         out, err = world.communicate(timeout=EVENT_LIMIT_S)

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from kantor_agent.robots import parts
+from kantor_agent.robots import decoded_parts as parts
 from kantor_protocol.base.counter_rng import Purpose, uniform
 from kantor_protocol.base.machine import (
     EVERYBODY,

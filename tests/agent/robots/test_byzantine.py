@@ -6,7 +6,7 @@ from functools import partial
 import msgspec
 import pytest
 
-from kantor_agent.robots import parts
+from kantor_agent.robots import decoded_parts as parts
 from kantor_agent.robots.byzantine import SPELL_STEPS, ByzantineRobot, as_declared
 from kantor_fleet.execution.in_process_team import lies_told, participant, team, team_identities
 from kantor_protocol.base.machine import (

@@ -6,7 +6,12 @@ Only the robot's own messages are read here, which are well-formed.
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from kantor_protocol.base.varint import read_int, read_uint
+import numpy as np
+
+from kantor_protocol.base.varint import put_uint, read_int, read_pair, read_uint
+
+_NUMBER_BYTES = 10
+"""Of one number, at most."""
 
 
 class Suffix(NamedTuple):
@@ -44,10 +49,7 @@ def suffixes_in(logs: bytes, *, valued: bool) -> list[Suffix]:
         (origin, start, span, count), at = _uints(logs, at, 4)
         entries, index = [], 0
         for _ in range(count):
-            (step, at), value = read_int(logs, at), 0
-            if valued:
-                value, at = read_uint(logs, at)
-            index += step
+            index, value, at = read_pair(logs, at, index, valued)
             entries.append((index, value))
         suffixes.append(Suffix(origin, start, span, entries))
     return suffixes
@@ -109,14 +111,11 @@ def uints_in(content: bytes) -> list[int]:
 
 def packed_uints(numbers: Iterable[int]) -> bytes:
     """Numbers as LEB128."""
-    out = bytearray()
-    for number in numbers:
-        value = int(number)
-        while value >= 128:
-            out.append(value & 127 | 128)
-            value >>= 7
-        out.append(value)
-    return bytes(out)
+    listed = list(numbers)
+    out, at = np.zeros(_NUMBER_BYTES * len(listed), dtype=np.uint8), 0
+    for number in listed:
+        at = put_uint(out, at, number)
+    return out[:at].tobytes()
 
 
 def _uints(content: bytes, at: int, count: int) -> tuple[list[int], int]:
