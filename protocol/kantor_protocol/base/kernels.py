@@ -4,9 +4,12 @@ import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
+from itertools import count
 from typing import Any
 
 from numba import config, types
+from numba.core.bytecode import FunctionIdentity
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
 from kantor_protocol.compilation.kernel_store import KernelStore
@@ -46,8 +49,22 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         """Load or compile this kernel for a signature: in one process, while the others wait for it."""
         if tuple(sig) in self.overloads:
             return super().compile(sig)
-        with self._cache.one_compiles(sig), _garbage_kept():
+        # The lock of the threads first: a thread that holds it may wait for a file that another thread compiles.
+        with global_compiler_lock, self._cache.one_compiles(sig), self._own_symbols(), _garbage_kept():
             return super().compile(sig)
+
+    @contextmanager
+    def _own_symbols(self) -> Iterator[None]:
+        """Number the functions of this kernel from its content on, not by how many this process has compiled.
+
+        Code that two processes compiled is linked in a third, where two functions of one symbol would be one.
+        """
+        of_process = FunctionIdentity._unique_ids  # noqa: SLF001
+        FunctionIdentity._unique_ids = count(self._cache.first_symbol)  # noqa: SLF001
+        try:
+            yield
+        finally:
+            FunctionIdentity._unique_ids = of_process  # noqa: SLF001
 
 
 @contextmanager

@@ -29,6 +29,7 @@ from numba.core.serialize import dumps
 
 _KEPT_S = 30 * 86_400.0
 _TOUCHED_S = 86_400.0
+_FORMAT = 2
 _SUFFIX, _COMPLETE = ".kernel", ".complete"
 
 
@@ -119,6 +120,11 @@ class KernelStore(_Cache):  # type: ignore[misc]
             self._folder
             / f"{function.__module__}.{function.__name__}-{digest.hexdigest()}{_SUFFIX}"
         )
+
+    @property
+    def first_symbol(self) -> int:
+        """A number that kernels of other content are far from."""
+        return int(self._content[:15], 16)
 
     @cached_property
     def _folder(self) -> Path:
@@ -219,9 +225,9 @@ def _constant(value: Any) -> str:
 
 @cache
 def _compiler() -> str:
-    """Digest of what compiles, and of the processor for which it does."""
+    """Digest of what compiles, of the processor for which it does, and of how the result is saved."""
     digest = blake2b(digest_size=8)
-    _feed(digest, numba.__version__, llvmlite.__version__, np.__version__, sys.version, config.OPT)
+    _feed(digest, _FORMAT, numba.__version__, llvmlite.__version__, np.__version__, sys.version, config.OPT)
     _feed(digest, cpu_target.target_context.codegen().magic_tuple())
     return digest.hexdigest()
 

@@ -1,6 +1,7 @@
 """Compiled kernels on disk: nothing stale is loaded, nothing is compiled twice, and no folder is needed."""
 
 import importlib
+import itertools
 import multiprocessing
 import os
 import pkgutil
@@ -14,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from numba import typeof
+from numba.core.bytecode import FunctionIdentity
 
 from kantor_protocol.base.counter_rng import uniform
 from kantor_protocol.base.kernels import Kernel, kernel
@@ -234,3 +236,30 @@ def test_the_content_of_every_kernel_can_be_told() -> None:
     contents = {id(each): content_of(each) for each in kernels()}
     assert len(contents) > 150
     assert len(set(contents.values())) == len(contents)
+
+
+_LOOP = """
+    for i in range(x):
+        if total % 5 == i:
+            total += i + STEP * x
+        total = (total ^ (total >> 3) * STEP) % 10007
+"""
+TOO_LONG_TO_INLINE = f"def callee(x):\n    total = STEP{8 * _LOOP}    return total\n"
+CALLED_OFTEN = "def caller(x):\n    return callee(x) + callee(x + 1) * callee(x + 2) + callee(x + 3)\n"
+
+
+def test_kernels_of_one_name_are_linked_apart(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Code of two processes, each of which compiled it as its first, is used in one: none calls the other's."""
+
+    def kernels_of_both() -> Iterator[tuple[Kernel, int]]:
+        for step in (3, 5):
+            monkeypatch.setattr(FunctionIdentity, "_unique_ids", itertools.count(1))
+            plain: dict[str, Any] = {"STEP": step}
+            exec(TOO_LONG_TO_INLINE + CALLED_OFTEN, plain)
+            yield caller(TOO_LONG_TO_INLINE, step, CALLED_OFTEN), plain["caller"](8)
+
+    compiled = [(made(8), expected) for made, expected in kernels_of_both()]
+    used = list(kernels_of_both())
+    loaded = [(made(8), expected) for made, expected in used]
+    assert len(files(store)) == 4
+    assert all(result == expected for result, expected in compiled + loaded)
