@@ -50,7 +50,12 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         if tuple(sig) in self.overloads:
             return super().compile(sig)
         # The lock of the threads first: a thread that holds it may wait for a file that another thread compiles.
-        with global_compiler_lock, self._cache.one_compiles(sig), self._own_symbols(), _garbage_kept():
+        with (
+            global_compiler_lock,
+            self._cache.one_compiles(sig),
+            self._own_symbols(),
+            _garbage_kept(),
+        ):
             return super().compile(sig)
 
     @contextmanager

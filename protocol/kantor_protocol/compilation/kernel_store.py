@@ -227,7 +227,15 @@ def _constant(value: Any) -> str:
 def _compiler() -> str:
     """Digest of what compiles, of the processor for which it does, and of how the result is saved."""
     digest = blake2b(digest_size=8)
-    _feed(digest, _FORMAT, numba.__version__, llvmlite.__version__, np.__version__, sys.version, config.OPT)
+    _feed(
+        digest,
+        _FORMAT,
+        numba.__version__,
+        llvmlite.__version__,
+        np.__version__,
+        sys.version,
+        config.OPT,
+    )
     _feed(digest, cpu_target.target_context.codegen().magic_tuple())
     return digest.hexdigest()
 

@@ -245,7 +245,9 @@ _LOOP = """
         total = (total ^ (total >> 3) * STEP) % 10007
 """
 TOO_LONG_TO_INLINE = f"def callee(x):\n    total = STEP{8 * _LOOP}    return total\n"
-CALLED_OFTEN = "def caller(x):\n    return callee(x) + callee(x + 1) * callee(x + 2) + callee(x + 3)\n"
+CALLED_OFTEN = (
+    "def caller(x):\n    return callee(x) + callee(x + 1) * callee(x + 2) + callee(x + 3)\n"
+)
 
 
 def test_kernels_of_one_name_are_linked_apart(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
