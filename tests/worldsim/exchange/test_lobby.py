@@ -47,13 +47,13 @@ class Bus:
         self.sent.append((name, payload))
 
 
-def lobby_on(bus: Bus, records: list[Record] | None = None) -> Lobby:
-    """The lobby of a mission in real time. records: what goes on record."""
+def lobby_on(bus: Bus, records: list[Record] | None = None, exchange: str = "wall") -> Lobby:
+    """The lobby of a mission. records: what goes on record."""
     scenario = mission()
     setup = WorldSetup.of(scenario, 0)
     return Lobby(
         cast("HubRouter", bus),
-        MissionConfig(scenario, 0, setup, "wall"),
+        MissionConfig(scenario, 0, setup, exchange),
         "run",
         Simulation(scenario, 0, setup, [] if records is None else [records.append]),
         ProgressReporter(DensityMetrics(), scenario, lambda _progress: None),
@@ -94,28 +94,29 @@ def test_clocks_run_on_while_world_sim_waits(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("back", [False, True])
-def test_who_leaves_after_its_answer_is_lost_in_the_next_batch(*, back: bool) -> None:
-    """Its step is on record before it leaves; and it has not left if it is back before it is asked again."""
+def test_in_lockstep_the_barrier_decides_who_has_left(*, back: bool) -> None:
+    """Whoever left and is not back is expected until it is given up; then it is on record that it left."""
     bus, records = Bus(), list[Record]()
-    lobby = lobby_on(bus, records)
+    lobby = lobby_on(bus, records, "lockstep")
     ready = Received("r1", encode(Ready(VERSION, "one")))
     bus.events += [Joined("r1", "one"), ready]
     lobby.next(1.0)
     lobby.next(1.0)
     lobby.open(lambda: 7)
     known = len(records)
-    lobby.begin_batch()
-    lobby.count_answer("r1")
     bus.events.append(Left("r1", "one"))
     lobby.next(1.0)
-    assert not lobby.is_expected("r1")
-    assert records[known:] == []
+    assert lobby.is_expected("r1")
+    assert not lobby.is_ready("r1")
+    assert lobby.has_left("r1")
     if back:
         bus.events += [Joined("r1", "one"), ready]
         lobby.next(1.0)
         lobby.next(1.0)
+        assert not lobby.has_left("r1")
+    else:
+        lobby.give_up("r1")
+        assert not lobby.is_expected("r1")
 
-    lobby.begin_batch()
-    assert lobby.is_expected("r1") == back
     left = ProcessEvent(7, "r1", ProcessEventKind.LEAVE)
     assert records[known:] == ([] if back else [left])

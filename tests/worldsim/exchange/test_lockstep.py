@@ -1,6 +1,7 @@
 """The barrier of lockstep: who is silent is not waited for, and is back as soon as it answers."""
 
-from typing import cast
+from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
 
@@ -24,20 +25,27 @@ class Team:
         self.asked: list[tuple[str, bool]] = []
         """Who was asked, and whether that waited."""
         self.silences: list[str] = []
+        self.left: set[str] = set()
+        """Whose session has ended."""
+        self.returns: dict[str, int] = {}
+        self.lost: list[str] = []
+        """Who was given up."""
 
     def monotonic(self) -> float:
         """The simulated time in seconds."""
         return self.now_s
 
     def is_expected(self, name: str) -> bool:
-        """All are there."""
-        return name in self.roster
+        """All that are there, or may come back."""
+        return name in self.roster and name not in self.lost
 
-    is_ready = is_expected
+    def is_ready(self, name: str) -> bool:
+        """All that are there."""
+        return self.is_expected(name) and name not in self.left
 
     def arrivals(self, name: str) -> int:
-        """Nobody leaves."""
-        return 1
+        """How often a participant came."""
+        return self.returns.get(name, 1)
 
     def grant_reply(self, name: str) -> None:
         """Replies are not counted here."""
@@ -46,11 +54,14 @@ class Team:
         """Keep the name."""
         self.silences.append(name)
 
-    def begin_batch(self) -> None:
-        """Nobody leaves."""
+    def has_left(self, name: str) -> bool:
+        """Whether its session has ended."""
+        return name in self.left
 
-    def count_answer(self, name: str) -> None:
-        """Nobody leaves."""
+    def give_up(self, name: str) -> None:
+        """It is not expected any more."""
+        self.left.discard(name)
+        self.lost.append(name)
 
     def forget_newcomers(self) -> None:
         """There are none."""
@@ -146,3 +157,47 @@ def test_all_silent_are_waited_for(team: Team) -> None:
         assert tick(exchange, steps) == set()
 
     assert team.now_s >= 1.5 * BARRIER_S
+
+
+def test_whose_session_expires_is_asked_again_when_it_is_back(team: Team) -> None:
+    """On a busy machine a session ends and a live process connects again: no step is missed, and nobody is lost."""
+    exchange = LockstepExchange(cast("Lobby", team), no_controller)
+    steps = dict.fromkeys(team.roster, 0)
+    tick(exchange, steps)
+    team.left = {"r1", "r2", "r3"}
+    comes_back_s = team.now_s + 0.9 * BARRIER_S
+
+    def back_in_time(timeout_s: float, wait: Callable[[float], Any] = team.next) -> Any:
+        if team.left and team.now_s > comes_back_s:
+            team.left, team.returns = set(), dict.fromkeys(team.roster, 2)
+        return wait(timeout_s)
+
+    team.next = back_in_time  # type: ignore[method-assign]
+    assert tick(exchange, steps) == {"r1", "r2", "r3"}
+    assert team.lost == team.silences == []
+
+
+def test_who_does_not_come_back_is_lost(team: Team) -> None:
+    """A process that is gone is waited for once."""
+    exchange = LockstepExchange(cast("Lobby", team), no_controller)
+    steps = dict.fromkeys(team.roster, 0)
+    team.left = {"r2"}
+    for _ in range(3):
+        assert tick(exchange, steps) == {"r1", "r3"}
+
+    assert BARRIER_S <= team.now_s <= BARRIER_S + 1.0
+    assert team.lost == ["r2"]
+    assert team.silences == []
+
+
+def test_who_is_silent_and_then_leaves_is_lost_at_once(team: Team) -> None:
+    """A frozen process is silent first; then its session expires."""
+    exchange = LockstepExchange(cast("Lobby", team), no_controller)
+    steps = dict.fromkeys(team.roster, 0)
+    team.mute = {"r2"}
+    tick(exchange, steps)
+    team.left, waited_s = {"r2"}, team.now_s
+    assert tick(exchange, steps) == {"r1", "r3"}
+
+    assert team.now_s == waited_s
+    assert team.lost == ["r2"]

@@ -106,11 +106,9 @@ class Lobby:
         self._away: set[ParticipantId] = set()
         """Participants that left without an excuse, or never came."""
         self._doubtful: set[ParticipantId] = set()
-        """Participants that may only seem to have left, because world-sim itself was frozen."""
-        self._answered: set[ParticipantId] = set()
-        """Lockstep: participants that have done their step of this batch. Whether one has left shows in the next."""
-        self._gone: dict[ParticipantId, None] = {}
-        """Those of them that have left since, and are not back, in order."""
+        """Participants that have left and may come back: in lockstep all, otherwise while world-sim may itself have
+        been frozen."""
+        self._is_lockstep = config.exchange == "lockstep"
         self._checked_s = time.monotonic()
         self._certain_s = 0.0
         """Time from which on an absence is certain."""
@@ -220,16 +218,14 @@ class Lobby:
         """All participants of the mission."""
         return self._config.scenario.roster
 
-    def begin_batch(self) -> None:
-        """Lockstep: who has left since its last step, and is not back, is lost from now on."""
-        gone, self._gone = self._gone, {}
-        self._answered.clear()
-        for name in gone:
-            self._lose(name)
+    def has_left(self, name: ParticipantId) -> bool:
+        """Lockstep: whether a participant has left the bus, and has not been given up."""
+        return name in self._doubtful
 
-    def count_answer(self, name: ParticipantId) -> None:
-        """Lockstep: a participant has done its step of this batch, wherever it is when that goes on record."""
-        self._answered.add(name)
+    def give_up(self, name: ParticipantId) -> None:
+        """Lockstep: put on record that a participant has left."""
+        self._doubtful.discard(name)
+        self._lose(name)
 
     def is_ready(self, name: ParticipantId) -> bool:
         """Whether a participant's process is on the bus and has its mission."""
@@ -318,6 +314,8 @@ class Lobby:
 
     def _settle_doubts(self) -> None:
         """Give processes that were disconnected while world-sim itself was frozen time to connect again."""
+        if self._is_lockstep:
+            return  # it decides itself how long it waits
         now_s = time.monotonic()
         if now_s - self._checked_s > LEASE_MS * 0.5e-3:
             self._certain_s = now_s + COME_BACK_S
@@ -382,9 +380,7 @@ class Lobby:
             return
         if self._clock is None or name in self._excused:
             return
-        if name in self._answered:
-            self._gone[name] = None
-        elif time.monotonic() < self._certain_s:
+        if self._is_lockstep or time.monotonic() < self._certain_s:
             self._doubtful.add(name)
         else:
             self._lose(name)
@@ -457,7 +453,6 @@ class Lobby:
         self._briefed_s.pop(name, None)
         self._arrivals[name] += 1
         self._doubtful.discard(name)
-        self._gone.pop(name, None)
         if self._clock is not None and name in self._away:
             self._come_back(name)
         self._newcomers.append(name)

@@ -15,7 +15,8 @@ from kantor_worldsim.exchange.process_control import (
 )
 
 BARRIER_S = 10.0
-"""Timeout of a step: a participant that has not answered by then misses it, and is silent until it answers."""
+"""Timeout of a step: a participant that has not answered by then misses it, and is silent until it answers. One that
+has left the bus has as long to come back: on a busy machine sessions of live processes expire."""
 _PATIENCE_MIN_S = 0.05
 """Whoever misses steps again and again is waited for half as long each time, down to this."""
 _WAIT_S = 0.05
@@ -45,7 +46,6 @@ class LockstepExchange:
         """Step all participants of a batch. Those that return meanwhile, or are silent, are asked again."""
         lobby = self._lobby
         outputs: dict[ParticipantId, Outputs] = {}
-        lobby.begin_batch()
         for name in inputs:
             if (late := self._late.pop(name, None)) is not None:
                 self._take(name, late, inputs, outputs)
@@ -61,12 +61,21 @@ class LockstepExchange:
                 self._take(report[0], report[1].outputs, inputs, outputs)
                 report = lobby.next(0.0)
         for name in inputs:
-            if name not in outputs and lobby.is_expected(name) and name not in self._silent:
-                self._silent.add(name)
-                lobby.note_silence(name)
-                self._patience_s[name] = max(_PATIENCE_MIN_S, self._patience_s[name] / 2.0)
+            if name not in outputs and lobby.is_expected(name):
+                self._go_on_without(name)
         lobby.forget_newcomers()
         return outputs
+
+    def _go_on_without(self, name: ParticipantId) -> None:
+        """Give up a participant that has left, and wait no more for one that is silent."""
+        lobby = self._lobby
+        if name not in self._silent:
+            self._patience_s[name] = max(_PATIENCE_MIN_S, self._patience_s[name] / 2.0)
+        if lobby.has_left(name):
+            lobby.give_up(name)
+        elif name not in self._silent:
+            self._silent.add(name)
+            lobby.note_silence(name)
 
     def _take(
         self,
@@ -79,7 +88,6 @@ class LockstepExchange:
         if name in inputs:
             if made.step == inputs[name].observation.step + 1:
                 outputs[name] = made
-                self._lobby.count_answer(name)
                 self._silent.discard(name)
                 self._asked.pop(name, None)
         elif name in self._silent:
