@@ -17,10 +17,11 @@ def run(
     connect_timeout_s: float,
     say: Callable[[str], None],
     state: Path,
+    lease_ms: int | None = None,
 ) -> str:
     """Play the robot of this identity until the mission is over; returns why it ended.
 
-    state: folder of its write-ahead log. Raises BusError, RejectedError and StateError.
+    state: folder of its write-ahead log. lease_ms: after which it is missed. Raises BusError, RejectedError and StateError.
     """
 
     def build(mission: Mission, body: Body) -> StateMachine:
@@ -35,4 +36,4 @@ def run(
             robot = DensityRobot(me, scenario, seed, body, samples_m, mission.identities)
         return as_declared(me, scenario, seed, robot)
 
-    return participate(connect, identity, build, connect_timeout_s, say, state)
+    return participate(connect, identity, build, connect_timeout_s, say, state, lease_ms)

@@ -16,10 +16,11 @@ def run(
     connect_timeout_s: float,
     say: Callable[[str], None],
     state: Path,
+    lease_ms: int | None = None,
 ) -> str:
     """Play the supervisor until the mission is over; returns why it ended.
 
-    state: folder of its write-ahead log. Raises BusError, RejectedError and StateError.
+    state: folder of its write-ahead log. lease_ms: after which it is missed. Raises BusError, RejectedError and StateError.
     """
 
     def build(mission: Mission, body: Body) -> StateMachine:
@@ -31,4 +32,4 @@ def run(
             return MappingSupervisor(me, scenario, mission.seed, body, mission.frame, identities)
         return DensitySupervisor(me, scenario, body, mission.samples.shape[0], identities)
 
-    return participate(connect, identity, build, connect_timeout_s, say, state)
+    return participate(connect, identity, build, connect_timeout_s, say, state, lease_ms)

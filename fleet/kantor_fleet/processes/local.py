@@ -25,6 +25,7 @@ from kantor_fleet.execution.fork_server import StartError, pipe, start_process
 from kantor_fleet.exits import Exit
 from kantor_fleet.interrupts import Interrupts
 from kantor_fleet.processes.log import log_to
+from kantor_fleet.processes.start_slots import take_slot
 from kantor_protocol.base.machine import SUPERVISOR, WORLD_SIM, ParticipantId
 from kantor_protocol.node import wal
 from kantor_protocol.node.runner import RejectedError, StateError
@@ -34,7 +35,7 @@ from kantor_protocol.transport.client import ObserverSession, observer_session
 from kantor_protocol.transport.credentials import Identity, Password, public_key
 from kantor_protocol.transport.endpoint import free_endpoint
 from kantor_protocol.transport.router import HubRouter
-from kantor_protocol.transport.session import BusError
+from kantor_protocol.transport.session import LEASE_MS, LOCKSTEP_LEASE_MS, BusError
 from kantor_protocol.transport.zenoh_log import init_log
 from kantor_protocol.wire import keys
 from kantor_protocol.wire.messages import Progress, RefusedError, decode_progress
@@ -119,7 +120,7 @@ class Fleet:
         absent = set(late_participants(self._config.scenario))
         for name in self._config.scenario.roster:
             if name not in absent:
-                self.participants[name] = self._start_participant(name, name)
+                self.participants[name] = self._start_participant(name, name, waits=True)
 
     def _start_world_sim(self, *, resume: bool) -> ForkServerProcess:
         ours, theirs = pipe(WORLD_SIM)
@@ -139,7 +140,10 @@ class Fleet:
         threading.Thread(target=self._serve, args=(ours, process), daemon=True).start()
         return process
 
-    def _start_participant(self, name: ParticipantId, log: str) -> ForkServerProcess:
+    def _start_participant(
+        self, name: ParticipantId, log: str, *, waits: bool = False
+    ) -> ForkServerProcess:
+        """Start a participant's process. waits: with the others of its fleet for a slot."""
         with self._lock:
             return start_process(
                 log,
@@ -148,6 +152,8 @@ class Fleet:
                 self._identities[name],
                 self._logs / f"{log}.log",
                 self._state,
+                self._state if waits else None,
+                LOCKSTEP_LEASE_MS if self._config.exchange == "lockstep" else LEASE_MS,
             )
 
     def newly_failed(self) -> list[tuple[ParticipantId, int]]:
@@ -480,16 +486,24 @@ def _controller(pipe: Connection) -> ProcessController:
     return carry_out
 
 
-def _be_participant(connect: str, identity: Identity, log: Path, state: Path) -> None:
+def _be_participant(
+    connect: str, identity: Identity, log: Path, state: Path, slots: Path | None, lease_ms: int
+) -> None:
     from kantor_agent.process import run as run_agent  # noqa: PLC0415  the fork server has it
     from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
 
     os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
-    say = log_to(log, identity.user)
+    write = log_to(log, identity.user)
+    give_back = take_slot(slots) if slots else lambda: None
+
+    def say(line: str) -> None:
+        give_back()  # it is on the bus, or never will be
+        write(line)
+
     init_log()
     run = run_supervisor if identity.user == SUPERVISOR else run_agent
     try:
-        say(run(connect, identity, _START_S, say, state))
+        say(run(connect, identity, _START_S, say, state, lease_ms))
     except BusError as error:
         say(str(error))
         sys.exit(Exit.UNREACHABLE)

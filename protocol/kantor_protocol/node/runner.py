@@ -65,15 +65,16 @@ def participate(
     connect_timeout_s: float,
     notify: Callable[[str], None],
     state: Path,
+    lease_ms: int | None = None,
 ) -> str:
     """Take part in missions until world-sim sends Stop; the reason in it.
 
     connect_timeout_s: how long to wait for world-sim. notify: takes one line of text for the operator. state: folder
-    of the write-ahead log. Raises BusError, RejectedError, StateError.
+    of the write-ahead log. lease_ms: after which this process is missed. Raises BusError, RejectedError, StateError.
     """
     _check_writable(state)
     nonce = secrets.token_hex(8)
-    with participant_session(connect, identity, nonce, connect_timeout_s) as session:
+    with participant_session(connect, identity, nonce, connect_timeout_s, lease_ms) as session:
         notify(f"{identity.user}: on the bus at {connect}, waiting for a mission")
         return _Runner(session, identity, build, notify, state).run()
 

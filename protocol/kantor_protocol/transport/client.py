@@ -11,7 +11,12 @@ import zenoh
 from kantor_protocol.transport import zenoh_config
 from kantor_protocol.transport.credentials import Certificate, Identity
 from kantor_protocol.transport.endpoint import await_endpoint, check_endpoint, is_crowded
-from kantor_protocol.transport.session import QUEUE_MAX, BusError, close_session, open_session
+from kantor_protocol.transport.session import (
+    QUEUE_MAX,
+    BusError,
+    close_session,
+    open_session,
+)
 from kantor_protocol.wire import keys
 
 
@@ -115,10 +120,15 @@ _REFUSALS = 2
 
 @contextlib.contextmanager
 def participant_session(
-    connect: str, identity: Identity, nonce: str, connect_timeout_s: float
+    connect: str,
+    identity: Identity,
+    nonce: str,
+    connect_timeout_s: float,
+    lease_ms: int | None = None,
 ) -> Iterator[ParticipantSession]:
     """Join the bus as a participant, waiting for world-sim up to `connect_timeout_s`. Raises BusError."""
-    session = ParticipantSession(client(connect, identity, connect_timeout_s), identity, nonce)
+    opened = client(connect, identity, connect_timeout_s, lease_ms)
+    session = ParticipantSession(opened, identity, nonce)
     try:
         yield session
     finally:
@@ -137,12 +147,14 @@ def observer_session(
         session.close()
 
 
-def client(connect: str, identity: Identity, connect_timeout_s: float) -> zenoh.Session:
+def client(
+    connect: str, identity: Identity, connect_timeout_s: float, lease_ms: int | None = None
+) -> zenoh.Session:
     """Open the session of a client, once the router at the endpoint admits it. Raises BusError."""
     check_endpoint(connect, identity)
     give_up = time.monotonic() + connect_timeout_s
     await_endpoint(connect, connect_timeout_s, identity)
-    session = _opened(connect, identity, give_up)
+    session = _opened(connect, identity, give_up, lease_ms)
     if isinstance(identity, Certificate):
         try:
             _check_admitted(connect, session, identity)
@@ -152,9 +164,11 @@ def client(connect: str, identity: Identity, connect_timeout_s: float) -> zenoh.
     return session
 
 
-def _opened(connect: str, identity: Identity, give_up: float) -> zenoh.Session:
+def _opened(
+    connect: str, identity: Identity, give_up: float, lease_ms: int | None
+) -> zenoh.Session:
     """A session, as soon as the router has room for it. give_up: by the monotonic clock. Raises BusError."""
-    config = zenoh_config.client_config(identity)
+    config = zenoh_config.client_config(identity, lease_ms)
     refusals = 0
     while True:
         with contextlib.suppress(zenoh.ZError):

@@ -9,7 +9,7 @@ import zenoh
 
 from kantor_protocol.transport import zenoh_config
 
-LEASE_MS = zenoh_config.LEASE_MS
+LEASE_MS, LOCKSTEP_LEASE_MS = zenoh_config.LEASE_MS, zenoh_config.LOCKSTEP_LEASE_MS
 
 
 QUEUE_MAX = 16_384

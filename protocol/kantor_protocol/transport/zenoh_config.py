@@ -16,6 +16,8 @@ from kantor_protocol.wire.messages import MESSAGE_BYTES_MAX
 
 LEASE_MS = 1000
 """A process that is frozen or disconnected is noticed after this."""
+LOCKSTEP_LEASE_MS = 10_000
+"""The same where time waits for a process on a busy machine. One that has ended is noticed at once in any case."""
 HANDSHAKE_S = 3.0
 POSE_BYTES_MAX = 256
 SHOWN_PER_S = 1000
@@ -49,7 +51,7 @@ def common_config(mode: str, connect: str | None, listen: str | None) -> ZenohCo
     }
 
 
-def client_config(identity: Identity) -> ZenohConfig:
+def client_config(identity: Identity, lease_ms: int | None = None) -> ZenohConfig:
     """The settings of a process that connects, and connects again when the connection is lost."""
     return _proof(identity) | {
         "connect/timeout_ms": round(HANDSHAKE_S * 1000),
@@ -58,7 +60,7 @@ def client_config(identity: Identity) -> ZenohConfig:
             "period_max_ms": 200,
             "period_increase_factor": 1.5,
         },
-        "transport/link/tx/lease": LEASE_MS,
+        "transport/link/tx/lease": LEASE_MS if lease_ms is None else lease_ms,
     }
 
 

@@ -15,8 +15,9 @@ from kantor_worldsim.exchange.process_control import (
 )
 
 BARRIER_S = 10.0
-"""Timeout of a step: a participant that has not answered by then misses it, and is silent until it answers. One that
-has left the bus has as long to come back: on a busy machine sessions of live processes expire."""
+"""Timeout of a step, from the last answer of anybody on: a participant that has not answered by then misses it, and is
+silent until it answers. One that has left the bus has as long to come back: on a busy machine sessions of live processes
+expire."""
 _PATIENCE_MIN_S = 0.05
 """Whoever misses steps again and again is waited for half as long each time, down to this."""
 _WAIT_S = 0.05
@@ -49,11 +50,13 @@ class LockstepExchange:
         for name in inputs:
             if (late := self._late.pop(name, None)) is not None:
                 self._take(name, late, inputs, outputs)
-        started_s = time.monotonic()
+        heard_s, answers = time.monotonic(), 0
         while True:
+            if len(outputs) > answers:  # a team that answers is busy, and not silent
+                heard_s, answers = time.monotonic(), len(outputs)
             missing = [name for name in inputs if name not in outputs]
             self._ask({name: inputs[name] for name in missing})
-            waited_s = time.monotonic() - started_s
+            waited_s = time.monotonic() - heard_s
             if not any(self._is_awaited(name, waited_s) for name in missing):
                 break
             report = lobby.next(_WAIT_S)
