@@ -11,6 +11,7 @@ peers     the speed of other simulators, if they are installed
 lockstep  ticks a second with a process for every robot, beside a bare Zenoh barrier
 hub       robots times rate that one world-sim relays in realtime
 wire      bytes that a robot publishes in a tick, beside its whole weight vector
+scale     time, bytes and memory of missions by their size: robots, processes, samples, simulated time
 signing   bytes and CPU time that signed attestations take, beside the same missions without
 
 A target is a ratio within the run, and stands beside its figure; one that is missed is marked MISS, and its section is
@@ -39,6 +40,7 @@ SECTIONS = (
     "lockstep",
     "hub",
     "wire",
+    "scale",
     "signing",
 )
 LIBRARIES = ("kantor", "eclipse-zenoh", "numpy", "numba", "msgspec")
