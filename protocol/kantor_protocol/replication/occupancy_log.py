@@ -17,12 +17,12 @@ Beams that met nothing count in the last bin. A few beams of each scan are enoug
 """
 
 import math
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, Frame, next_cell
+from kantor_protocol.base.grid import FREE, OCCUPIED, Frame
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.machine import Pose
 from kantor_protocol.scenario.schema import SensorOptions
@@ -41,6 +41,8 @@ _SHARED_BEAMS = 4
 _NOISE_CELLS_MAX = 0.5
 """An obstacle is looked for this far around where a noisy beam ended, at most: further, and there are always
 several cells to choose from."""
+_CELLS_KEPT = 1 << 18
+"""Cells of scans whose evidence is kept, for whoever reads the same scan in this process."""
 
 
 def entries(frame: Frame) -> int:
@@ -75,14 +77,22 @@ def beam_rad(heading_rad: float, field_of_view_rad: float, beams: int, beam: int
 
 
 @kernel
-def _touch(cell: int, evidence: int, votes: np.ndarray, touched: np.ndarray, count: int) -> int:
-    """Add the evidence of one beam to a cell; the number of cells in `touched`."""
-    if votes[cell] == 0:
-        touched[count] = cell
-        count += 1
-        votes[cell] = 1  # sums of HIT and PASS are multiples of 5: a touched cell is never at 0
-    votes[cell] += evidence
-    return count
+def border_share(at: float, direction: float, cell: int) -> float:
+    """How far along a ray it leaves a row or a column of cells, as `next_cell` tells it; inf if it never does.
+
+    at, direction: of the ray on this axis. cell: the row or column.
+    """
+    if direction > 0.0:
+        return (cell + 1 - at) / direction
+    if direction < 0.0:
+        return (cell - at) / direction
+    return math.inf
+
+
+@kernel
+def _touch(sums: np.ndarray, row: int, column: int, evidence: int) -> None:
+    """Add the evidence of a beam to a cell. A sum is doubled, so that the lowest bit says that there is one."""
+    sums[row, column] = (sums[row, column] + 2 * evidence) | 1
 
 
 @kernel
@@ -94,11 +104,13 @@ def _follow_beam(
     tolerance: float,
     rows: int,
     columns: int,
-    votes: np.ndarray,
-    touched: np.ndarray,
-    count: int,
-) -> int:
-    """Touch the cells of one beam. reach, tolerance: in cells; negative tolerance: nothing was met.
+    sums: np.ndarray,
+    bottom: int,
+    left: int,
+) -> None:
+    """Touch the cells of one beam, but the first. reach, tolerance: in cells; negative tolerance: nothing was met.
+
+    sums: of a window of the map, from a row and a column on, that has all cells within reach.
 
     A wall's face is a border of cells, and the beam ended at it, give or take the tolerance. If it enters just one
     cell there, this one is occupied; if it enters several, as at a corner, it is no evidence for any of them. Cells
@@ -106,23 +118,32 @@ def _follow_beam(
     """
     column, row = int(u), int(v)
     du, dv = math.cos(angle_rad), math.sin(angle_rad)
-    count = _touch(row * columns + column, PASS, votes, touched, count)  # the robot stands here
-    wall, entered = NOWHERE, 0
+    right, above = (1 if du > 0.0 else -1), (1 if dv > 0.0 else -1)
+    across, up = border_share(u, du, column), border_share(v, dv, row)
+    limit, entered = reach + max(0.0, tolerance), 0
     while True:
-        row, column, share = next_cell(row, column, u, v, du, dv)
-        if not share <= reach + max(0.0, tolerance):
+        share = min(across, up)
+        if not share <= limit:
             break
+        if across <= up:
+            column += right
+            if not 0 <= column < columns:
+                return
+            across = border_share(u, du, column)
+        else:
+            row += above
+            if not 0 <= row < rows:
+                return
+            up = border_share(v, dv, row)
         entered += share >= reach - tolerance
-        if not (0 <= row < rows and 0 <= column < columns):
-            return count
-        wall = row * columns + column
         if entered == 0:
-            count = _touch(wall, PASS, votes, touched, count)
-    return _touch(wall, HIT, votes, touched, count) if entered == 1 else count
+            _touch(sums, row - bottom, column - left, PASS)
+    if entered == 1:
+        _touch(sums, row - bottom, column - left, HIT)
 
 
 @kernel
-def _integrate(
+def _read_scan(
     codes: np.ndarray,
     u: float,
     v: float,
@@ -132,38 +153,120 @@ def _integrate(
     tolerance: float,
     rows: int,
     columns: int,
-    votes: np.ndarray,
-    touched: np.ndarray,
-    odds: np.ndarray,
-    kinds: np.ndarray,
-    changed: np.ndarray,
+    sums: np.ndarray,
+    evidence: np.ndarray,
 ) -> int:
-    """Add one scan; how many cells changed their kind, as entries in `changed`."""
+    """Write what a scan is evidence of into `evidence`, as `ScanReader.read` does; how many cells these are.
+
+    sums: (high, wide) zeros, and so afterwards: of a window of the map around the robot.
+    """
     if not (0.0 <= u < columns and 0.0 <= v < rows):
         return 0
-    count, beams = 0, codes.shape[0]
+    high, wide = sums.shape
+    bottom = max(0, min(int(v) - high // 2, rows - high))
+    left = max(0, min(int(u) - wide // 2, columns - wide))
+    beams = codes.shape[0]
+    _touch(sums, int(v) - bottom, int(u) - left, PASS * beams)  # the robot stands here
     for beam in range(beams):
         angle_rad = beam_rad(heading_rad, field_of_view_rad, beams, beam)
         reach, margin = range_cells, -1.0
         if codes[beam] <= CODES:
             reach, margin = codes[beam] / CODES * range_cells, tolerance
-        count = _follow_beam(u, v, angle_rad, reach, margin, rows, columns, votes, touched, count)
-    changes = 0
-    for i in range(count):
-        cell = touched[i]
-        step = HIT if votes[cell] > 1 else PASS
-        votes[cell] = 0
-        odds[cell] = min(CERTAIN, max(-CERTAIN, odds[cell] + step))
+        _follow_beam(u, v, angle_rad, reach, margin, rows, columns, sums, bottom, left)
+    count = 0
+    for row in range(high):
+        for column in range(wide):
+            sum_ = sums[row, column]
+            if sum_ != 0:
+                sums[row, column] = 0
+                cell = (bottom + row) * columns + left + column
+                evidence[count] = 2 * cell + (1 if sum_ > 1 else 0)
+                count += 1
+    return count
+
+
+@kernel
+def _add(
+    evidence: np.ndarray,
+    codes: np.ndarray,
+    first: int,
+    stride: int,
+    odds: np.ndarray,
+    kinds: np.ndarray,
+    out: np.ndarray,
+) -> int:
+    """Add the evidence of a scan, and write entries into `out`: cells that changed, then ranges. How many these are.
+
+    The ranges of every stride-th beam are shared, beginning with the first.
+    """
+    count = 0
+    for i in range(evidence.shape[0]):
+        cell = evidence[i] >> 1
+        sum_ = odds[cell] + (HIT if evidence[i] & 1 else PASS)
+        odds[cell] = min(CERTAIN, max(-CERTAIN, sum_))
         kind = kinds[cell]
-        if odds[cell] > 0:
-            kind = OCCUPIED
-        elif odds[cell] < 0:
-            kind = FREE
+        if odds[cell] != 0:
+            kind = OCCUPIED if odds[cell] > 0 else FREE
         if kind != kinds[cell]:
             kinds[cell] = kind
-            changed[changes] = 2 * cell + (1 if kind == OCCUPIED else 0)
-            changes += 1
-    return changes
+            out[count] = 2 * cell + (1 if kind == OCCUPIED else 0)
+            count += 1
+    ranges = count
+    for beam in range(first, codes.shape[0], stride):
+        bin_ = min(np.int64(codes[beam]) * RANGE_BINS // CODES, RANGE_BINS - 1)
+        entry, at = 3 * kinds.shape[0] + bin_, count
+        while at > ranges and out[at - 1] > entry:
+            out[at] = out[at - 1]
+            at -= 1
+        out[at] = entry
+        count += 1
+    return count
+
+
+class ScanReader:
+    """Reads the scans of one kind of sensor on one map: of which cells they are evidence."""
+
+    def __init__(self, frame: Frame, sensor: SensorOptions) -> None:
+        self._frame = frame
+        range_cells = sensor.range_m / frame.resolution_m
+        noise_cells = min(3.0 * sensor.noise_m / frame.resolution_m, _NOISE_CELLS_MAX)
+        tolerance = range_cells / CODES + noise_cells
+        self._sensor = (
+            math.radians(sensor.field_of_view_deg),
+            range_cells,
+            tolerance,
+            frame.rows,
+            frame.columns,
+        )
+        side = 2 * math.ceil(min(range_cells + tolerance, frame.rows + frame.columns)) + 5
+        self._sums = np.zeros((min(side, frame.rows), min(side, frame.columns)), dtype=np.int32)
+        """(high, wide) scratch: all cells that a scan can tell of."""
+        self._found = np.empty(self._sums.size, dtype=np.int32)
+        self.read = lru_cache(_CELLS_KEPT // self._sums.size)(self._read)
+        """As `_read`. Whoever follows the record of a robot in its process reads the same scan again."""
+
+    @property
+    def cells_max(self) -> int:
+        """The most cells that a scan is evidence of."""
+        return self._sums.size
+
+    def _read(self, scan: bytes, pose: Pose) -> npt.NDArray[np.int32]:
+        """(k,) 2 cell + 1 for evidence that a cell is occupied, 2 cell that it is free, rising. Do not change it."""
+        count = _read_scan(
+            np.frombuffer(scan, dtype="<u2"),
+            *self._frame.uv(pose.x_m, pose.y_m),
+            pose.heading_rad,
+            *self._sensor,
+            self._sums,
+            self._found,
+        )
+        return self._found[:count].copy()
+
+
+@lru_cache(maxsize=1)
+def scan_reader(frame: Frame, sensor: SensorOptions) -> ScanReader:
+    """The reader of a mission, which all its robots in one process share."""
+    return ScanReader(frame, sensor)
 
 
 class OccupancyLog:
@@ -179,22 +282,12 @@ class OccupancyLog:
         """(cells,) evidence in 1/100 of log odds."""
         self.kinds = np.zeros(cells, dtype=np.uint8)
         """(cells,) UNKNOWN, FREE or OCCUPIED."""
-        self._frame = frame
         self._beams = sensor.beams
         self._ranges = ranges
-        range_cells = sensor.range_m / frame.resolution_m
-        noise_cells = min(3.0 * sensor.noise_m / frame.resolution_m, _NOISE_CELLS_MAX)
-        self._sensor = (
-            math.radians(sensor.field_of_view_deg),
-            range_cells,
-            range_cells / CODES + noise_cells,
-            frame.rows,
-            frame.columns,
-        )
+        self._stride = max(1, self._beams // _SHARED_BEAMS)
         self._scans = 0
-        self._votes = np.zeros(cells, dtype=np.int32)
-        self._touched = np.zeros(cells, dtype=np.int64)
-        self._changed = np.zeros(cells, dtype=np.int64)
+        self._reader = scan_reader(frame, sensor)
+        self._entries = np.empty(self._reader.cells_max + self._beams, dtype=np.int64)
 
     def observe(self, scan: bytes, pose: Pose, *, moved: bool) -> npt.NDArray[np.int64]:
         """Add a scan made at a pose: (k,) entries for the log, rising. A scan of the wrong size is dropped.
@@ -203,27 +296,15 @@ class OccupancyLog:
         """
         if len(scan) != 2 * self._beams:
             return np.zeros(0, dtype=np.int64)
-        codes = np.frombuffer(scan, dtype="<u2")
-        count = _integrate(
-            codes,
-            *self._frame.uv(pose.x_m, pose.y_m),
-            pose.heading_rad,
-            *self._sensor,
-            self._votes,
-            self._touched,
+        self._scans += 1
+        shares = self._ranges and moved
+        count = _add(
+            self._reader.read(scan, pose),
+            np.frombuffer(scan, dtype="<u2"),
+            self._scans % self._stride if shares else self._beams,
+            self._stride,
             self.odds,
             self.kinds,
-            self._changed,
+            self._entries,
         )
-        self._scans += 1
-        changes = np.sort(self._changed[:count])
-        if self._ranges and moved:
-            changes = np.concatenate((changes, self._ranges_in(codes)))
-        return changes
-
-    def _ranges_in(self, codes: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-        """(k,) entries of the measured ranges of a few beams, other ones in each scan."""
-        stride = max(1, self._beams // _SHARED_BEAMS)
-        some = codes[self._scans % stride :: stride].astype(np.int64)
-        bins = np.minimum(some * RANGE_BINS // CODES, RANGE_BINS - 1)
-        return np.sort(bins) + 3 * self._frame.cells
+        return self._entries[:count].copy()

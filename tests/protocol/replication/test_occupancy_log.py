@@ -17,6 +17,7 @@ from kantor_protocol.replication.occupancy_log import (
     PASS,
     RANGE_BINS,
     OccupancyLog,
+    ScanReader,
     beam_rad,
     bump,
     dead_frontier,
@@ -28,6 +29,7 @@ from kantor_protocol.scenario.schema import SensorOptions
 from kantor_worldsim.world.maps import Ground
 from kantor_worldsim.world.sensors import RangeFinder
 from support.grounds import Place, drawn, places
+from support.references.plain_scan import evidence_of
 from support.strategies import examples
 
 BEAMS = st.sampled_from([1, 4, 8, 24, 360]) | st.integers(1, 400)
@@ -286,6 +288,26 @@ def test_from_outside_a_scan_says_nothing(
     inside = 0.0 <= x_m < 3.0 and 0.0 <= y_m < 2.0
 
     assert evidence.odds.any() == inside
+
+
+@examples(300)
+@given(
+    place=places(),
+    range_cells=RANGES_CELLS,
+    scan=st.lists(st.integers(0, NO_RETURN), min_size=1, max_size=24),
+    view_deg=VIEWS_DEG,
+    noise_cells=st.sampled_from([0.0, 0.1, 0.5]),
+)
+def test_scan_is_read_as_by_the_plain_reference(
+    place: Place, range_cells: float, scan: list[int], view_deg: float, noise_cells: float
+) -> None:
+    """Cells and evidence are exactly those of the reference, whatever the ranges say."""
+    (frame, _), pose = place
+    sensor = sensor_of(place[0], range_cells, len(scan), view_deg, noise_cells)
+    evidence = ScanReader(frame, sensor).read(codes(*scan), pose).tolist()
+
+    expected = evidence_of(frame, sensor, scan, pose)
+    assert evidence == [2 * cell + occupied for cell, occupied in expected]
 
 
 # With noise.
