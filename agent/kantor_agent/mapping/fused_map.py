@@ -12,90 +12,108 @@ that has nothing else to do may try each once more, and those that do so at the 
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.grid import FREE, OCCUPIED, UNKNOWN, Frame
+from kantor_agent.mapping.routes import Box
+from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame, neighbour
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.replication.occupancy_log import CERTAIN, RANGE_BINS
 from kantor_protocol.replication.replica import Replica
 
-_P_OCC = 1.0 / (1.0 + np.exp(-np.array([-1.0, 0.0, 1.0]) * CERTAIN / 100.0))
+P_OCC = 1.0 / (1.0 + np.exp(-np.array([-1.0, 0.0, 1.0]) * CERTAIN / 100.0))
 """Probability of occupancy where more layers say free, as many say either, or more say occupied."""
 
-LIVE, GIVEN_UP = 0, 1
-"""Frontiers that robots head for, and those that they have given up."""
+NO_BOX = (1 << 31, 0, 1 << 31, 0)
+"""A box without cells: rows and columns from and below."""
+
+
+@kernel
+def _is_beside_unknown(cells: np.ndarray, cell: int, columns: int) -> bool:
+    column = cell % columns
+    return bool(
+        (column > 0 and cells[cell - 1] == UNKNOWN)
+        or (column + 1 < columns and cells[cell + 1] == UNKNOWN)
+        or (cell >= columns and cells[cell - columns] == UNKNOWN)
+        or (cell + columns < cells.shape[0] and cells[cell + columns] == UNKNOWN)
+    )
+
+
+@kernel
+def _vote(kind: int) -> int:
+    """What a layer says of a cell: 1 that it is occupied, -1 that it is free, or 0."""
+    return (kind == OCCUPIED) - (kind == FREE)
+
+
+@kernel
+def _renew_frontier(
+    cells: np.ndarray,
+    columns: int,
+    cell: int,
+    dead_frontiers: np.ndarray,
+    given_up: np.ndarray,
+    live: np.ndarray,
+) -> None:
+    """Note whether a cell is a frontier that is neither dead nor given up."""
+    open_ = cells[cell] == FREE and not dead_frontiers[cell] and given_up[cell] <= 0
+    live[cell] = open_ and _is_beside_unknown(cells, cell, columns)
 
 
 @kernel
 def _fold(
-    log: np.ndarray,
-    first: int,
-    length: int,
-    layer: np.ndarray,
+    logs: np.ndarray,
+    lengths: np.ndarray,
+    folded: np.ndarray,
+    columns: int,
+    layers: np.ndarray,
     votes: np.ndarray,
     cells: np.ndarray,
     dead_frontiers: np.ndarray,
     given_up: np.ndarray,
     bumps: np.ndarray,
     ranges: np.ndarray,
+    live: np.ndarray,
+    boxes: np.ndarray,
 ) -> bool:
-    """Apply the entries log[first:length] of one origin; whether any is about a cell. cells: (n,) fused."""
+    """Apply the entries of every log that were not folded yet; whether any is about a cell."""
     count = cells.shape[0]
     beyond = 3 * count + ranges.shape[0]
     changed = False
-    for i in range(first, length):
-        entry = log[i, 0]
-        if 3 * count <= entry < beyond:
-            ranges[entry - 3 * count] += 1
-            continue
-        changed = True
-        if entry >= beyond + 2 * count:
-            cell = entry - beyond - 2 * count
-            bumps[cell] = True
-            cells[cell] = OCCUPIED
-        elif entry >= beyond + count:
-            given_up[entry - beyond - count] -= 1
-        elif entry >= beyond:
-            given_up[entry - beyond] += 1
-        elif entry >= 2 * count:
-            dead_frontiers[entry - 2 * count] = True
-        elif entry >= 0:
-            cell, kind = entry // 2, OCCUPIED if entry & 1 else FREE
-            votes[cell] += (1 if kind == OCCUPIED else -1) - (
-                0 if layer[cell] == UNKNOWN else 1 if layer[cell] == OCCUPIED else -1
-            )
-            layer[cell] = kind
-            free = votes[cell] < 0 and not bumps[cell]
-            cells[cell] = FREE if free else OCCUPIED  # in doubt there is a wall
+    for origin in range(lengths.shape[0]):
+        box = boxes[origin]
+        for i in range(folded[origin], lengths[origin]):
+            entry = logs[origin, i, 0]
+            if 3 * count <= entry < beyond:
+                ranges[entry - 3 * count] += 1
+                continue
+            changed = True
+            if entry >= beyond + 2 * count:
+                cell, kind = entry - beyond - 2 * count, OCCUPIED
+                bumps[cell] = True
+            elif entry >= 2 * count:
+                cell = (entry if entry < 3 * count else entry - beyond) % count
+                if entry < 3 * count:
+                    dead_frontiers[cell] = True
+                else:
+                    given_up[cell] += 1 if entry < beyond + count else -1
+                _renew_frontier(cells, columns, cell, dead_frontiers, given_up, live)
+                continue
+            else:
+                cell, kind = entry >> 1, OCCUPIED if entry & 1 else FREE
+                votes[cell] += _vote(kind) - _vote(layers[origin, cell])
+                layers[origin, cell] = kind
+                free = votes[cell] < 0 and not bumps[cell]
+                kind = FREE if free else OCCUPIED  # in doubt there is a wall
+            before, cells[cell] = cells[cell], kind
+            row, column = cell // columns, cell % columns
+            box[0], box[1] = min(box[0], row), max(box[1], row + 1)
+            box[2], box[3] = min(box[2], column), max(box[3], column + 1)
+            if before != kind:
+                _renew_frontier(cells, columns, cell, dead_frontiers, given_up, live)
+            if before == UNKNOWN:
+                for side in range(4):
+                    n = neighbour(cell, side, columns, count)
+                    if n != NOWHERE:
+                        _renew_frontier(cells, columns, n, dead_frontiers, given_up, live)
+        folded[origin] = lengths[origin]
     return changed
-
-
-@kernel
-def _find_frontiers(
-    cells: np.ndarray,
-    dead_frontiers: np.ndarray,
-    given_up: np.ndarray,
-    columns: int,
-    wanted: int,
-    out: np.ndarray,
-) -> int:
-    """Write frontiers into out (cells,), rising; returns how many there are.
-
-    wanted: GIVEN_UP for those that are given up, LIVE for the others.
-    """
-    count = 0
-    total = cells.shape[0]
-    for cell in range(total):
-        if cells[cell] != FREE or dead_frontiers[cell] or (given_up[cell] > 0) != wanted:
-            continue
-        column = cell % columns
-        if (
-            (column > 0 and cells[cell - 1] == UNKNOWN)
-            or (column + 1 < columns and cells[cell + 1] == UNKNOWN)
-            or (cell >= columns and cells[cell - columns] == UNKNOWN)
-            or (cell + columns < total and cells[cell + columns] == UNKNOWN)
-        ):
-            out[count] = cell
-            count += 1
-    return count
 
 
 class FusedMap:
@@ -126,11 +144,13 @@ class FusedMap:
         """(cells,) layers that say occupied, less those that say free."""
         self._folded = np.zeros(origins, dtype=np.int64)
         """(origins,) entries of each log that have been folded: at most as many as the log has."""
-        self._found = np.zeros(frame.cells, dtype=np.int64)
-        """(cells,) output of `_find_frontiers`."""
-        self._frontiers = self._found[:0]
-        """The frontiers, by the arrays above, while `_frontiers_of` is `revision`, else out of date."""
+        self._live = np.zeros(frame.cells, dtype=np.bool_)
+        """(cells,) whether a cell is among the `frontiers`."""
+        self._frontiers: npt.NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        """The places in `_live` while `_frontiers_of` is `revision`, else out of date."""
         self._frontiers_of = -1
+        self._boxes = np.tile(NO_BOX, (origins, 1))
+        """(origins, 4) as `routes.Box`: where entries of each log have changed cells since `take_boxes`."""
 
     def validate(self, replica: Replica) -> None:
         """Assert what the attributes say of one another and of the logs. replica: the one that was folded."""
@@ -163,43 +183,59 @@ class FusedMap:
         fused[(self._layers == UNKNOWN).all(axis=0)] = UNKNOWN
         fused[self.bumps] = OCCUPIED
         assert np.array_equal(self.cells, fused)
+        unknown = np.pad((fused == UNKNOWN).reshape(shape), 1)
+        beside = unknown[1:-1, :-2] | unknown[1:-1, 2:] | unknown[:-2, 1:-1] | unknown[2:, 1:-1]
+        given_up_now = dead_frontiers | (self._given_up > 0)
+        live = (fused == FREE) & beside.ravel() & ~given_up_now
+        assert np.array_equal(self._live, live)
         if self._frontiers_of == self.revision:
-            unknown = np.pad((fused == UNKNOWN).reshape(shape), 1)
-            beside = unknown[1:-1, :-2] | unknown[1:-1, 2:] | unknown[:-2, 1:-1] | unknown[2:, 1:-1]
-            given_up_now = dead_frontiers | (self._given_up > 0)
-            found = np.flatnonzero((fused == FREE) & beside.ravel() & ~given_up_now)
-            assert np.array_equal(self._frontiers, found)
+            assert np.array_equal(self._frontiers, np.flatnonzero(live))
 
     def fold(self, replica: Replica) -> bool:
         """Take in the entries that the logs have gained; whether a cell may have changed."""
         if replica.origins > self._folded.shape[0]:
             self._widen(replica.origins)
-        lengths = replica.store.length
-        before = self.revision
-        for origin in np.flatnonzero(lengths > self._folded).tolist():
-            changed = _fold(
-                replica.store.logs[origin],
-                int(self._folded[origin]),
-                int(lengths[origin]),
-                self._layers[origin],
-                self._votes,
-                self.cells,
-                self.dead_frontiers,
-                self._given_up,
-                self.bumps,
-                self.ranges,
-            )
-            self._folded[origin] = lengths[origin]
-            self.revision = before + 1 if changed else self.revision
-        return self.revision > before
+        changed: bool = _fold(
+            replica.store.logs,
+            replica.store.length,
+            self._folded,
+            self.frame.columns,
+            self._layers,
+            self._votes,
+            self.cells,
+            self.dead_frontiers,
+            self._given_up,
+            self.bumps,
+            self.ranges,
+            self._live,
+            self._boxes,
+        )
+        self.revision += changed
+        return changed
+
+    def take_boxes(self) -> list[Box]:
+        """The parts of the map within which cells have changed since this was last asked."""
+        boxes = [Box(*box) for box in self._boxes.tolist() if box[0] < box[1]]
+        if boxes:
+            self._boxes[:] = NO_BOX
+        return boxes
 
     def _widen(self, origins: int) -> None:
         """Add layers for new incarnations."""
-        layers, folded = self._layers, self._folded
+        layers, folded, boxes = self._layers, self._folded, self._boxes
         self._layers = np.zeros((origins, self.frame.cells), dtype=np.uint8)
         self._layers[: layers.shape[0]] = layers
         self._folded = np.zeros(origins, dtype=np.int64)
         self._folded[: folded.shape[0]] = folded
+        self._boxes = np.tile(NO_BOX, (origins, 1))
+        self._boxes[: boxes.shape[0]] = boxes
+
+    @property
+    def evidence(
+        self,
+    ) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.int16], npt.NDArray[np.bool_]]:
+        """`cells`, the layers that say occupied less those that say free, and `bumps`, (cells,) each."""
+        return self.cells, self._votes, self.bumps
 
     @property
     def frontiers(self) -> npt.NDArray[np.int64]:
@@ -208,18 +244,20 @@ class FusedMap:
         Do not change the array.
         """
         if self._frontiers_of != self.revision:
-            self._frontiers = self._find(LIVE)
+            self._frontiers = np.flatnonzero(self._live)
             self._frontiers_of = self.revision
         return self._frontiers
 
     def given_up_frontiers(self) -> npt.NDArray[np.int64]:
         """Frontiers that are given up and not dead, rising."""
-        return self._find(GIVEN_UP)
-
-    def _find(self, wanted: int) -> npt.NDArray[np.int64]:
-        masks = (self.cells, self.dead_frontiers, self._given_up)
-        count = _find_frontiers(*masks, self.frame.columns, wanted, self._found)
-        return self._found[:count].copy()
+        columns, out = self.frame.columns, np.flatnonzero(self._given_up > 0)
+        would_be = [
+            self.cells[cell] == FREE
+            and not self.dead_frontiers[cell]
+            and _is_beside_unknown(self.cells, cell, columns)
+            for cell in out.tolist()
+        ]
+        return out[np.array(would_be, dtype=np.bool_)]
 
     def is_abandoned(self, cell: int) -> bool:
         """Whether a cell is a dead frontier, or one that is given up."""
@@ -227,13 +265,11 @@ class FusedMap:
 
     def is_frontier(self, cell: int) -> bool:
         """Whether a cell is among the frontiers."""
-        frontiers = self.frontiers
-        at = int(np.searchsorted(frontiers, cell))
-        return at < frontiers.shape[0] and int(frontiers[at]) == cell
+        return 0 <= cell < self.frame.cells and bool(self._live[cell])
 
     def p_occ(self) -> npt.NDArray[np.float64]:
         """(cells,) probability of occupancy, 0.5 where nothing is known."""
-        return np.asarray(np.where(self.bumps, _P_OCC[2], _P_OCC[np.sign(self._votes) + 1]))
+        return np.asarray(np.where(self.bumps, P_OCC[2], P_OCC[np.sign(self._votes) + 1]))
 
     def explored(self) -> npt.NDArray[np.bool_]:
         """(cells,) whether any layer knows the cell."""

@@ -16,11 +16,11 @@ the ring of buckets holds, a binary heap settles the cells, with the same number
 
 import itertools
 import math
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import gaussian_filter
 
 from kantor_protocol.base.grid import CELLS_MAX
 from kantor_protocol.base.kernels import kernel
@@ -50,44 +50,82 @@ _LOWEST_BIT = np.array([0] + [(byte & -byte).bit_length() - 1 for byte in range(
 """Number of the lowest bit that is set, for each byte; 0 for 0."""
 
 
+class Box(NamedTuple):
+    """A part of a map: rows and columns from and below."""
+
+    bottom: int
+    top: int
+    left: int
+    right: int
+
+    def wider(self, cells: int, rows: int, columns: int) -> "Box":
+        """The box and so many cells around it, as far as a map of this size has them."""
+        return Box(
+            max(0, self.bottom - cells),
+            min(rows, self.top + cells),
+            max(0, self.left - cells),
+            min(columns, self.right + cells),
+        )
+
+
 @kernel
 def possible_moves(
     cost: np.ndarray,
     rows: int,
     columns: int,
-    price: np.ndarray,
+    bottom: int,
+    top: int,
+    left: int,
+    right: int,
     passable: np.ndarray,
     moves: np.ndarray,
 ) -> tuple[float, float]:
-    """Find the steps that can be taken from every cell; returns the lowest and the highest cost.
+    """Find the steps that can be taken, after costs have changed in a box; the lowest and the highest cost in it.
 
-    cost: (rows * columns,) float64. Outputs: price, a copy of it; passable, (rows + 2, columns + 2) bytes
-    with a margin of zeros; moves, (rows * columns,) bytes with a bit for every step.
+    cost: (rows * columns,) float64. Outputs: passable, (rows + 2, columns + 2) bytes with a margin of zeros;
+    moves, (rows * columns,) bytes with a bit for every step.
     """
     least, most = math.inf, 0.0
-    for row in range(rows):
-        for column in range(columns):
+    for row in range(bottom, top):
+        for column in range(left, right):
             here = cost[row * columns + column]
             good = 0.0 < here < math.inf
-            price[row * columns + column] = here
             passable[row + 1, column + 1] = good
             least = min(least, here if good else math.inf)
             most = max(most, here if good else 0.0)
-    for row in range(rows):
-        for column in range(columns):
+    for row in range(max(0, bottom - 1), min(rows, top + 1)):
+        for column in range(max(0, left - 1), min(columns, right + 1)):
             down, up = passable[row, column + 1], passable[row + 2, column + 1]
-            left, right = passable[row + 1, column], passable[row + 1, column + 2]
+            west, east = passable[row + 1, column], passable[row + 1, column + 2]
             moves[row * columns + column] = (
-                (down & left & passable[row, column])
+                (down & west & passable[row, column])
                 | down << 1
-                | (down & right & passable[row, column + 2]) << 2
-                | left << 3
-                | right << 4
-                | (up & left & passable[row + 2, column]) << 5
+                | (down & east & passable[row, column + 2]) << 2
+                | west << 3
+                | east << 4
+                | (up & west & passable[row + 2, column]) << 5
                 | up << 6
-                | (up & right & passable[row + 2, column + 2]) << 7
+                | (up & east & passable[row + 2, column + 2]) << 7
             )
     return least, most
+
+
+@kernel
+def _mark(targets: np.ndarray, enough: int, wanted: np.ndarray) -> int:
+    """Mark targets in `wanted` (cells,); how many are to be settled, -1 if there is no target on the map."""
+    count = 0
+    for i in range(targets.shape[0]):
+        if 0 <= targets[i] < wanted.shape[0] and not wanted[targets[i]]:
+            wanted[targets[i]] = True
+            count += 1
+    return min(count, enough) if count > 0 else -1
+
+
+@kernel
+def _unmark(targets: np.ndarray, wanted: np.ndarray) -> None:
+    for i in range(targets.shape[0]):
+        if 0 <= targets[i] < wanted.shape[0]:
+            wanted[targets[i]] = False
 
 
 @kernel
@@ -96,15 +134,19 @@ def spread_by_buckets(
     moves: np.ndarray,
     offsets: np.ndarray,
     source: int,
-    until: int,
+    targets: np.ndarray,
+    enough: int,
     least: float,
     value: np.ndarray,
     around: np.ndarray,
+    wanted: np.ndarray,
     heads: np.ndarray,
     links: np.ndarray,
     members: np.ndarray,
-) -> None:
-    """Settle all cells, or those up to `until`. `value` is infinite before, and the source passable.
+) -> tuple[int, int]:
+    """Settle all cells, or as many targets as are enough; the lowest and the highest cell that was reached.
+
+    `value` is infinite before, and the source passable. wanted: (cells,) False, and so afterwards.
 
     around: the memory of `value` with a margin at both ends, columns + 1 wide, so that all eight
     neighbours can be compared without first testing which of them exist: one branch that is hard to
@@ -120,6 +162,7 @@ def spread_by_buckets(
     heads[0], links[0], members[0] = 0, -1, source
     value[source] = 0.0
     queued, used, spare, bucket = 1, 1, -1, 0
+    lowest, highest, left = source, source, _mark(targets, enough, wanted)
     while queued > 0:
         entry = heads[bucket & (_RING - 1)]
         if entry < 0:
@@ -132,8 +175,11 @@ def spread_by_buckets(
         cell = int(members[entry])
         if int(value[cell] * per) != bucket:
             continue
-        if cell == until:
-            return
+        if wanted[cell]:
+            wanted[cell] = False
+            left -= 1
+            if left == 0:
+                break
         straight, slant = value[cell] + price[cell], value[cell] + _SLANT * price[cell]
         better = 0
         for step in range(8):
@@ -147,6 +193,7 @@ def spread_by_buckets(
             offer = slant if (_SLANTED >> step) & 1 else straight
             before = value[n]
             value[n] = offer
+            lowest, highest = min(lowest, n), max(highest, n)
             new = int(offer * per)
             if before < math.inf and int(before * per) == new:
                 continue
@@ -158,6 +205,8 @@ def spread_by_buckets(
             links[entry] = heads[new & (_RING - 1)]
             heads[new & (_RING - 1)] = entry
             queued += 1
+    _unmark(targets, wanted)
+    return lowest, highest
 
 
 @kernel
@@ -196,22 +245,27 @@ def spread_by_heap(
     moves: np.ndarray,
     offsets: np.ndarray,
     source: int,
-    until: int,
+    targets: np.ndarray,
+    enough: int,
     value: np.ndarray,
+    wanted: np.ndarray,
     heap: np.ndarray,
     place: np.ndarray,
-) -> None:
+) -> tuple[int, int]:
     """`spread_by_buckets` for any costs.
 
     heap, place: (cells,) scratch: the cell at each place of the heap, and the place of each cell.
     """
     value[source] = 0.0
     heap[0], place[source], size = source, 0, 1
+    lowest, highest, left = source, source, _mark(targets, enough, wanted)
     while size > 0:
         cell = _pop_least(value, heap, place, size)
         size -= 1
-        if cell == until:
-            return
+        if wanted[cell]:
+            left -= 1
+            if left == 0:
+                break
         straight, slant = value[cell] + price[cell], value[cell] + _SLANT * price[cell]
         for step in range(8):
             if not (moves[cell] >> step) & 1:
@@ -224,7 +278,10 @@ def spread_by_heap(
                 place[n] = size
                 size += 1
             value[n] = offer
+            lowest, highest = min(lowest, n), max(highest, n)
             _rise(value, heap, place, n, place[n])
+    _unmark(targets, wanted)
+    return lowest, highest
 
 
 @kernel
@@ -263,58 +320,99 @@ def trace(
     return 0
 
 
-class Routes:
-    """The value function over one grid, with its scratch arrays: a call allocates nothing but a way."""
+class Scratch:
+    """What a spread works with. Memory that no spread has needed is not touched."""
 
     def __init__(self, rows: int, columns: int) -> None:
-        """Raises ValueError if there is no cell, or more than `CELLS_MAX`."""
+        cells = rows * columns
+        self.around = np.full(cells + 2 * (columns + 1), np.inf)
+        self.value = self.around[columns + 1 : -(columns + 1)]
+        """(cells,) infinite but between the two cells of `reached`."""
+        self.reached = (0, -1)
+        self.wanted = np.zeros(cells, dtype=np.bool_)
+        self.heads = np.empty(_RING, dtype=np.int32)
+        self.links = np.empty(_ENTRIES * cells, dtype=np.int32)
+        self.members = np.empty(_ENTRIES * cells, dtype=np.int32)
+        self.way = np.empty(cells, dtype=np.int32)
+
+    def clear(self) -> None:
+        """Make all values infinite."""
+        lowest, highest = self.reached
+        self.value[lowest : highest + 1] = np.inf
+        self.reached = (0, -1)
+
+
+@lru_cache(maxsize=1)
+def shared_scratch(rows: int, columns: int) -> Scratch:
+    """For all in one process whose values nobody reads after the next spread of another."""
+    return Scratch(rows, columns)
+
+
+class Routes:
+    """The value function over one grid, and the ways by it."""
+
+    def __init__(self, rows: int, columns: int, scratch: Scratch | None = None) -> None:
+        """scratch: by default of its own. Raises ValueError if there is no cell, or more than `CELLS_MAX`."""
         if rows < 1 or columns < 1 or rows * columns > CELLS_MAX:
             raise ValueError(f"a grid of {rows} x {columns} cells: 1 to {CELLS_MAX} are possible")
         self.rows, self.columns, self.cells = rows, columns, rows * columns
-        self._around = np.full(self.cells + 2 * (columns + 1), np.inf)
-        self._value = self._around[columns + 1 : -(columns + 1)]
+        self.cost = np.zeros(self.cells)
+        """(cells,) of crossing a cell, row by row; not passable unless it is finite and above 0."""
+        self._least, self._most = math.inf, 0.0
+        """No cost is lower, and none higher, of cells that are passable."""
         self._source = -1
-        self._price = np.empty(self.cells)
         self._passable = np.zeros((rows + 2, columns + 2), dtype=np.uint8)
         self._moves = np.zeros(self.cells, dtype=np.uint8)
         across = (-1, 0, 1)
         steps = [columns * i + j for i in across for j in across if (i, j) != (0, 0)]
         self._offsets = np.array(steps, dtype=np.int64)
-        self._heads = np.empty(_RING, dtype=np.int32)
-        # Few entries are ever in use: the memory of the others is not touched.
-        self._links = np.empty(_ENTRIES * self.cells, dtype=np.int32)
-        self._members = np.empty(_ENTRIES * self.cells, dtype=np.int32)
-        self._way = np.empty(self.cells, dtype=np.int64)
+        self._scratch = scratch or Scratch(rows, columns)
+
+    def renew(self, box: Box) -> None:
+        """Take in that costs have changed within a box."""
+        grid = (self.cost, self.rows, self.columns, *box)
+        least, most = possible_moves(*grid, self._passable, self._moves)
+        self._least, self._most = min(self._least, least), max(self._most, most)
 
     def spread(
         self, cost: npt.NDArray[np.float64], source: int, *, until: int = -1
     ) -> npt.NDArray[np.float64]:
-        """(cells,) the value function: the cost of the way from the source to every cell, inf without a way.
+        """`spread_from` with other costs (cells,): up to one cell, or to all.
 
-        cost: (cells,) of crossing a cell, row by row; not passable unless it is finite and above 0.
-        until: stop as soon as the value of this cell is final; others may be too high. If the source is
-        no passable cell, no cell is reached, not even the source.
-
-        The array belongs to this object: read it only, the next call overwrites it. Raises ValueError if
-        there are not as many costs as cells.
+        Raises ValueError if there are not as many costs as cells.
         """
         if cost.shape != (self.cells,):
             raise ValueError(f"costs of shape {cost.shape} for {self.cells} cells")
-        cost = np.ascontiguousarray(cost, dtype=np.float64)
-        least, most = possible_moves(
-            cost, self.rows, self.columns, self._price, self._passable, self._moves
-        )
-        self._source = int(source)
-        self._value.fill(np.inf)
-        if not (0 <= source < self.cells and 0.0 < cost[source] < math.inf):
-            return self._value
-        graph = (self._price, self._moves, self._offsets, int(source), int(until))
+        self.cost[:] = cost
+        self._least, self._most = math.inf, 0.0
+        self.renew(Box(0, self.rows, 0, self.columns))
+        return self.spread_from(source, np.array([until]))
+
+    def spread_from(
+        self, source: int, targets: npt.NDArray[np.int64], enough: int = CELLS_MAX
+    ) -> npt.NDArray[np.float64]:
+        """(cells,) the value function: the cost of the way from the source to every cell, inf without a way.
+
+        targets: stop as soon as the values of so many of these cells as are enough are final; others may be too
+        high. Cells that are not on the map do not count, and without any all values are final. If the source is no
+        passable cell, no cell is reached, not even the source.
+
+        The array belongs to the scratch: read it only, the next spread overwrites it.
+        """
+        scratch, source = self._scratch, int(source)
+        self._source = source
+        scratch.clear()
+        if not (0 <= source < self.cells and 0.0 < self.cost[source] < math.inf):
+            return scratch.value
+        graph = (self.cost, self._moves, self._offsets, source, targets, enough)
+        room = (scratch.links, scratch.members)
+        least, most = self._least, self._most
         if most <= RATIO_MAX * least and least >= _LEAST and most <= _MOST:
-            buckets = (self._heads, self._links, self._members)
-            spread_by_buckets(*graph, least, self._value, self._around, *buckets)
+            values = (scratch.value, scratch.around, scratch.wanted, scratch.heads)
+            scratch.reached = spread_by_buckets(*graph, least, *values, *room)
         else:
-            spread_by_heap(*graph, self._value, self._links, self._members)
-        return self._value
+            scratch.reached = spread_by_heap(*graph, scratch.value, scratch.wanted, *room)
+        return scratch.value
 
     def way(self, target: int) -> npt.NDArray[np.int64]:
         """The cells of the way from the source of the last `spread` to the target, both ends included.
@@ -323,16 +421,10 @@ class Routes:
         that their sum does not grow. Of ways that cost the same it is, seen from the target, the one whose
         last cells have the lowest value, then the lowest index.
         """
-        count = trace(
-            self._price,
-            self._moves,
-            self._offsets,
-            self._source,
-            target,
-            self._value,
-            self._way,
-        )
-        return self._way[:count][::-1].copy()
+        scratch = self._scratch
+        graph = (self.cost, self._moves, self._offsets, self._source, target)
+        count = trace(*graph, scratch.value, scratch.way)
+        return scratch.way[:count][::-1].astype(np.int64)
 
 
 def iterate_once(
@@ -367,6 +459,28 @@ def length_cost(passable: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:
     return np.where(passable, 1.0, np.inf).ravel()
 
 
+def gaussian(sigma_cells: float) -> npt.NDArray[np.float64]:
+    """(reach + 1,) weights of a Gaussian that ends after `TRUNCATE` standard deviations, from its middle."""
+    reach = int(TRUNCATE * sigma_cells + 0.5)
+    if reach == 0:
+        return np.ones(1)
+    bell = np.exp(-0.5 / (sigma_cells * sigma_cells) * np.arange(-reach, reach + 1) ** 2)
+    return np.asarray((bell / bell.sum())[reach:])
+
+
+def _smoothed_rows(
+    table: npt.NDArray[np.float64], weights: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """(rows, columns) a table smoothed across its rows; it goes on beyond its border as it is there."""
+    reach, rows = weights.shape[0] - 1, table.shape[0]
+    around = np.pad(table, ((reach, reach), (0, 0)), mode="edge")
+    smooth: npt.NDArray[np.float64] = table * weights[0]
+    for k in range(reach, 0, -1):
+        both = around[reach - k : reach - k + rows] + around[reach + k : reach + k + rows]
+        smooth += both * weights[k]
+    return smooth
+
+
 def smoothed_cost(
     p_occ: npt.NDArray[np.float64],
     explored: npt.NDArray[np.bool_],
@@ -380,9 +494,10 @@ def smoothed_cost(
     explored counts as `UNKNOWN`, the map goes on beyond its border as it is there, the Gaussian ends after
     `TRUNCATE` standard deviations, and the costs are at least `COST_MIN`. A cell is passable if it is
     explored and its occupancy is below `p_max` before smoothing: a step is charged by the cell that it
-    leaves, so that it would be cheap to step into a wall.
+    leaves, so that it would be cheap to step into a wall. Slow and plain: `cost_map.py` renews costs in part.
     """
-    known = np.where(explored, p_occ, UNKNOWN)
-    smooth = gaussian_filter(known, sigma_cells, mode="nearest", truncate=TRUNCATE)
+    smooth, weights = np.where(explored, p_occ, UNKNOWN), gaussian(sigma_cells)
+    for _ in range(2):  # rows, then columns
+        smooth = _smoothed_rows(smooth, weights).T
     passable = explored & (p_occ < p_max)
     return np.where(passable, np.maximum(smooth, COST_MIN), np.inf).ravel()

@@ -150,7 +150,7 @@ class Burgard:
     def assign(self, situation: Situation, /) -> list[Task]:
         """A frontier for each member; no target for those that can reach none."""
         cost_map, frontiers = situation.cost_map, situation.frontiers
-        ways = [cost_map.travel(member.cell)[frontiers] for member in situation.members]
+        ways = [cost_map.travel(member.cell, frontiers) for member in situation.members]
         value = np.array(ways) / cost_map.sensor_cells
         picked = (
             self._coordinated(situation, value) if self._planner.coordinated else _cheapest(value)

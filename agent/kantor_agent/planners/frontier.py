@@ -36,7 +36,7 @@ class Frontier:
         if member.arrived and member.task.target not in visited:
             visited.append(member.task.target)
         frontiers = situation.frontiers
-        travel = situation.cost_map.travel(member.cell)[frontiers]
+        travel = situation.cost_map.travel(member.cell, frontiers)
         fresh = np.where(np.isin(frontiers, visited), np.inf, travel)
         for costs in (fresh, travel):
             if np.isfinite(costs).any():

@@ -59,7 +59,7 @@ class Hungarian:
         cost_map, frontiers = situation.cost_map, situation.frontiers
         if frontiers.size == 0:
             return [Task() for _ in situation.members]
-        ways = [cost_map.travel(member.cell)[frontiers] for member in situation.members]
+        ways = [cost_map.travel(member.cell, frontiers) for member in situation.members]
         travel = np.array(ways)
         picked = travel.argmin(axis=1)
         spots = _find_spots(situation, travel.min(axis=0))

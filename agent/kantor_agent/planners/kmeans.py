@@ -379,7 +379,7 @@ class KMeans:
         team = sorted((*members, *others), key=lambda member: member.robot)
         cells = np.array([member.cell for member in team])
         starts = np.array([self._start(member, cost_map.frame) for member in team])
-        travel = np.stack([cost_map.travel(member.cell)[frontiers] for member in team])
+        travel = np.stack([cost_map.travel(member.cell, frontiers) for member in team])
         regions = Regions(cost_map, frontiers, cells, starts, travel)
         mine = [team.index(member) for member in members]
         targets = choose_targets(situation, regions, travel, mine)

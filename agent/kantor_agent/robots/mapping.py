@@ -204,7 +204,7 @@ class MappingRobot:
         """Try the frontiers that were given up and to which there is a way now; whether there are any."""
         frontiers = self._fused_map.given_up_frontiers()
         cell = self._frame.cell_of(self._pose.x_m, self._pose.y_m)
-        reachable = frontiers[np.isfinite(self._cost_map.travel(cell)[frontiers])]
+        reachable = frontiers[np.isfinite(self._cost_map.travel(cell, frontiers))]
         again = [each for each in reachable.tolist() if each not in self._tried_again]
         self._tried_again.update(again)
         if again:
@@ -242,7 +242,7 @@ class MappingRobot:
         if self._task.target != NOWHERE and self._fused_map.is_frontier(self._task.target):
             return True
         cell = self._frame.cell_of(self._pose.x_m, self._pose.y_m)
-        return bool(np.isfinite(self._cost_map.travel(cell)[frontiers]).any())
+        return self._cost_map.reaches(cell, frontiers)
 
     # Acting.
 

@@ -55,7 +55,7 @@ class MarketRules:
         goal: NOWHERE for the nearest frontier. Of equal ones the lowest cell; NOWHERE if none can be reached.
         """
         cost_map, frontiers = situation.cost_map, situation.frontiers
-        totals = cost_map.travel(member.cell)[frontiers]
+        totals = cost_map.travel(member.cell, frontiers)
         if goal != NOWHERE:
             towards = totals + cost_map.optimistic(goal, until=member.cell)[frontiers]
             totals = towards if np.isfinite(towards).any() else totals
