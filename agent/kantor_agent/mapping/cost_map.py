@@ -10,13 +10,13 @@ import numpy.typing as npt
 from kantor_agent.mapping.fused_map import P_OCC, FusedMap
 from kantor_agent.mapping.routes import (
     COST_MIN,
-    Box,
     Routes,
     gaussian,
     iterate_once,
     length_cost,
     shared_scratch,
     smoothed_cost,
+    widened,
 )
 from kantor_agent.mapping.routes import UNKNOWN as UNKNOWN_P
 from kantor_protocol.base.grid import FREE, NOWHERE, UNKNOWN
@@ -26,17 +26,20 @@ from kantor_protocol.scenario.schema import Scenario
 _FREE_P = 0.05
 """Cost of open floor on a smoothed map: the least probability of occupancy that evidence gets to."""
 
+Boxes = npt.NDArray[np.int64]
+"""(n, 4) parts of the map: rows and columns, from and below."""
+
 _NO_CELL = np.zeros(0, dtype=np.int64)
 
 
 @kernel
-def _renew_lengths(
-    cost: np.ndarray, columns: int, bottom: int, top: int, left: int, right: int, cells: np.ndarray
-) -> None:
-    """`length_cost` within a box, with 0 instead of inf."""
-    for row in range(bottom, top):
-        for cell in range(row * columns + left, row * columns + right):
-            cost[cell] = 1.0 if cells[cell] == FREE else 0.0
+def _renew_lengths(cost: np.ndarray, columns: int, boxes: np.ndarray, cells: np.ndarray) -> None:
+    """`length_cost` within boxes, with 0 instead of inf."""
+    for i in range(boxes.shape[0]):
+        bottom, top, left, right = boxes[i]
+        for row in range(bottom, top):
+            for cell in range(row * columns + left, row * columns + right):
+                cost[cell] = 1.0 if cells[cell] == FREE else 0.0
 
 
 @kernel
@@ -110,20 +113,57 @@ def _renew_smoothed(
 
 
 @kernel
+def _renew_all_smoothed(
+    cost: np.ndarray,
+    columns: int,
+    boxes: np.ndarray,
+    cells: np.ndarray,
+    votes: np.ndarray,
+    bumps: np.ndarray,
+    p_occ: np.ndarray,
+    p_max: float,
+    weights: np.ndarray,
+    ring: np.ndarray,
+    column_sums: np.ndarray,
+) -> None:
+    """Renew the costs that cells within boxes have changed."""
+    reach, rows = weights.shape[0] - 1, cells.shape[0] // columns
+    for i in range(boxes.shape[0]):
+        bottom, top, left, right = widened(boxes[i], reach, rows, columns)
+        _renew_smoothed(
+            cost,
+            columns,
+            bottom,
+            top,
+            left,
+            right,
+            cells,
+            votes,
+            bumps,
+            p_occ,
+            p_max,
+            weights,
+            ring,
+            column_sums,
+        )
+
+
+@kernel
 def _renew_hopeful(
     hopeful: np.ndarray,
     columns: int,
-    bottom: int,
-    top: int,
-    left: int,
-    right: int,
+    boxes: np.ndarray,
+    reach: int,
     cells: np.ndarray,
     cost: np.ndarray,
 ) -> None:
-    """The costs within a box, with unknown cells taken for open floor."""
-    for row in range(bottom, top):
-        for cell in range(row * columns + left, row * columns + right):
-            hopeful[cell] = 1.0 if cells[cell] == UNKNOWN else cost[cell]
+    """The costs within boxes and around them, with unknown cells taken for open floor."""
+    for i in range(boxes.shape[0]):
+        box = widened(boxes[i], reach, cells.shape[0] // columns, columns)
+        bottom, top, left, right = box
+        for row in range(bottom, top):
+            for cell in range(row * columns + left, row * columns + right):
+                hopeful[cell] = 1.0 if cells[cell] == UNKNOWN else cost[cell]
 
 
 class CostMap:
@@ -133,7 +173,7 @@ class CostMap:
     """
 
     def __init__(self, scenario: Scenario, fused_map: FusedMap) -> None:
-        """scenario: its planner has the rule of costs, its sensor the range. The only reader of the map's `take_boxes`."""
+        """scenario: its planner has the rule of costs, its sensor the range. Nobody else takes the map's boxes."""
         self.fused_map = fused_map
         self.frame = fused_map.frame
         self.sensor_cells = scenario.sensor.range_m / fused_map.frame.resolution_m
@@ -145,7 +185,8 @@ class CostMap:
         """How far a cell's occupancy changes costs."""
         rows, columns = self._grid = self.frame.rows, self.frame.columns
         self._routes = Routes(rows, columns, shared_scratch(rows, columns))
-        """Over the costs of the fused map, but for what has changed in it since."""
+        """Over the costs of the fused map in `_revision`."""
+        self._revision = -1
         self._hopeful: Routes | None = None
         """The same with unknown cells taken for open floor; None until it is asked for."""
         size = 2 * self._reach + 1
@@ -186,7 +227,7 @@ class CostMap:
         self._renewed()
         if self._hopeful is None:
             self._hopeful = Routes(*self._grid, shared_scratch(*self._grid))
-            self._hope(self._hopeful, Box(0, self.frame.rows, 0, self.frame.columns))
+            self._hope(self._hopeful, np.array([[0, self.frame.rows, 0, self.frame.columns]]))
         with _opened(self._hopeful, cell) as routes:
             return routes.spread_from(cell, np.array([until])).copy()
 
@@ -203,26 +244,27 @@ class CostMap:
 
     def _renewed(self) -> Routes:
         """The routes over the fused map as it is."""
-        for changed in self.fused_map.take_boxes():
-            box = changed.wider(self._reach, *self._grid)
-            self._renew(box)
-            self._routes.renew(box)
+        if self._revision != self.fused_map.revision:
+            self._revision = self.fused_map.revision
+            boxes = self.fused_map.take_boxes()
+            self._renew(boxes)
+            self._routes.renew(boxes, self._reach)
             if self._hopeful is not None:
-                self._hope(self._hopeful, box)
+                self._hope(self._hopeful, boxes)
         return self._routes
 
-    def _renew(self, box: Box) -> None:
-        part = (self._routes.cost, self.frame.columns, *box)
+    def _renew(self, boxes: Boxes) -> None:
+        part = (self._routes.cost, self.frame.columns, boxes)
         if self._planner.cost == "length":
             _renew_lengths(*part, self.fused_map.cells)
             return
         rule = (P_OCC, self._planner.occupied_from, self._weights)
-        _renew_smoothed(*part, *self.fused_map.evidence, *rule, self._ring, self._column_sums)
+        _renew_all_smoothed(*part, *self.fused_map.evidence, *rule, self._ring, self._column_sums)
 
-    def _hope(self, hopeful: Routes, box: Box) -> None:
-        grid = (hopeful.cost, self.frame.columns, *box)
+    def _hope(self, hopeful: Routes, boxes: Boxes) -> None:
+        grid = (hopeful.cost, self.frame.columns, boxes, self._reach)
         _renew_hopeful(*grid, self.fused_map.cells, self._routes.cost)
-        hopeful.renew(box)
+        hopeful.renew(boxes, self._reach)
 
     def _plain_cost(self) -> npt.NDArray[np.float64]:
         """(cells,) the costs by the plain rules, inf where no way leads."""
@@ -245,7 +287,7 @@ def _opened(routes: Routes, cell: int) -> Iterator[Routes]:
         yield routes
         return
     row, column = divmod(cell, routes.columns)
-    box = Box(row, row + 1, column, column + 1)
+    box = np.array([[row, row + 1, column, column + 1]])
     routes.cost[cell] = 1.0
     routes.renew(box)
     try:

@@ -12,7 +12,6 @@ that has nothing else to do may try each once more, and those that do so at the 
 import numpy as np
 import numpy.typing as npt
 
-from kantor_agent.mapping.routes import Box
 from kantor_protocol.base.grid import FREE, NOWHERE, OCCUPIED, UNKNOWN, Frame, neighbour
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.replication.occupancy_log import CERTAIN, RANGE_BINS
@@ -150,7 +149,8 @@ class FusedMap:
         """The places in `_live` while `_frontiers_of` is `revision`, else out of date."""
         self._frontiers_of = -1
         self._boxes = np.tile(NO_BOX, (origins, 1))
-        """(origins, 4) as `routes.Box`: where entries of each log have changed cells since `take_boxes`."""
+        """(origins, 4) rows and columns from and below: where entries of each log have changed cells since
+        `take_boxes`."""
 
     def validate(self, replica: Replica) -> None:
         """Assert what the attributes say of one another and of the logs. replica: the one that was folded."""
@@ -213,11 +213,10 @@ class FusedMap:
         self.revision += changed
         return changed
 
-    def take_boxes(self) -> list[Box]:
-        """The parts of the map within which cells have changed since this was last asked."""
-        boxes = [Box(*box) for box in self._boxes.tolist() if box[0] < box[1]]
-        if boxes:
-            self._boxes[:] = NO_BOX
+    def take_boxes(self) -> npt.NDArray[np.int64]:
+        """(n, 4) rows and columns, from and below, in which cells have changed since this was last asked."""
+        boxes = self._boxes[self._boxes[:, 0] < self._boxes[:, 1]]
+        self._boxes[:] = NO_BOX
         return boxes
 
     def _widen(self, origins: int) -> None:

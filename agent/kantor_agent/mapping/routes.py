@@ -17,7 +17,7 @@ the ring of buckets holds, a binary heap settles the cells, with the same number
 import itertools
 import math
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -50,22 +50,15 @@ _LOWEST_BIT = np.array([0] + [(byte & -byte).bit_length() - 1 for byte in range(
 """Number of the lowest bit that is set, for each byte; 0 for 0."""
 
 
-class Box(NamedTuple):
-    """A part of a map: rows and columns from and below."""
-
-    bottom: int
-    top: int
-    left: int
-    right: int
-
-    def wider(self, cells: int, rows: int, columns: int) -> "Box":
-        """The box and so many cells around it, as far as a map of this size has them."""
-        return Box(
-            max(0, self.bottom - cells),
-            min(rows, self.top + cells),
-            max(0, self.left - cells),
-            min(columns, self.right + cells),
-        )
+@kernel
+def widened(box: np.ndarray, cells: int, rows: int, columns: int) -> tuple[int, int, int, int]:
+    """A box, (4,) rows and columns from and below, and so many cells around it, as far as the map has them."""
+    return (
+        max(0, box[0] - cells),
+        min(rows, box[1] + cells),
+        max(0, box[2] - cells),
+        min(columns, box[3] + cells),
+    )
 
 
 @kernel
@@ -73,40 +66,42 @@ def possible_moves(
     cost: np.ndarray,
     rows: int,
     columns: int,
-    bottom: int,
-    top: int,
-    left: int,
-    right: int,
+    boxes: np.ndarray,
+    reach: int,
     passable: np.ndarray,
     moves: np.ndarray,
 ) -> tuple[float, float]:
-    """Find the steps that can be taken, after costs have changed in a box; the lowest and the highest cost in it.
+    """Find the steps that can be taken, after costs have changed; the lowest and the highest cost there.
 
-    cost: (rows * columns,) float64. Outputs: passable, (rows + 2, columns + 2) bytes with a margin of zeros;
-    moves, (rows * columns,) bytes with a bit for every step.
+    cost: (rows * columns,) float64. They have changed in boxes (n, 4) and as far around as `reach`. Outputs: passable,
+    (rows + 2, columns + 2) bytes with a margin of zeros; moves, (rows * columns,) bytes with a bit for every step.
     """
     least, most = math.inf, 0.0
-    for row in range(bottom, top):
-        for column in range(left, right):
-            here = cost[row * columns + column]
-            good = 0.0 < here < math.inf
-            passable[row + 1, column + 1] = good
-            least = min(least, here if good else math.inf)
-            most = max(most, here if good else 0.0)
-    for row in range(max(0, bottom - 1), min(rows, top + 1)):
-        for column in range(max(0, left - 1), min(columns, right + 1)):
-            down, up = passable[row, column + 1], passable[row + 2, column + 1]
-            west, east = passable[row + 1, column], passable[row + 1, column + 2]
-            moves[row * columns + column] = (
-                (down & west & passable[row, column])
-                | down << 1
-                | (down & east & passable[row, column + 2]) << 2
-                | west << 3
-                | east << 4
-                | (up & west & passable[row + 2, column]) << 5
-                | up << 6
-                | (up & east & passable[row + 2, column + 2]) << 7
-            )
+    for i in range(boxes.shape[0]):
+        bottom, top, left, right = widened(boxes[i], reach, rows, columns)
+        for row in range(bottom, top):
+            for column in range(left, right):
+                here = cost[row * columns + column]
+                good = 0.0 < here < math.inf
+                passable[row + 1, column + 1] = good
+                least = min(least, here if good else math.inf)
+                most = max(most, here if good else 0.0)
+    for i in range(boxes.shape[0]):
+        bottom, top, left, right = widened(boxes[i], reach + 1, rows, columns)
+        for row in range(bottom, top):
+            for column in range(left, right):
+                down, up = passable[row, column + 1], passable[row + 2, column + 1]
+                west, east = passable[row + 1, column], passable[row + 1, column + 2]
+                moves[row * columns + column] = (
+                    (down & west & passable[row, column])
+                    | down << 1
+                    | (down & east & passable[row, column + 2]) << 2
+                    | west << 3
+                    | east << 4
+                    | (up & west & passable[row + 2, column]) << 5
+                    | up << 6
+                    | (up & east & passable[row + 2, column + 2]) << 7
+                )
     return least, most
 
 
@@ -368,9 +363,9 @@ class Routes:
         self._offsets = np.array(steps, dtype=np.int64)
         self._scratch = scratch or Scratch(rows, columns)
 
-    def renew(self, box: Box) -> None:
-        """Take in that costs have changed within a box."""
-        grid = (self.cost, self.rows, self.columns, *box)
+    def renew(self, boxes: npt.NDArray[np.int64], reach: int = 0) -> None:
+        """Take in that costs have changed in boxes (n, 4), rows and columns from and below, and around them."""
+        grid = (self.cost, self.rows, self.columns, boxes, reach)
         least, most = possible_moves(*grid, self._passable, self._moves)
         self._least, self._most = min(self._least, least), max(self._most, most)
 
@@ -385,7 +380,7 @@ class Routes:
             raise ValueError(f"costs of shape {cost.shape} for {self.cells} cells")
         self.cost[:] = cost
         self._least, self._most = math.inf, 0.0
-        self.renew(Box(0, self.rows, 0, self.columns))
+        self.renew(np.array([[0, self.rows, 0, self.columns]]))
         return self.spread_from(source, np.array([until]))
 
     def spread_from(

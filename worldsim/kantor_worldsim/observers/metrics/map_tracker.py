@@ -215,9 +215,9 @@ class MapTracker:
         for row, place, step_record in stepped:
             self._take_scan(place, step_record.observation, row)
         step_records = columns.step_records[: columns.sizes[of.STEP_RECORDS]]
-        self._reserve(
-            "as_sent", "written", AS_SENT, int(step_records[:, of.BODY_BYTES].max(initial=0))
-        )
+        if step_records.shape[0]:
+            longest = self.state.written[:, AS_SENT].max() + step_records[:, of.BODY_BYTES].max()
+            self._reserve("as_sent", int(longest))
         follow(*columns, *self._arguments)
         for _, place, step_record in stepped:
             assert step_record.verdict is not None
@@ -273,7 +273,8 @@ class MapTracker:
         self._scanned[place] = observation.step, pose
         seen = self._evidence[place].observe(observation.scan, pose, moved=pose != before)
         if seen.shape[0]:
-            self._reserve("scanned", "written", SCANNED, seen.shape[0])
+            written = self.state.written.item(self.state.incarnation_ids.item(place), SCANNED)
+            self._reserve("scanned", written + seen.shape[0])
             take_scan(*self._arguments, seen, place, row, self.tick)
 
     def _move(self, place: int, verdict: StepVerdict) -> None:
@@ -301,14 +302,13 @@ class MapTracker:
         count = self.state.counts.item(place, STOOD)
         if count and self.state.stood.item(place, count - 1) == cell:
             return
-        self._reserve("stood", "counts", STOOD, 1)
+        self._reserve("stood", count + 1)
         self.state.stood[place, count] = cell
         self.state.counts[place, STOOD] += 1
 
-    def _reserve(self, name: str, counted: str, column: int, more: int) -> None:
-        """Make room for so many more entries in one of the arrays that grow with the run."""
+    def _reserve(self, name: str, needed: int) -> None:
+        """Make room for so many entries of each in one of the arrays that grow with the run."""
         rows = getattr(self.state, name)
-        needed = int(getattr(self.state, counted)[:, column].max()) + more
         if needed <= rows.shape[1]:
             return
         longer = np.zeros((rows.shape[0], 2 * needed), dtype=rows.dtype)

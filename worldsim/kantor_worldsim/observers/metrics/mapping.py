@@ -98,7 +98,13 @@ def _merged(finest: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDAr
 def _variance(sums: npt.NDArray[np.float64], counts: npt.NDArray[np.float64]) -> float:
     """The variance of the means of regions that have any cells."""
     there = counts > 0.0
-    return float(np.var(sums[there] / counts[there])) if there.any() else 0.0
+    means = sums[there] / counts[there]
+    if not means.shape[0]:
+        return 0.0
+    apart = (
+        means - np.add.reduce(means) / means.shape[0]
+    )  # as `np.var`, which takes three times as long
+    return float(np.add.reduce(apart * apart) / means.shape[0])
 
 
 class _Pace:
