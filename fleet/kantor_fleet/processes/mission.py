@@ -75,27 +75,32 @@ def _run_folder(
 
 
 def _run_in_process(terms: _Terms, setup: WorldSetup, interrupts: Interrupts) -> Exit:
-    scenario, seed = terms.scenario, terms.seed
-    kinds = kinds_of(scenario)
+    kinds = kinds_of(terms.scenario)
     if not all(map(is_complete, kinds)):  # else each kernel is loaded when it is called
         with interrupts.at_once():
             warm_up(kinds)
     with _run_folder(terms, interrupts) as (folder, _):
-        with ProgressView(scenario.name) as view:
-            recording = Recording(scenario, seed, terms.exchange, folder, terms.exact_every)
-            shown_s = time.monotonic()
-
-            def show(_record: Record) -> None:
-                nonlocal shown_s
-                if time.monotonic() - shown_s >= _SHOW_S:
-                    shown_s = time.monotonic()
-                    view.show(progress(recording.metrics, scenario, "running", ""))
-
-            reason = play(scenario, seed, setup, [recording.observe, show], stopped=interrupts)
-            view.show(progress(recording.metrics, scenario, "over", reason))
-        code = exit_code_of(recording.finish())
+        code = _play(terms, setup, interrupts, folder)
         conclude(folder)
     return interrupts.code or code
+
+
+def _play(terms: _Terms, setup: WorldSetup, interrupts: Interrupts, folder: Path) -> Exit:
+    """Play and record a mission. What its observers hold, such as maps, is gone afterwards."""
+    scenario, seed = terms.scenario, terms.seed
+    with ProgressView(scenario.name) as view:
+        recording = Recording(scenario, seed, terms.exchange, folder, terms.exact_every)
+        shown_s = time.monotonic()
+
+        def show(_record: Record) -> None:
+            nonlocal shown_s
+            if time.monotonic() - shown_s >= _SHOW_S:
+                shown_s = time.monotonic()
+                view.show(progress(recording.metrics, scenario, "running", ""))
+
+        reason = play(scenario, seed, setup, [recording.observe, show], stopped=interrupts)
+        view.show(progress(recording.metrics, scenario, "over", reason))
+    return exit_code_of(recording.finish())
 
 
 def _run_processes(terms: _Terms, interrupts: Interrupts) -> Exit:

@@ -56,12 +56,18 @@ def draw_known(axes: Axes, map_tracker: MapTracker, period_s: float) -> None:
     frame, cells = map_tracker.frame, map_tracker.ground.cells
     step = max(1, -(-max(frame.rows, frame.columns) // _CELLS_SHOWN))
     first_tick = map_tracker.state.first_tick.reshape(cells.shape)[::step, ::step]
-    free, known = cells[::step, ::step] == FREE, first_tick >= 0
-    last_s = max(1, map_tracker.tick) * period_s
+    free = cells[::step, ::step] == FREE
+    last = max(1, map_tracker.tick)
+    last_s = last * period_s
     paint = ScalarMappable(Normalize(0.0, last_s), _TIME)
-    colours = paint.to_rgba(first_tick * period_s)[..., :3]
-    colours = np.where(free[..., None], colours, _WALL * colours)
-    colours = np.where(known[..., None], colours, np.where(free[..., None], 1.0, _UNSEEN_WALL))
+    times = _TIME(np.arange(_TIME.N))[:, :3]
+    unseen = np.full((1, 3), 1.0), np.full((1, 3), _UNSEEN_WALL)
+    palette = np.rint(255.0 * np.concatenate((times, _WALL * times, *unseen))).astype(np.uint8)
+    shade = np.minimum(_TIME.N * first_tick.astype(np.int64) // last, _TIME.N - 1).astype(np.int16)
+    shade[~free] += _TIME.N
+    shade[first_tick < 0] = 2 * _TIME.N
+    shade[(first_tick < 0) & ~free] = 2 * _TIME.N + 1
+    colours = palette[shade]
     left, right, bottom, top = frame.extent_m
     right += (-frame.columns % step) * frame.resolution_m
     top += (-frame.rows % step) * frame.resolution_m
@@ -69,19 +75,22 @@ def draw_known(axes: Axes, map_tracker: MapTracker, period_s: float) -> None:
         colours, origin="lower", extent=(left, right, bottom, top), interpolation="none", zorder=0.2
     )
     edges_m = _edges(map_tracker)
-    if edges_m.shape[0] <= _EDGES_SHOWN:
+    if edges_m is not None:
         outlines = LineCollection(list(edges_m), colors=FAINT, linewidths=0.5, zorder=0.6)
         axes.add_collection(outlines)
     add_scale(axes, paint, "first seen at  0 s", f"{last_s:.4g} s")
 
 
-def _edges(map_tracker: MapTracker) -> Points:
-    """(E, 2, 2) borders between free cells and others, world frame."""
+def _edges(map_tracker: MapTracker) -> Points | None:
+    """(E, 2, 2) borders between free cells and others, world frame; None if there are too many to be drawn."""
     frame = map_tracker.frame
     free = np.pad(map_tracker.ground.cells == FREE, 1)
-    row, column = np.nonzero(free[1:, 1:-1] != free[:-1, 1:-1])
+    along, across = free[1:, 1:-1] != free[:-1, 1:-1], free[1:-1, 1:] != free[1:-1, :-1]
+    if np.count_nonzero(along) + np.count_nonzero(across) > _EDGES_SHOWN:
+        return None
+    row, column = np.nonzero(along)
     level = np.stack((column, row, column + 1, row), axis=1)
-    row, column = np.nonzero(free[1:-1, 1:] != free[1:-1, :-1])
+    row, column = np.nonzero(across)
     upright = np.stack((column, row, column, row + 1), axis=1)
     cells = np.concatenate((level, upright)).reshape(-1, 2, 2)
     return np.asarray(cells * frame.resolution_m + np.array(frame.origin_m))

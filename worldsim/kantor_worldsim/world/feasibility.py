@@ -7,10 +7,11 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.grid import FREE
+from kantor_protocol.base.kernels import kernel
 from kantor_protocol.replication.occupancy_log import CODES
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.schema import Scenario
-from kantor_worldsim.world.maps import Ground
+from kantor_worldsim.world.maps import Ground, parts
 
 _GAP_DEG = 45.0
 """From anywhere in a cell each of the four cells beside it fills at least such an angle."""
@@ -82,13 +83,39 @@ def _fits(ground: Ground, starts_m: npt.NDArray[np.float64], radius_cells: float
     """Whether a round body gets from anywhere where it has room to all other such places."""
     if radius_cells <= 0.5:
         return True  # the narrowest passage is a cell wide
-    from scipy.ndimage import distance_transform_edt, label  # noqa: PLC0415  slow to import
-
-    from kantor_worldsim.world.starts import observable  # noqa: PLC0415  likewise
+    from kantor_worldsim.world.starts import observable  # noqa: PLC0415  only where there is a map
 
     free = observable(ground, starts_m) & (ground.cells == FREE)
-    room_cells = distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] - 0.5
-    return bool(label(room_cells >= radius_cells)[1] == 1)
+    room = np.zeros(free.shape, dtype=np.uint8)
+    _find_room(free, radius_cells, np.zeros(free.shape, dtype=np.int32), room)
+    return len(parts(room)[1]) == 2
+
+
+@kernel
+def _find_room(free: np.ndarray, radius_cells: float, height: np.ndarray, room: np.ndarray) -> None:
+    """Mark the cells in which a round body has room as FREE.
+
+    free, room: (rows, columns). height: the same shape, scratch: the distance to what is not free in a column.
+    """
+    rows, columns = free.shape
+    reach = int(radius_cells + 0.5) + 1
+    for column in range(columns):
+        above = 0
+        for row in range(rows):
+            above = above + 1 if free[row, column] else 0
+            height[row, column] = above
+        above = 0
+        for row in range(rows - 1, -1, -1):
+            above = above + 1 if free[row, column] else 0
+            height[row, column] = min(height[row, column], above)
+    for row in range(rows):
+        for column in range(columns):
+            least = 1 << 60
+            for beside in range(column - reach, column + reach + 1):
+                tall = height[row, beside] if 0 <= beside < columns else 0
+                least = min(least, (beside - column) ** 2 + tall * tall)
+            if math.sqrt(least) - 0.5 >= radius_cells:
+                room[row, column] = FREE
 
 
 def doubts_of_density(scenario: Scenario, samples_m: npt.NDArray[np.float64]) -> list[str]:

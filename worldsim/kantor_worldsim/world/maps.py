@@ -11,7 +11,16 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.grid import CELLS_MAX, FREE, OCCUPIED, UNKNOWN, Frame
+from kantor_protocol.base.grid import (
+    CELLS_MAX,
+    FREE,
+    NOWHERE,
+    OCCUPIED,
+    UNKNOWN,
+    Frame,
+    neighbour,
+)
+from kantor_protocol.base.kernels import kernel
 from kantor_protocol.files.reading import UnreadableError, read_text
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_worldsim.world.nav2 import (
@@ -196,15 +205,46 @@ _READERS: dict[str, _Reader] = {
 # Parts.
 
 
+@kernel
+def _label(cells: np.ndarray, labels: np.ndarray, stack: np.ndarray, sizes: np.ndarray) -> int:
+    """Label the parts of the free cells, in the order of their lowest cells; how many there are.
+
+    cells, labels: (rows, columns), labels 0 before. stack: (cells,) scratch. sizes: room for every part's, from 1.
+    """
+    rows, columns = cells.shape
+    count = 0
+    for first in range(rows * columns):
+        if (
+            cells[first // columns, first % columns] != FREE
+            or labels[first // columns, first % columns]
+        ):
+            continue
+        count += 1
+        labels[first // columns, first % columns] = count
+        stack[0], pending = first, 1
+        while pending > 0:
+            pending -= 1
+            cell = stack[pending]
+            sizes[count] += 1
+            for side in range(4):
+                n = neighbour(cell, side, columns, rows * columns)
+                if n == NOWHERE:
+                    continue
+                row, column = n // columns, n % columns
+                if cells[row, column] == FREE and labels[row, column] == 0:
+                    labels[row, column] = count
+                    stack[pending] = n
+                    pending += 1
+    return count
+
+
 def parts(cells: Cells) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int64]]:
     """The connected parts of the free cells: regions that a robot crosses without cutting corners.
 
-    cells: (rows, columns). Returns (rows, columns) labels from 1, with 0 for cells that are not free, and
-    (labels + 1) sizes in cells, 0 for label 0.
+    cells: (rows, columns). Returns (rows, columns) labels from 1, in the order of the lowest cells, with 0 for cells
+    that are not free, and (labels + 1) sizes in cells, 0 for label 0.
     """
-    from scipy.ndimage import label  # noqa: PLC0415  slow to import, not needed without a map
-
-    labels, count = label(cells == FREE, output=np.int32)  # 4-connected
-    sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    sizes[0] = 0
-    return labels, sizes
+    labels = np.zeros(cells.shape, dtype=np.int32)
+    sizes = np.zeros(cells.size // 2 + 2, dtype=np.int64)  # parts have a cell between them
+    count = _label(np.ascontiguousarray(cells), labels, np.empty(cells.size, dtype=np.int32), sizes)
+    return labels, sizes[: count + 1].copy()

@@ -60,32 +60,47 @@ class MapRow(NamedTuple):
 
 
 @kernel
+def _count_blocks(
+    counting: np.ndarray, block_rows: np.ndarray, block_columns: np.ndarray, counts: np.ndarray
+) -> None:
+    """Count the cells (rows, columns) that count in each of the finest blocks (64,)."""
+    rows, columns = counting.shape
+    for row in range(rows):
+        for column in range(columns):
+            counts[_FINEST * block_rows[row] + block_columns[column]] += counting[row, column]
+
+
+@kernel
 def _sum_blocks(
-    cells: np.ndarray,
-    blocks: np.ndarray,
+    counting: np.ndarray,
+    block_rows: np.ndarray,
+    block_columns: np.ndarray,
     first_tick: np.ndarray,
-    columns: int,
     robots_uv: np.ndarray,
     tick: int,
     sums: np.ndarray,
 ) -> None:
-    """Sum up the finest blocks. cells (k,): those that count, each in one of `blocks` (k,).
+    """Sum up the finest blocks. counting (rows, columns): the cells that count.
 
     robots_uv (n, 2): in cells, column axis first. sums (3, 64): cells seen, their w, the w' of the others.
     """
+    rows, columns = counting.shape
     sums[:] = 0.0
-    for i in range(cells.shape[0]):
-        cell, block = cells[i], blocks[i]
-        if first_tick[cell] >= 0:
-            sums[0, block] += 1.0
-            sums[1, block] += first_tick[cell]
-            continue
-        u, v = cell % columns + 0.5, cell // columns + 0.5
-        least = math.inf
-        for robot in range(robots_uv.shape[0]):
-            du, dv = robots_uv[robot, 0] - u, robots_uv[robot, 1] - v
-            least = min(least, du * du + dv * dv)
-        sums[2, block] += tick + math.sqrt(least)
+    for row in range(rows):
+        for column in range(columns):
+            if not counting[row, column]:
+                continue
+            block = _FINEST * block_rows[row] + block_columns[column]
+            first = first_tick[row * columns + column]
+            if first >= 0:
+                sums[0, block] += 1.0
+                sums[1, block] += first
+                continue
+            least = math.inf
+            for robot in range(robots_uv.shape[0]):
+                du, dv = robots_uv[robot, 0] - (column + 0.5), robots_uv[robot, 1] - (row + 0.5)
+                least = min(least, du * du + dv * dv)
+            sums[2, block] += tick + math.sqrt(least)
 
 
 def _merged(finest: npt.NDArray[np.float64], shape: tuple[int, int]) -> npt.NDArray[np.float64]:
@@ -142,12 +157,13 @@ class MapMetrics(RunMetrics):
         scenario, frame = opening.scenario, self.map_tracker.frame
         self._every = scenario.metrics.every or EVERY
         self._robots = scenario.robots.count
-        self._cells = np.flatnonzero(self.map_tracker.observable.ravel())
-        rows, columns = np.divmod(self._cells, frame.columns)
-        self._blocks = _FINEST * (_FINEST * rows // frame.rows) + (
-            _FINEST * columns // frame.columns
+        self._blocks = (
+            _FINEST * np.arange(frame.rows) // frame.rows,
+            _FINEST * np.arange(frame.columns) // frame.columns,
         )
-        self._counts = np.bincount(self._blocks, minlength=_FINEST**2).astype(np.float64)
+        """(rows,) and (columns,): the row and the column of blocks in which a cell lies."""
+        self._counts = np.zeros(_FINEST**2)
+        _count_blocks(self.map_tracker.observable, *self._blocks, self._counts)
         self._sums = np.zeros((3, _FINEST**2))
         self._over_time = np.zeros((2, len(SHAPES)))
         """Sums of WTV and EPV."""
@@ -221,10 +237,9 @@ class MapMetrics(RunMetrics):
         map_tracker = self.map_tracker
         origin_m = np.array(map_tracker.frame.origin_m)
         _sum_blocks(
-            self._cells,
-            self._blocks,
+            map_tracker.observable,
+            *self._blocks,
             map_tracker.state.first_tick,
-            map_tracker.frame.columns,
             (np.array(map_tracker.poses_m) - origin_m) / map_tracker.frame.resolution_m,
             self._tick,
             self._sums,
