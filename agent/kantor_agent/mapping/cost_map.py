@@ -10,6 +10,7 @@ import numpy.typing as npt
 from kantor_agent.mapping.fused_map import P_OCC, FusedMap
 from kantor_agent.mapping.routes import (
     COST_MIN,
+    Answers,
     Routes,
     gaussian,
     iterate_once,
@@ -184,7 +185,10 @@ class CostMap:
         self._reach = self._weights.shape[0] - 1
         """How far a cell's occupancy changes costs."""
         rows, columns = self._grid = self.frame.rows, self.frame.columns
-        self._routes = Routes(rows, columns, shared_scratch(rows, columns))
+        self._scratch = shared_scratch(rows, columns)
+        self._answers: Answers | None = None
+        """Of the present costs, from the scratch; None before the first question."""
+        self._routes = Routes(rows, columns, self._scratch)
         """Over the costs of the fused map in `_revision`."""
         self._revision = -1
         self._hopeful: Routes | None = None
@@ -205,12 +209,21 @@ class CostMap:
     def travel(self, cell: int, to: npt.NDArray[np.int64] | None = None) -> npt.NDArray[np.float64]:
         """The least cost of the way from a cell to others; inf where there is none.
 
-        to: (n,) these cells; by default all. The value function V of Burgard et al., section 2.2.1.
+        to: (n,) these cells; by default all. Do not change the array. The value function V of Burgard et al., section 2.2.1.
         """
-        with _opened(self._renewed(), cell) as routes:
-            if to is None:
+        routes = self._renewed()
+        if to is None:
+            with _opened(routes, cell):
                 return routes.spread_from(cell, _NO_CELL).copy()
-            return routes.spread_from(cell, to)[to] if to.size else np.zeros(0)
+        if self._answers is None:
+            self._answers = self._scratch.answers(routes.cost)
+        asked = (cell, to.tobytes())
+        if not to.size:
+            return np.zeros(0)
+        if asked not in self._answers:
+            with _opened(routes, cell):
+                self._answers[asked] = routes.spread_from(cell, to)[to]
+        return self._answers[asked]
 
     def reaches(self, cell: int, targets: npt.NDArray[np.int64]) -> bool:
         """Whether a way leads from a cell to any of the targets."""
@@ -226,7 +239,7 @@ class CostMap:
         """
         self._renewed()
         if self._hopeful is None:
-            self._hopeful = Routes(*self._grid, shared_scratch(*self._grid))
+            self._hopeful = Routes(*self._grid, self._scratch)
             self._hope(self._hopeful, np.array([[0, self.frame.rows, 0, self.frame.columns]]))
         with _opened(self._hopeful, cell) as routes:
             return routes.spread_from(cell, np.array([until])).copy()
@@ -245,7 +258,7 @@ class CostMap:
     def _renewed(self) -> Routes:
         """The routes over the fused map as it is."""
         if self._revision != self.fused_map.revision:
-            self._revision = self.fused_map.revision
+            self._revision, self._answers = self.fused_map.revision, None
             boxes = self.fused_map.take_boxes()
             self._renew(boxes)
             self._routes.renew(boxes, self._reach)

@@ -31,6 +31,19 @@ def _farthest_in_sight(
     return last
 
 
+@kernel
+def _measure_rest(way: np.ndarray, columns: int, beyond: np.ndarray) -> None:
+    """Write the length of the way from each of its cells to the last into beyond (way,), in cells."""
+    rest = 0.0
+    for i in range(way.shape[0] - 1, -1, -1):
+        if i + 1 < way.shape[0]:
+            slanted = way[i] // columns != way[i + 1] // columns and (
+                way[i] % columns != way[i + 1] % columns
+            )
+            rest += math.sqrt(2.0) if slanted else 1.0
+        beyond[i] = rest
+
+
 class Navigator:
     """Keeps the way to the target, and takes a shortcut where a straight line is free."""
 
@@ -56,7 +69,8 @@ class Navigator:
         if ahead < 0:
             self._target, self._passed = target, 0
             self._way = self._cost_map.way(cell, target)
-            self._beyond = self._lengths_to_the_end()
+            self._beyond = np.empty(self._way.shape[0])
+            _measure_rest(self._way, self._frame.columns, self._beyond)
             ahead = self._look_ahead(pose)
         if ahead < 0:  # the robot stands beside a corner
             ahead = self._look_ahead(pose, 0.0)
@@ -68,12 +82,6 @@ class Navigator:
         away_m = math.dist(place_m, (pose.x_m, pose.y_m))
         self.left_cells = away_m / self._frame.resolution_m + float(self._beyond[ahead])
         return place_m
-
-    def _lengths_to_the_end(self) -> npt.NDArray[np.float64]:
-        """(way,) the length of the way from each of its cells to the last, in cells."""
-        rows, columns = np.divmod(self._way, self._frame.columns)
-        steps = np.hypot(np.diff(rows), np.diff(columns))
-        return np.append(steps[::-1].cumsum()[::-1], 0.0)
 
     def _look_ahead(self, pose: Pose, margin_cells: float = _MARGIN_CELLS) -> int:
         frame = self._frame

@@ -46,6 +46,8 @@ _NARROWER = 1.0 - 2.0**-16
 of up to `CELLS_MAX` cells."""
 _ENTRIES = 8
 """Entries of one cell in all buckets: every neighbour improves it once at most."""
+_REMEMBERED_CELLS = 1 << 18
+"""The largest map of which answers are remembered."""
 _LOWEST_BIT = np.array([0] + [(byte & -byte).bit_length() - 1 for byte in range(1, 256)])
 """Number of the lowest bit that is set, for each byte; 0 for 0."""
 
@@ -315,6 +317,10 @@ def trace(
     return 0
 
 
+Answers = dict[tuple[int, bytes], npt.NDArray[np.float64]]
+"""By source and targets, the values of these; read them only."""
+
+
 class Scratch:
     """What a spread works with. Memory that no spread has needed is not touched."""
 
@@ -329,6 +335,20 @@ class Scratch:
         self.links = np.empty(_ENTRIES * cells, dtype=np.int32)
         self.members = np.empty(_ENTRIES * cells, dtype=np.int32)
         self.way = np.empty(cells, dtype=np.int32)
+        self._cost = np.zeros(0)
+        self._answers: Answers = {}
+        """Over `_cost`."""
+
+    def answers(self, cost: npt.NDArray[np.float64]) -> Answers:
+        """What was asked before over exactly these costs, by any participant of this process, to be added to.
+
+        Robots in contact know the same, and each asks the same of it. A large map is not remembered.
+        """
+        if cost.shape[0] > _REMEMBERED_CELLS:
+            return {}
+        if not np.array_equal(self._cost, cost):
+            self._cost, self._answers = cost.copy(), {}
+        return self._answers
 
     def clear(self) -> None:
         """Make all values infinite."""

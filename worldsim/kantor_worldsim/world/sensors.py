@@ -8,7 +8,7 @@ from kantor_protocol.base.counter_rng import Purpose, philox, to_unit
 from kantor_protocol.base.grid import FREE, next_cell
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.machine import Pose
-from kantor_protocol.replication.occupancy_log import CODES, NO_RETURN, beam_rad
+from kantor_protocol.replication.occupancy_log import CODES, NO_RETURN, beam_rad, border_share
 from kantor_protocol.scenario.schema import SensorOptions
 from kantor_worldsim.world.maps import Ground
 
@@ -105,10 +105,22 @@ def way_to_wall(
         return 0.0
     column, row, way = int(u), int(v), 0.0
     du, dv = math.cos(angle_rad), math.sin(angle_rad)
-    while 0 <= row < rows and 0 <= column < columns and cells[row, column] == FREE:
-        row, column, way = next_cell(row, column, u, v, du, dv)
+    right, above = (1 if du > 0.0 else -1), (1 if dv > 0.0 else -1)
+    across, up = border_share(u, du, column), border_share(v, dv, row)
+    while cells[row, column] == FREE:
+        way = min(across, up)
         if not way <= range_cells:
             return math.inf
+        if across <= up:
+            column += right
+            if not 0 <= column < columns:
+                break
+            across = border_share(u, du, column)
+        else:
+            row += above
+            if not 0 <= row < rows:
+                break
+            up = border_share(v, dv, row)
     return max(0.0, way)
 
 

@@ -248,6 +248,8 @@ class World:
         return []
 
     def _sense(self, name: ParticipantId) -> tuple[Found, ...]:
+        if not self.found.size:
+            return ()
         body, ground, targets_m = self._bodies[name], self._ground, self._targets.xy_m
         arguments = (targets_m, self.found, body.pose.x_m, body.pose.y_m, self._range_m, self._room)
         if ground is None:
