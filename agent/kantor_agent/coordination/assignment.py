@@ -66,13 +66,13 @@ def read_member(
 
     cells: of the map. tick: now; a later `since` is of a wrong clock.
     """
-    cell, flags, target, since, *memo = register.tolist()
+    cell, flags, target, since = register[:MEMO].tolist()
     if not (1 <= cell <= cells and 0 <= target <= cells) or flags & RESTING:
         return None
-    while memo and memo[-1] == 0:  # registers lose zeros at the end too
-        memo.pop()
+    used = register.nonzero()[0]
+    memo = tuple(register[MEMO : used[-1] + 1].tolist())  # registers lose zeros at the end too
     since, arrived = past_or_long_ago(since, tick), bool(flags & ARRIVED)
-    return TeamMember(robot, cell - 1, Task(target - 1, tuple(memo)), since, arrived=arrived)
+    return TeamMember(robot, cell - 1, Task(target - 1, memo), since, arrived=arrived)
 
 
 def visible_team(

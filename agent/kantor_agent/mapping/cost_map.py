@@ -225,12 +225,10 @@ class CostMap:
                 self._answers[asked] = routes.spread_from(cell, to)[to]
         return self._answers[asked]
 
-    def reaches(self, cell: int, targets: npt.NDArray[np.int64]) -> bool:
-        """Whether a way leads from a cell to any of the targets."""
-        if not targets.size:
-            return False
+    def reaches_frontier(self, cell: int) -> bool:
+        """Whether a way leads from a cell to any frontier."""
         with _opened(self._renewed(), cell) as routes:
-            return bool((routes.spread_from(cell, targets, 1)[targets] < math.inf).any())
+            return routes.reaches(cell, self.fused_map.is_live)
 
     def optimistic(self, cell: int, *, until: int = NOWHERE) -> npt.NDArray[np.float64]:
         """(cells,) `travel` with unknown cells taken for open floor (Zlot et al.).

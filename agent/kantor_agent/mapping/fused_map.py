@@ -143,12 +143,13 @@ class FusedMap:
         """(cells,) layers that say occupied, less those that say free."""
         self._folded = np.zeros(origins, dtype=np.int64)
         """(origins,) entries of each log that have been folded: at most as many as the log has."""
-        self._live = np.zeros(frame.cells, dtype=np.bool_)
+        self.is_live = np.zeros(frame.cells, dtype=np.bool_)
         """(cells,) whether a cell is among the `frontiers`."""
         self._frontiers: npt.NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         """The places in `_live` while `_frontiers_of` is `revision`, else out of date."""
         self._frontiers_of = -1
-        self._boxes = np.tile(NO_BOX, (origins, 1))
+        self._no_boxes = np.tile(NO_BOX, (origins, 1))
+        self._boxes = self._no_boxes.copy()
         """(origins, 4) rows and columns from and below: where entries of each log have changed cells since
         `take_boxes`."""
 
@@ -187,7 +188,7 @@ class FusedMap:
         beside = unknown[1:-1, :-2] | unknown[1:-1, 2:] | unknown[:-2, 1:-1] | unknown[2:, 1:-1]
         given_up_now = dead_frontiers | (self._given_up > 0)
         live = (fused == FREE) & beside.ravel() & ~given_up_now
-        assert np.array_equal(self._live, live)
+        assert np.array_equal(self.is_live, live)
         if self._frontiers_of == self.revision:
             assert np.array_equal(self._frontiers, np.flatnonzero(live))
 
@@ -207,16 +208,15 @@ class FusedMap:
             self._given_up,
             self.bumps,
             self.ranges,
-            self._live,
+            self.is_live,
             self._boxes,
         )
         self.revision += changed
         return changed
 
     def take_boxes(self) -> npt.NDArray[np.int64]:
-        """(n, 4) rows and columns, from and below, in which cells have changed since this was last asked."""
-        boxes = self._boxes[self._boxes[:, 0] < self._boxes[:, 1]]
-        self._boxes[:] = NO_BOX
+        """(n, 4) rows and columns, from and below, in which cells have changed since this was last asked; `NO_BOX`es."""
+        boxes, self._boxes = self._boxes, self._no_boxes.copy()
         return boxes
 
     def _widen(self, origins: int) -> None:
@@ -226,7 +226,8 @@ class FusedMap:
         self._layers[: layers.shape[0]] = layers
         self._folded = np.zeros(origins, dtype=np.int64)
         self._folded[: folded.shape[0]] = folded
-        self._boxes = np.tile(NO_BOX, (origins, 1))
+        self._no_boxes = np.tile(NO_BOX, (origins, 1))
+        self._boxes = self._no_boxes.copy()
         self._boxes[: boxes.shape[0]] = boxes
 
     @property
@@ -243,7 +244,7 @@ class FusedMap:
         Do not change the array.
         """
         if self._frontiers_of != self.revision:
-            self._frontiers = np.flatnonzero(self._live)
+            self._frontiers = np.flatnonzero(self.is_live)
             self._frontiers_of = self.revision
         return self._frontiers
 
@@ -264,7 +265,7 @@ class FusedMap:
 
     def is_frontier(self, cell: int) -> bool:
         """Whether a cell is among the frontiers."""
-        return 0 <= cell < self.frame.cells and bool(self._live[cell])
+        return 0 <= cell < self.frame.cells and bool(self.is_live[cell])
 
     def p_occ(self) -> npt.NDArray[np.float64]:
         """(cells,) probability of occupancy, 0.5 where nothing is known."""

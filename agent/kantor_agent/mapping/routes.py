@@ -48,6 +48,7 @@ _ENTRIES = 8
 """Entries of one cell in all buckets: every neighbour improves it once at most."""
 _REMEMBERED_CELLS = 1 << 18
 """The largest map of which answers are remembered."""
+_NO_CELL = np.zeros(0, dtype=np.int64)
 _LOWEST_BIT = np.array([0] + [(byte & -byte).bit_length() - 1 for byte in range(1, 256)])
 """Number of the lowest bit that is set, for each byte; 0 for 0."""
 
@@ -109,13 +110,13 @@ def possible_moves(
 
 @kernel
 def _mark(targets: np.ndarray, enough: int, wanted: np.ndarray) -> int:
-    """Mark targets in `wanted` (cells,); how many are to be settled, -1 if there is no target on the map."""
+    """Mark targets in `wanted` (cells,), where others may be already; how many wanted cells are to be settled."""
     count = 0
     for i in range(targets.shape[0]):
         if 0 <= targets[i] < wanted.shape[0] and not wanted[targets[i]]:
             wanted[targets[i]] = True
             count += 1
-    return min(count, enough) if count > 0 else -1
+    return min(count, enough) if count > 0 else enough
 
 
 @kernel
@@ -140,10 +141,12 @@ def spread_by_buckets(
     heads: np.ndarray,
     links: np.ndarray,
     members: np.ndarray,
-) -> tuple[int, int]:
-    """Settle all cells, or as many targets as are enough; the lowest and the highest cell that was reached.
+) -> tuple[int, int, int]:
+    """Settle all cells, or as many targets as are enough.
 
-    `value` is infinite before, and the source passable. wanted: (cells,) False, and so afterwards.
+    The lowest and the highest cell that was reached, and how many targets more would have been enough.
+
+    `value` is infinite before, and the source passable. wanted: (cells,) further targets, which no target is.
 
     around: the memory of `value` with a margin at both ends, columns + 1 wide, so that all eight
     neighbours can be compared without first testing which of them exist: one branch that is hard to
@@ -173,7 +176,6 @@ def spread_by_buckets(
         if int(value[cell] * per) != bucket:
             continue
         if wanted[cell]:
-            wanted[cell] = False
             left -= 1
             if left == 0:
                 break
@@ -203,7 +205,7 @@ def spread_by_buckets(
             heads[new & (_RING - 1)] = entry
             queued += 1
     _unmark(targets, wanted)
-    return lowest, highest
+    return lowest, highest, left
 
 
 @kernel
@@ -248,7 +250,7 @@ def spread_by_heap(
     wanted: np.ndarray,
     heap: np.ndarray,
     place: np.ndarray,
-) -> tuple[int, int]:
+) -> tuple[int, int, int]:
     """`spread_by_buckets` for any costs.
 
     heap, place: (cells,) scratch: the cell at each place of the heap, and the place of each cell.
@@ -278,7 +280,7 @@ def spread_by_heap(
             lowest, highest = min(lowest, n), max(highest, n)
             _rise(value, heap, place, n, place[n])
     _unmark(targets, wanted)
-    return lowest, highest
+    return lowest, highest, left
 
 
 @kernel
@@ -403,31 +405,45 @@ class Routes:
         self.renew(np.array([[0, self.rows, 0, self.columns]]))
         return self.spread_from(source, np.array([until]))
 
-    def spread_from(
-        self, source: int, targets: npt.NDArray[np.int64], enough: int = CELLS_MAX
-    ) -> npt.NDArray[np.float64]:
+    def spread_from(self, source: int, targets: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
         """(cells,) the value function: the cost of the way from the source to every cell, inf without a way.
 
-        targets: stop as soon as the values of so many of these cells as are enough are final; others may be too
-        high. Cells that are not on the map do not count, and without any all values are final. If the source is no
-        passable cell, no cell is reached, not even the source.
+        targets: stop as soon as the values of these cells are final; others may be too high. Cells that are not on
+        the map do not count, and without any all values are final. If the source is no passable cell, no cell is
+        reached, not even the source.
 
         The array belongs to the scratch: read it only, the next spread overwrites it.
         """
+        self._spread(source, targets, self._scratch.wanted, CELLS_MAX)
+        return self._scratch.value
+
+    def reaches(self, source: int, wanted: npt.NDArray[np.bool_]) -> bool:
+        """Whether a way leads from the source to any of the wanted cells (cells,)."""
+        return self._spread(source, _NO_CELL, wanted, 1) == 0
+
+    def _spread(
+        self,
+        source: int,
+        targets: npt.NDArray[np.int64],
+        wanted: npt.NDArray[np.bool_],
+        enough: int,
+    ) -> int:
+        """Compute values; how many more wanted cells would have been enough."""
         scratch, source = self._scratch, int(source)
         self._source = source
         scratch.clear()
         if not (0 <= source < self.cells and 0.0 < self.cost[source] < math.inf):
-            return scratch.value
+            return enough
         graph = (self.cost, self._moves, self._offsets, source, targets, enough)
         room = (scratch.links, scratch.members)
         least, most = self._least, self._most
         if most <= RATIO_MAX * least and least >= _LEAST and most <= _MOST:
-            values = (scratch.value, scratch.around, scratch.wanted, scratch.heads)
-            scratch.reached = spread_by_buckets(*graph, least, *values, *room)
+            values = (scratch.value, scratch.around, wanted, scratch.heads)
+            lowest, highest, left = spread_by_buckets(*graph, least, *values, *room)
         else:
-            scratch.reached = spread_by_heap(*graph, scratch.value, scratch.wanted, *room)
-        return scratch.value
+            lowest, highest, left = spread_by_heap(*graph, scratch.value, wanted, *room)
+        scratch.reached = lowest, highest
+        return int(left)
 
     def way(self, target: int) -> npt.NDArray[np.int64]:
         """The cells of the way from the source of the last `spread` to the target, both ends included.

@@ -236,13 +236,10 @@ class MappingRobot:
         """Whether there may still be a frontier for this robot."""
         if self._step <= self._explores_until:
             return True
-        frontiers = self._fused_map.frontiers
-        if not frontiers.size:
-            return False
         if self._task.target != NOWHERE and self._fused_map.is_frontier(self._task.target):
             return True
         cell = self._frame.cell_of(self._pose.x_m, self._pose.y_m)
-        return self._cost_map.reaches(cell, frontiers)
+        return self._cost_map.reaches_frontier(cell)
 
     # Acting.
 

@@ -202,11 +202,14 @@ def _add(
     count = 0
     for i in range(evidence.shape[0]):
         cell = evidence[i] >> 1
-        sum_ = odds[cell] + (HIT if evidence[i] & 1 else PASS)
-        odds[cell] = min(CERTAIN, max(-CERTAIN, sum_))
+        before = odds[cell]
+        after = min(CERTAIN, max(-CERTAIN, before + (HIT if evidence[i] & 1 else PASS)))
+        if after == before:
+            continue
+        odds[cell] = after
         kind = kinds[cell]
-        if odds[cell] != 0:
-            kind = OCCUPIED if odds[cell] > 0 else FREE
+        if after != 0:
+            kind = OCCUPIED if after > 0 else FREE
         if kind != kinds[cell]:
             kinds[cell] = kind
             out[count] = 2 * cell + (1 if kind == OCCUPIED else 0)

@@ -41,7 +41,6 @@ from kantor_worldsim.observers.metrics.map_tracker_kernels import (
     follow,
     take_scan,
 )
-from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch, DecodedRecord
 from kantor_worldsim.record.process_events import TAKE_OVER
 from kantor_worldsim.record.records import Batch, Opening, ProcessEvent
@@ -103,6 +102,8 @@ class MapTracker:
             scenario.sensor.noise_m == 0.0,
         )
         self._arguments = (*self.state, *self._ground)
+        self._sent_at_most = 0
+        """No log has more entries that were sent: an entry takes a byte."""
         self.poses_m: list[tuple[float, float]] = [(x, y) for x, y in setup.starts_m.tolist()]
         """Where the robots are, world frame."""
         self.ways_m = [0.0] * robots
@@ -214,10 +215,10 @@ class MapTracker:
         ]
         for row, place, step_record in stepped:
             self._take_scan(place, step_record.observation, row)
-        step_records = columns.step_records[: columns.sizes[of.STEP_RECORDS]]
-        if step_records.shape[0]:
-            longest = self.state.written[:, AS_SENT].max() + step_records[:, of.BODY_BYTES].max()
-            self._reserve("as_sent", int(longest))
+        self._sent_at_most += len(columns.payload)
+        if self._sent_at_most > self.state.as_sent.shape[1]:
+            self._sent_at_most = int(self.state.written[:, AS_SENT].max()) + len(columns.payload)
+            self._reserve("as_sent", self._sent_at_most)
         follow(*columns, *self._arguments)
         for _, place, step_record in stepped:
             assert step_record.verdict is not None
