@@ -2,11 +2,17 @@
 
 The office at 0.2 m, three robots that hear each other within 12 m, or a supervisor that hears all; and eight
 robots in a field of obstacles. Runs are in process and exactly repeatable but for the time; over the bus
-the bytes are the same.
+the bytes are the same. Then commands of a few seconds of the office at other sizes, up to the largest map: what they
+take beside the mission itself, with the picture.
 """
 
+import os
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
+from pathlib import Path
 from typing import NamedTuple
 
 from tables import Table, verdict
@@ -20,6 +26,10 @@ from kantor_worldsim.world.world import WorldSetup
 
 BYTES_MAX = 60.0
 """Bytes of maps per robot and tick, on average, at 0.2 m."""
+SIDES_M = (20, 200, 400, 800)
+"""Of square maps; of the last 800 m are the most cells that a map may have."""
+MIB_MAX = 1_300
+"""Memory that a command on the largest map takes at most."""
 _EIGHT = ("robots.count=8", "coordination=centralized")
 
 
@@ -67,6 +77,8 @@ def measure(*, quick: bool) -> Table:
                     f"{whole / map_bytes:,.0f}",
                 )
             )
+    sizes = [_command(side_m) for side_m in SIDES_M[: 2 if quick else None]]
+    fits = all(size.peak_mib <= MIB_MAX for size in sizes)
     return Table(
         "maps: missions on an unknown map",
         (
@@ -81,8 +93,39 @@ def measure(*, quick: bool) -> Table:
             "ratio",
         ),
         rows,
-        met=met,
+        (
+            f"4 s of the office at other sizes, as a command; at most {MIB_MAX} MiB: {verdict(met=fits)}",
+            *(
+                f"{size.cells:>12,} cells: {size.cpu_s:5.1f} CPU s, {size.peak_mib:6,.0f} MiB"
+                for size in sizes
+            ),
+        ),
+        met and fits,
     )
+
+
+class Size(NamedTuple):
+    """What a command on a map of some size takes."""
+
+    cells: int
+    cpu_s: float
+    peak_mib: float
+
+
+def _command(side_m: int) -> Size:
+    mission = ["run", "office", "--exchange", "in-process"]
+    settings = [f"map.size_m=[{side_m},{side_m}]", "limit_s=4"]
+    with tempfile.TemporaryDirectory() as folder:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "kantor_fleet", *mission, "--set", *settings],
+            cwd=Path(folder),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    assert process.returncode == 1, "a mission that is cut by its limit"
+    return Size((5 * side_m) ** 2, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
 
 
 def _run(name: str, overrides: tuple[str, ...], seed: int) -> Cost:
