@@ -1,12 +1,16 @@
 """Scenarios that cannot work are refused at the start, and doubtful ones get a warning."""
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.ndimage import distance_transform_edt
 
 from kantor_fleet.scenarios.catalog import find, names
+from kantor_protocol.base.grid import FREE
 from kantor_protocol.scenario.errors import ScenarioError
 from kantor_protocol.scenario.load import parse
+from kantor_worldsim.world.feasibility import find_room
 from kantor_worldsim.world.world import WorldSetup
 from support.strategies import examples
 
@@ -101,3 +105,17 @@ def test_samples_outside_the_domain() -> None:
 def test_no_packaged_scenario_is_doubtful(name: str) -> None:
     """Nobody has to learn to ignore a warning."""
     assert WorldSetup.of(find(name), 0).warnings == ()
+
+
+@examples(60)
+@given(seed=st.integers(0, 1000), radius_cells=st.floats(0.5, 6.0))
+def test_a_body_has_room_where_what_is_not_free_is_far_enough(
+    seed: int, radius_cells: float
+) -> None:
+    """As scipy's distances say; all beside the map is not free."""
+    draws = np.random.default_rng(seed)
+    free = draws.random(draws.integers(1, 30, 2)) < 0.9
+    room = find_room(free, radius_cells)
+
+    apart = distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] - 0.5
+    assert (room == FREE).tolist() == (apart >= radius_cells).tolist()

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageFile
+from scipy.ndimage import label
 
 from kantor_protocol.base.grid import CELLS_MAX, FREE, OCCUPIED, UNKNOWN, Frame
 from kantor_protocol.scenario.errors import ScenarioError
@@ -598,3 +599,18 @@ def test_a_map_without_free_cells_has_no_parts() -> None:
 
     assert sizes.tolist() == [0]
     assert not labels.any()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_parts_are_those_of_scipy(seed: int) -> None:
+    """Labels are in the order of the lowest cells."""
+    draws = np.random.default_rng(seed)
+    cells = draws.choice([UNKNOWN, FREE, OCCUPIED], draws.integers(1, 20, 2), p=[0.1, 0.6, 0.3])
+    labels, sizes = parts(cells.astype(np.uint8))
+    expected, count = label(cells == FREE)
+    firsts = np.unique(labels, return_index=True)[1]
+
+    assert labels.max() == count
+    assert all(np.unique(expected[labels == part]).size == 1 for part in range(1, count + 1))
+    assert np.bincount(labels.ravel())[1:].tolist() == sizes[1:].tolist()
+    assert firsts[-count:].tolist() == sorted(firsts[-count:].tolist()) or count == 0

@@ -86,9 +86,14 @@ def _fits(ground: Ground, starts_m: npt.NDArray[np.float64], radius_cells: float
     from kantor_worldsim.world.starts import observable  # noqa: PLC0415  only where there is a map
 
     free = observable(ground, starts_m) & (ground.cells == FREE)
+    return len(parts(find_room(free, radius_cells))[1]) == 2
+
+
+def find_room(free: npt.NDArray[np.bool_], radius_cells: float) -> npt.NDArray[np.uint8]:
+    """(rows, columns) FREE in the cells in which a round body has room. free: the same shape."""
     room = np.zeros(free.shape, dtype=np.uint8)
     _find_room(free, radius_cells, np.zeros(free.shape, dtype=np.int32), room)
-    return len(parts(room)[1]) == 2
+    return room
 
 
 @kernel
