@@ -115,7 +115,7 @@ def test_colours_are_those_of_the_stamps() -> None:
 
     assert run.setup.ground is not None
     assert image.get_extent() == list(ROOMS.frame.extent_m)
-    assert (colours[free & (ticks < 0)] == 1.0).all()
+    assert (colours[free & (ticks < 0)] == 255).all()
     assert np.unique(colours[~free & (ticks < 0)]).size == 1
     for kind in (free, ~free):
         by_tick = {
