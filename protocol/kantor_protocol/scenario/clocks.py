@@ -30,6 +30,14 @@ class StepClock(msgspec.Struct, frozen=True):
             late += int(draw * self.jitter_ns)
         return nominal + late
 
+    def steps_by(self, now_ns: int) -> int:
+        """How many steps are due by then."""
+        nominal_ns = now_ns * 1_000_000 // (1_000_000 + self.drift_ppm)
+        step = max(0, (nominal_ns - self.phase_ns) // self.period_ns + 1)
+        while step and self.due_ns(step) > now_ns:
+            step -= 1
+        return step
+
 
 def step_clocks(scenario: Scenario, seed: int) -> dict[ParticipantId, StepClock]:
     """The clocks of all participants in the roster.

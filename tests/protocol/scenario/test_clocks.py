@@ -53,6 +53,8 @@ def test_time_rises_with_every_step(
         dues_ns = [clock.due_ns(step) for step in range(1, 60)]
 
         assert all(before < after for before, after in pairwise([0, *dues_ns]))
+        for now_ns in (0, *(due_ns + late_ns for due_ns in dues_ns[:-1] for late_ns in (-1, 0, 1))):
+            assert clock.steps_by(now_ns) == sum(due_ns <= now_ns for due_ns in dues_ns)
 
 
 def test_concurrent_robots_step_at_the_same_moment() -> None:

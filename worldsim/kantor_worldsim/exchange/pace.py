@@ -4,15 +4,12 @@ A participant steps when its own clock says so, at most once for each of the clo
 steps that it has missed. World-sim knows the clock, so that whoever was silent has no steps saved up.
 """
 
-from bisect import bisect_right
-
 from kantor_protocol.scenario.clocks import StepClock
 
 _AT_ONCE = 3.0
 """Steps that may come together, for instance because reports of one and a half periods were under way."""
 _FASTER = 1.02
 """A real clock may run a little fast."""
-_STEPS = range(1, 2**40)
 
 
 class Pace:
@@ -34,15 +31,16 @@ class Pace:
 
     def permits(self, made_ns: int, now_ns: int) -> bool:
         """Whether a step is possible that was made at made_ns by the participant's clock. now_ns: true time."""
-        return self._steps_at(now_ns) >= 1.0 and self._due_at(made_ns) > self._due_before
+        return self._steps_at(now_ns) >= 1.0 and self._clock.steps_by(made_ns) > self._due_before
 
     def count(self, made_ns: int, now_ns: int) -> None:
         """Count a step that was accepted."""
         self._steps = max(0.0, self._steps_at(now_ns) - 1.0)
-        self._filled_ns, self._due_before = now_ns, self._due_at(made_ns)
+        self._filled_ns, self._due_before = now_ns, self._clock.steps_by(made_ns)
+
+    def next_due_ns(self, now_ns: int) -> int:
+        """The next time of its clock."""
+        return self._clock.due_ns(self._clock.steps_by(now_ns) + 1)
 
     def _steps_at(self, now_ns: int) -> float:
         return min(_AT_ONCE, self._steps + (now_ns - self._filled_ns) * self._steps_per_ns)
-
-    def _due_at(self, made_ns: int) -> int:
-        return bisect_right(_STEPS, made_ns, key=self._clock.due_ns)
