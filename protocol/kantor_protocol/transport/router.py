@@ -40,6 +40,8 @@ from kantor_protocol.transport.session_limit import SessionLimit
 from kantor_protocol.wire import keys
 from kantor_protocol.wire.messages import NONCE_MAX
 
+BATCH_MAX = 128
+"""Events that are taken at once."""
 _SLOW_S = 0.1
 """A participant whose queue was full for so long does not read."""
 _IMPATIENT_S = 10.0
@@ -55,6 +57,7 @@ class Router:
     def __init__(self) -> None:
         """No session yet."""
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._drained_s = 0.0
         self._guards: list[RefusalResponder | SessionLimit] = []
 
     def __enter__(self) -> Self:
@@ -69,6 +72,22 @@ class Router:
             return self._events.get(timeout=max(0.0, timeout_s))
         except queue.Empty:
             return None
+
+    def drain(self, timeout_s: float, every_s: float) -> list[Event]:
+        """The events that have come, at most BATCH_MAX; empty after the timeout.
+
+        every_s: least time since the last ones, in which more may gather.
+        """
+        first = self.next(timeout_s)
+        if first is None:
+            return []
+        pause_s = self._drained_s + every_s - time.monotonic()
+        if pause_s > 0.0:
+            time.sleep(pause_s)
+        more = min(self._events.qsize(), BATCH_MAX - 1)
+        events = [first, *(self._events.get_nowait() for _ in range(more))]
+        self._drained_s = time.monotonic()
+        return events
 
     def close(self) -> None:
         """Leave the bus."""

@@ -13,7 +13,7 @@ import msgspec
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX
 from kantor_protocol.base.machine import EVERYBODY, WORLD_SIM, Body, Outputs, ParticipantId
 from kantor_protocol.scenario.faults.liars import lies_of
-from kantor_protocol.transport.events import Flooded, Joined, Left, Received
+from kantor_protocol.transport.events import Event, Flooded, Joined, Left, Received
 from kantor_protocol.transport.router import HubRouter
 from kantor_protocol.transport.session import LEASE_MS, BusError
 from kantor_protocol.wire.attestations import Identities
@@ -99,6 +99,8 @@ class Lobby:
         """Number of times that each participant became ready."""
         self._excused: set[ParticipantId] = set()
         """Participants that a fault has killed or frozen, or that are late: their absence is no event."""
+        self._gathered: deque[Event] = deque()
+        """Events that have come, and wait until the reports before them are settled."""
         self._newcomers: deque[ParticipantId] = deque()
         """Participants that became ready, until the exchange asks for them."""
         self._briefed_s: dict[ParticipantId, float] = {}
@@ -174,8 +176,28 @@ class Lobby:
         """The next report, or None when something else came or the timeout passed."""
         self._settle_doubts()
         self._brief_again()
-        event = self._host.next(timeout_s)
+        event = self._gathered.popleft() if self._gathered else self._host.next(timeout_s)
         self._checked_s = time.monotonic()
+        return self._take(event)
+
+    def reports(self, timeout_s: float, every_s: float) -> list[tuple[ParticipantId, Report]]:
+        """The reports that have come, none after an arrival or a departure that came later than them.
+
+        Waits up to the timeout if nothing has come, and until `every_s` after the last ones.
+        """
+        self._settle_doubts()
+        self._brief_again()
+        if not self._gathered:
+            self._gathered.extend(self._host.drain(timeout_s, every_s))
+        self._checked_s = time.monotonic()
+        reports: list[tuple[ParticipantId, Report]] = []
+        while self._gathered and (not reports or isinstance(self._gathered[0], Received)):
+            report = self._take(self._gathered.popleft())
+            if report is not None:
+                reports.append(report)
+        return reports
+
+    def _take(self, event: Event | None) -> tuple[ParticipantId, Report] | None:
         match event:
             case Joined():
                 self._join(event)

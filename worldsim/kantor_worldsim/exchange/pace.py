@@ -1,4 +1,5 @@
-"""The pace of a participant in the realtime exchange: how many steps it can have made by now. Pure.
+"""The pace of a participant in the realtime exchange: how many steps it can have made by now, and when it needs what it
+hears. Pure.
 
 A participant steps when its own clock says so, at most once for each of the clock's times, and does not make up for
 steps that it has missed. World-sim knows the clock, so that whoever was silent has no steps saved up.
@@ -8,6 +9,8 @@ from kantor_protocol.scenario.clocks import StepClock
 
 _AT_ONCE = 3.0
 """Steps that may come together, for instance because reports of one and a half periods were under way."""
+_LEAD = 0.2
+"""Part of a period."""
 _FASTER = 1.02
 """A real clock may run a little fast."""
 
@@ -24,6 +27,8 @@ class Pace:
         self._filled_ns = now_ns
         self._due_before = 0
         """Times of its clock that were due when it made its last step."""
+        self._next_due_ns = 0
+        self._lead_ns = round(_LEAD * clock.period_ns)
 
     def restart(self) -> None:
         """Another process may have set its clock anew, a little earlier."""
@@ -38,9 +43,11 @@ class Pace:
         self._steps = max(0.0, self._steps_at(now_ns) - 1.0)
         self._filled_ns, self._due_before = now_ns, self._clock.steps_by(made_ns)
 
-    def next_due_ns(self, now_ns: int) -> int:
-        """The next time of its clock."""
-        return self._clock.due_ns(self._clock.steps_by(now_ns) + 1)
+    def delivery_ns(self, now_ns: int) -> int:
+        """The time from which on it needs what has arrived at it, for the next step that its clock has from now on."""
+        if now_ns >= self._next_due_ns:
+            self._next_due_ns = self._clock.due_ns(self._clock.steps_by(now_ns) + 1)
+        return self._next_due_ns - self._lead_ns
 
     def _steps_at(self, now_ns: int) -> float:
         return min(_AT_ONCE, self._steps + (now_ns - self._filled_ns) * self._steps_per_ns)

@@ -2,12 +2,10 @@
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from itertools import islice
 
-import msgspec
-
-from kantor_protocol.base.machine import WORLD_SIM, Envelope, Inputs, ParticipantId
+from kantor_protocol.base.machine import NEVER_NS, WORLD_SIM, Envelope, Inputs, ParticipantId
 from kantor_protocol.scenario.clocks import step_clocks
 from kantor_protocol.wire.messages import INBOX_MAX, VERSION, Report, StepRequest
 from kantor_worldsim.engine.simulation import Simulation, Step
@@ -24,6 +22,8 @@ from kantor_worldsim.record.records import ProcessEvent
 _CLOCK_TOLERANCE_NS = 500_000_000
 """In real time: how far a robot's clock may be ahead of world-sim's."""
 _SKEW_MAX_NS = 2**52
+_GATHER = 0.05
+"""Part of a participant's period in which reports gather to a batch: every answer has that much less time."""
 
 
 class RealtimeExchange:
@@ -60,6 +60,12 @@ class RealtimeExchange:
         self._paces = {name: Pace(clock, start_ns) for name, clock in clocks.items()}
         self._moved_ns = dict.fromkeys(clocks, 0)
         """Time of each participant's last accepted step in this process of world-sim, by its own clock."""
+        turns = len(clocks) if config.scenario.clock.order == "turn" else 1
+        beat_ns = min(clock.period_ns for clock in clocks.values()) / turns
+        self._gather_s = _GATHER * beat_ns * 1e-9 / self._speed
+        """Real time from one batch of reports to the next, at least."""
+        self._delivery_ns = NEVER_NS
+        """Time of the next delivery."""
 
     def _resumed_ns(self) -> int:
         """Restore what had been handed out, as participants may still report it; the time to go on from."""
@@ -86,12 +92,11 @@ class RealtimeExchange:
             if reason is not None:
                 self._simulation.end(reason)
                 return reason
-            report = lobby.next(self._timeout_s())
+            reports = lobby.reports(self._timeout_s(), self._gather_s)
             injector.advance(self._now_ns)
             self._welcome_newcomers()  # a participant's first message must start its clock
             if not injector.world_is_down:  # a report that is lost now is repeated
-                if report is not None:
-                    self._settle(*report)
+                self._settle(reports)
                 self._deliver()
 
     @property
@@ -110,10 +115,14 @@ class RealtimeExchange:
     def _timeout_s(self) -> float:
         """Real seconds until there is something to do."""
         now_ns = self._now_ns
-        due_ns = (self._simulation.channel.next_due_ns(), self._injector.next_ns(now_ns))
-        waits_s = [(due - now_ns) * 1e-9 / self._speed for due in due_ns if due is not None]
         longest_s = POLL_S if self._injector.busy else PROGRESS_S
-        return min(longest_s, max(0.0, min(waits_s, default=longest_s)))
+        delivery_s = max(self._gather_s, self._real_s(self._delivery_ns - now_ns))
+        fault_ns = self._injector.next_ns(now_ns)
+        fault_s = longest_s if fault_ns is None else max(0.0, self._real_s(fault_ns - now_ns))
+        return min(longest_s, delivery_s, fault_s)
+
+    def _real_s(self, simulated_ns: int) -> float:
+        return simulated_ns * 1e-9 / self._speed
 
     def _welcome_newcomers(self) -> None:
         """Start the clocks of participants that became ready."""
@@ -127,29 +136,47 @@ class RealtimeExchange:
         self._skews_ns[name] = self._injector.skew_ns(name, now_ns)
         self._lobby.start_clock(name, now_ns, self._speed, self._skews_ns[name])
 
-    def _settle(self, name: ParticipantId, report: Report) -> None:
-        done = self._simulation.body(name).step
-        if report.outputs.step <= done:  # the acknowledgement has not arrived yet
-            self._hand(name)
-        elif not self._injector.kills_in_step(name):
-            now_ns = self._now_ns
-            if not self._paces[name].permits(report.now_ns, now_ns):
-                return  # it is repeated, and its time may come
-            inputs = self._inputs(name, done, report)
-            if inputs is None:
-                self._lobby.refused += 1
-                return
-            self._paces[name].count(report.now_ns, now_ns)
-            self._moved_ns[name] = report.now_ns
-            step = Step(name, inputs, report.outputs, report.skew_ns)
-            self._simulation.settle(now_ns, [step])
-            self._hand(name)
+    def _settle(self, reports: Iterable[tuple[ParticipantId, Report]]) -> None:
+        """Settle the steps that are reported in one batch, and acknowledge them once they are on record."""
+        now_ns = self._now_ns
+        steps: dict[ParticipantId, Step] = {}
+        reported: dict[ParticipantId, None] = {}
+        for name, report in reports:
+            done = self._simulation.body(name).step
+            if report.outputs.step <= done or name in steps:
+                reported[name] = None  # the acknowledgement has not arrived yet
+            elif (step := self._step(name, report, done, now_ns)) is not None:
+                steps[name] = step
+                reported[name] = None
+        if steps:
+            self._simulation.settle(now_ns, steps.values())
+        for name in reported:
+            self._hand(name, now_ns)
 
-    def _inputs(self, name: ParticipantId, done: int, report: Report) -> Inputs | None:
-        """The inputs that a participant reports, if they are possible. done: its last step on record."""
-        ahead_ns = report.now_ns - self._now_ns
+    def _step(
+        self, name: ParticipantId, report: Report, done: int, now_ns: int
+    ) -> Step | None:
+        """The step that a participant reports, if it may be settled now. done: its last step on record."""
+        if self._injector.kills_in_step(name):
+            return None
+        pace = self._paces[name]
+        if not pace.permits(report.now_ns, now_ns):
+            return None  # it is repeated, and its time may come
+        inputs = self._inputs(name, done, report, now_ns)
+        if inputs is None:
+            self._lobby.refused += 1
+            return None
+        pace.count(report.now_ns, now_ns)
+        self._moved_ns[name] = report.now_ns
+        return Step(name, inputs, report.outputs, report.skew_ns)
+
+    def _inputs(
+        self, name: ParticipantId, done: int, report: Report, now_ns: int
+    ) -> Inputs | None:
+        """The inputs that a participant reports, if they are possible."""
         if report.observed != done or report.now_ns < self._moved_ns[name]:
             return None
+        ahead_ns = report.now_ns - now_ns
         if ahead_ns > _CLOCK_TOLERANCE_NS * self._speed or abs(report.skew_ns) > _SKEW_MAX_NS:
             return None
         inbox = self._outboxes[name].received(report.heard)
@@ -158,19 +185,19 @@ class RealtimeExchange:
         return Inputs(report.now_ns + report.skew_ns, self._simulation.look(name), inbox)
 
     def _deliver(self) -> None:
-        """Hand out the envelopes that are due at any participant."""
-        due_ns, now_ns = self._simulation.channel.next_due_ns(), self._now_ns
-        if due_ns is None or due_ns > now_ns:
-            return
-        for name in self._simulation.scenario.roster:
-            if self._simulation.channel.waits(name, now_ns):
-                self._hand(name)
+        """Hand out what has arrived at participants that are about to step. It can wait until then."""
+        now_ns, self._delivery_ns = self._now_ns, NEVER_NS
+        for name, arrival_ns in self._simulation.channel.arrivals():
+            delivery_ns = max(arrival_ns, self._paces[name].delivery_ns(now_ns))
+            if delivery_ns <= now_ns:
+                self._hand(name, now_ns)
+            else:
+                self._delivery_ns = min(self._delivery_ns, delivery_ns)
 
-    def _hand(self, name: ParticipantId) -> None:
+    def _hand(self, name: ParticipantId, now_ns: int) -> None:
         """Send a participant its observation, which acknowledges its step, and the envelopes that have arrived."""
-        now_ns, outbox = self._now_ns, self._outboxes[name]
-        given = self._simulation.inputs(name, now_ns)
-        outbox.waiting += given.inbox
+        outbox = self._outboxes[name]
+        outbox.waiting += self._simulation.channel.collect(name, now_ns)
         if self._injector.is_frozen(name):
             return  # the envelopes wait
         if not self._lobby.is_ready(name):
@@ -178,8 +205,8 @@ class RealtimeExchange:
             return
         if self._injector.skew_ns(name, now_ns) != self._skews_ns[name]:
             self._set_clock(name, now_ns)
-        request = StepRequest(VERSION, msgspec.structs.replace(given, inbox=outbox.hand()))
-        self._lobby.request(name, request, blocking=False)
+        inputs = Inputs(now_ns, self._simulation.look(name), outbox.hand())
+        self._lobby.request(name, StepRequest(VERSION, inputs), blocking=False)
 
 
 class Outbox:

@@ -426,14 +426,9 @@ class Channel:
         for box in self._in_flight.values():
             box.clear()
 
-    def waits(self, name: ParticipantId, now_ns: int) -> bool:
-        """Whether an envelope has arrived at a participant and was not collected."""
-        waiting = self._in_flight[name]
-        return bool(waiting) and waiting[0][0] <= now_ns
-
-    def next_due_ns(self) -> int | None:
-        """Time of the next arrival at any participant; None if nothing is in flight."""
-        return min((box[0][0] for box in self._in_flight.values() if box), default=None)
+    def arrivals(self) -> list[tuple[ParticipantId, int]]:
+        """Each participant that envelopes are in flight to, or have arrived at, and when the first one does."""
+        return [(name, box[0][0]) for name, box in self._boxes if box]
 
     def validate(self) -> None:
         """Assert the invariants that are stated at the attributes."""
