@@ -489,19 +489,16 @@ def test_an_inbox_is_in_order_of_arrival_then_source_then_sequence() -> None:
 
 
 def test_an_envelope_is_collected_once_and_not_before_it_is_due() -> None:
-    """A delivery waits until its time, is collected once, and `waits` reports it until then."""
+    """A delivery waits until its time, is collected once, and is among the arrivals until then."""
     radio = channel("radio.delay_s=0.05")
     radio.transmit([sent_by("r1", 1, "r2"), sent_by("r1", 2, "r2", now_ns=10 * MS)])
 
-    assert radio.next_due_ns() == 50 * MS
+    assert radio.arrivals() == [("r2", 50 * MS)]
     assert radio.collect("r2", 50 * MS - 1) == ()
-    assert not radio.waits("r2", 50 * MS - 1)
-    assert radio.waits("r2", 50 * MS)
     assert [envelope.sequence for envelope in radio.collect("r2", 50 * MS)] == [1]
-    assert not radio.waits("r2", 50 * MS)
-    assert radio.next_due_ns() == 60 * MS
+    assert radio.arrivals() == [("r2", 60 * MS)]
     assert [envelope.sequence for envelope in radio.collect("r2", 10**12)] == [2]
-    assert radio.next_due_ns() is None
+    assert radio.arrivals() == []
     assert radio.collect("r2", 10**12) == ()
 
 
@@ -514,7 +511,7 @@ def test_a_dropped_copy_has_a_decision_and_is_never_in_flight() -> None:
         DeliveryDecision("r1", 1, "r2", DROPPED),
         DeliveryDecision("r1", 1, "r3", DROPPED),
     ]
-    assert radio.next_due_ns() is None
+    assert radio.arrivals() == []
 
 
 def test_without_envelopes_there_is_no_decision() -> None:

@@ -18,14 +18,16 @@ faith. But nobody, a liar neither, sends what could break a record or a resumpti
 incarnations that never were.
 """
 
+import contextlib
 import math
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX
-from kantor_protocol.base.machine import EVERYBODY, Envelope, Outputs, ParticipantId, Pose
+from kantor_protocol.base.machine import EVERYBODY, Outputs, ParticipantId, Pose
 from kantor_protocol.base.varint import Pairs, sum_pairs
 from kantor_protocol.replication.gossip import MessageCheck, log_length_max
 from kantor_protocol.replication.occupancy_log import entries
@@ -42,7 +44,14 @@ from kantor_protocol.wire.messages import (
     decode_gossip,
 )
 from kantor_protocol.wire.weights import weights_bytes_max
-from kantor_worldsim.exchange.admission_kernels import BARE, NO_INCARNATION, REASONS, judge, learn
+from kantor_worldsim.exchange.admission_kernels import (
+    BARE,
+    NO_INCARNATION,
+    REASONS,
+    judge,
+    learn,
+    spend,
+)
 from kantor_worldsim.record.process_events import TAKE_OVER
 from kantor_worldsim.record.records import Batch, ProcessEvent, Record
 from kantor_worldsim.world.world import WorldSetup, rounding_m, units_of
@@ -53,6 +62,17 @@ _PAIR_BYTES_MAX = 20
 
 Entries = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 """Samples, and units of each."""
+
+
+class Judged(NamedTuple):
+    """What the next step of a participant was found to hold."""
+
+    outputs: Outputs
+    own: int
+    """The incarnation id that made it."""
+    spent: Entries | None
+    messages: list[GossipMessage]
+    """Those that receivers take."""
 
 
 class Admission:
@@ -104,6 +124,8 @@ class Admission:
         """Points that each has shipped."""
         self._sequences = dict.fromkeys(scenario.roster, 0)
         """The number of the last envelope of each."""
+        self._judged: dict[ParticipantId, Judged] = {}
+        """The step of each that was judged last, if it is not settled."""
         self._pairs = Pairs()
         self._chains: dict[int, Chain] = {}
         """By incarnation id: the hashes of its log, as far as it is settled."""
@@ -173,26 +195,37 @@ class Admission:
         own = self._id_of(name)
         self._spend(own, spent)
         self._unsettled = spent[0].size
-        lenient = name in self._liars or self._spreads
-        reasons = (
-            self._refusal_of(envelope, own, outputs.step, lenient=lenient)
-            for envelope in outputs.outbox
-        )
-        reason = next(filter(None, reasons), "")
+        reason, messages = self._refusal_of_envelopes(name, outputs, own)
         self._spend(own, spent, back=True)
+        if not reason:
+            self._judged[name] = Judged(outputs, own, spent, messages)
         return reason
 
-    def _refusal_of(self, envelope: Envelope, own: int, step: int, *, lenient: bool) -> str:
-        """Why an envelope is refused. lenient: it may say what is not so."""
-        try:
-            message = decode_gossip(envelope.body)
-        except RefusedError as error:
-            return f"a malformed envelope ({error})"
+    def _refusal_of_envelopes(
+        self, name: ParticipantId, outputs: Outputs, own: int
+    ) -> tuple[str, list[GossipMessage]]:
+        """Why an envelope is refused; and the messages in those before it."""
+        lenient = name in self._liars or self._spreads
+        messages: list[GossipMessage] = []
+        for envelope in outputs.outbox:
+            try:
+                message = decode_gossip(envelope.body)
+            except RefusedError as error:
+                return f"a malformed envelope ({error})", messages
+            if reason := self._refusal_of(name, message, own, outputs.step, lenient=lenient):
+                return reason, messages
+            messages.append(message)
+        return "", messages
+
+    def _refusal_of(
+        self, source: ParticipantId, message: GossipMessage, own: int, step: int, *, lenient: bool
+    ) -> str:
+        """Why a message is refused. lenient: it may say what is not so."""
         if message.incarnation != own // len(self._places):
             return f"an envelope of incarnation {message.incarnation}"
-        if reason := self._refusal_of_attestations(envelope.source, message):
+        if reason := self._refusal_of_attestations(source, message):
             return reason
-        if not self._receivers_of(envelope.source).passes(own, message):
+        if not self._receivers_of(source).passes(own, message):
             return "a malformed envelope"
         arrays = (self._logs, self._written, self._consumed, self._stamps, self._false_logs)
         content = (*_parts(message), message.registers)
@@ -251,27 +284,39 @@ class Admission:
     def _follow(self, name: ParticipantId, outputs: Outputs) -> None:
         """Follow a step that was settled: an older version may have settled what is refused now."""
         own = self._id_of(name)
-        spent = self._spent_in(name, outputs)
-        if spent is not None and spent[0].size:
+        judged = self._judged.pop(name, None)
+        if judged is None or judged.outputs is not outputs or judged.own != own:
+            messages = self._messages_in(name, outputs, own)
+            judged = Judged(outputs, own, self._spent_in(name, outputs), messages)
+        if judged.spent is not None and judged.spent[0].size:
             self._points[name] += 1
-            self._spend(own, spent)
+            self._spend(own, judged.spent)
         for envelope in outputs.outbox:
             if envelope.source == name:
                 self._sequences[name] = max(self._sequences[name], envelope.sequence)
-                self._learn(envelope, own)
+        for message in judged.messages:
+            self._learn(message, own)
 
-    def _learn(self, envelope: Envelope, own: int) -> None:
-        try:
-            message = decode_gossip(envelope.body)
-        except RefusedError:
-            return
-        receivers = self._receivers_of(envelope.source)
-        if message.incarnation == own // len(self._places) and receivers.passes(own, message):
-            if self._settings[BARE]:
-                self._make_room(int(self._written[own]) + len(message.logs))
-            vector, logs, _ = _parts(message)
-            arrays = (self._logs, self._written, self._stamps, self._settings)
-            learn(*arrays, vector, logs, message.registers, own)
+    def _messages_in(self, name: ParticipantId, outputs: Outputs, own: int) -> list[GossipMessage]:
+        """The messages that a step sends, without those that nobody would take."""
+        receivers, messages = self._receivers_of(name), []
+        for envelope in outputs.outbox:
+            if envelope.source != name:
+                continue
+            with contextlib.suppress(RefusedError):
+                message = decode_gossip(envelope.body)
+                if message.incarnation == own // len(self._places) and receivers.passes(
+                    own, message
+                ):
+                    messages.append(message)
+        return messages
+
+    def _learn(self, message: GossipMessage, own: int) -> None:
+        if self._settings[BARE]:
+            self._make_room(int(self._written[own]) + len(message.logs))
+        vector, logs, _ = _parts(message)
+        arrays = (self._logs, self._written, self._stamps, self._settings)
+        learn(*arrays, vector, logs, message.registers, own)
 
     def _id_of(self, name: ParticipantId) -> int:
         """The incarnation id of a participant's newest incarnation."""
@@ -291,15 +336,12 @@ class Admission:
     def _spend(self, own: int, spent: Entries, *, back: bool = False) -> None:
         """Count what a step ships; back: take it back, since the step is only judged."""
         samples, units = spent
-        np.add.at(self._consumed, samples, -units if back else units)
-        if not self._ledger:
+        if not samples.size:
             return
-        if not back:
-            length = int(self._written[own])
-            self._make_room(length + samples.size)
-            self._logs[own, length : length + samples.size, 0] = samples
-            self._logs[own, length : length + samples.size, 1] = units
-        self._written[own] += -samples.size if back else samples.size
+        if self._ledger and not back:
+            self._make_room(int(self._written[own]) + samples.size)
+        arrays = (self._logs, self._written, self._consumed)
+        spend(*arrays, self._ledger, samples, units, own, back)
 
     def _make_room(self, needed: int) -> None:
         """Make room for so many entries in every log."""

@@ -230,3 +230,29 @@ def learn(
             if origin == own and position == written[own]:
                 logs[own, position, 0] = index
                 written[own] += 1
+
+
+@kernel
+def spend(
+    logs: np.ndarray,
+    written: np.ndarray,
+    consumed: np.ndarray,
+    ledger: bool,
+    samples: np.ndarray,
+    units: np.ndarray,
+    own: int,
+    back: bool,
+) -> None:
+    """Count what a step ships, or take it back: entries of its log, with a ledger, or what is consumed.
+
+    samples, units: (n,) the entries. `logs` has room for them; what is taken back was counted last.
+    """
+    length = written[own]
+    for i in range(samples.shape[0]):
+        if not ledger:
+            consumed[samples[i]] += -units[i] if back else units[i]
+        elif not back:
+            logs[own, length + i, 0] = samples[i]
+            logs[own, length + i, 1] = units[i]
+    if ledger:
+        written[own] += -samples.shape[0] if back else samples.shape[0]

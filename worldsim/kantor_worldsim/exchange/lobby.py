@@ -99,6 +99,8 @@ class Lobby:
         """Number of times that each participant became ready."""
         self._excused: set[ParticipantId] = set()
         """Participants that a fault has killed or frozen, or that are late: their absence is no event."""
+        self._share = 1.0 / max(1, len(config.scenario.roster) - 1)
+        """Work of an envelope to one participant, over that of one to the whole team."""
         self._gathered: deque[Event] = deque()
         """Events that have come, and wait until the reports before them are settled."""
         self._newcomers: deque[ParticipantId] = deque()
@@ -447,9 +449,8 @@ class Lobby:
 
     def _work_of(self, outputs: Outputs) -> float:
         """Receivers of the envelopes of a step, over those of one envelope to the whole team."""
-        others = max(1, len(self._config.scenario.roster) - 1)
         targets = [envelope.target for envelope in outputs.outbox]
-        return sum(1.0 if target == EVERYBODY else 1.0 / others for target in targets)
+        return sum(1.0 if target == EVERYBODY else self._share for target in targets)
 
     def _refuse_report(self, name: ParticipantId, reason: str) -> None:
         """Count a report that no honest participant sends, and name its sender, once."""

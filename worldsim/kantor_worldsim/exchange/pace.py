@@ -1,5 +1,4 @@
-"""The pace of a participant in the realtime exchange: how many steps it can have made by now, and when it needs what it
-hears. Pure.
+"""The pace of a participant in the realtime exchange: the steps it can have made, and when it needs what it hears. Pure.
 
 A participant steps when its own clock says so, at most once for each of the clock's times, and does not make up for
 steps that it has missed. World-sim knows the clock, so that whoever was silent has no steps saved up.

@@ -153,9 +153,7 @@ class RealtimeExchange:
         for name in reported:
             self._hand(name, now_ns)
 
-    def _step(
-        self, name: ParticipantId, report: Report, done: int, now_ns: int
-    ) -> Step | None:
+    def _step(self, name: ParticipantId, report: Report, done: int, now_ns: int) -> Step | None:
         """The step that a participant reports, if it may be settled now. done: its last step on record."""
         if self._injector.kills_in_step(name):
             return None
@@ -170,9 +168,7 @@ class RealtimeExchange:
         self._moved_ns[name] = report.now_ns
         return Step(name, inputs, report.outputs, report.skew_ns)
 
-    def _inputs(
-        self, name: ParticipantId, done: int, report: Report, now_ns: int
-    ) -> Inputs | None:
+    def _inputs(self, name: ParticipantId, done: int, report: Report, now_ns: int) -> Inputs | None:
         """The inputs that a participant reports, if they are possible."""
         if report.observed != done or report.now_ns < self._moved_ns[name]:
             return None
