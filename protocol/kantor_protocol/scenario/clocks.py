@@ -32,8 +32,8 @@ class StepClock(msgspec.Struct, frozen=True):
 
     def steps_by(self, now_ns: int) -> int:
         """How many steps are due by then."""
-        nominal_ns = now_ns * 1_000_000 // (1_000_000 + self.drift_ppm)
-        step = max(0, (nominal_ns - self.phase_ns) // self.period_ns + 1)
+        nominal_ns = (now_ns + 1) * 1_000_000 // (1_000_000 + self.drift_ppm)  # at the latest
+        step = max(0, (nominal_ns - self.phase_ns) // self.period_ns)
         while step and self.due_ns(step) > now_ns:
             step -= 1
         return step

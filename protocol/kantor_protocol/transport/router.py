@@ -12,11 +12,10 @@ A client connects again by itself when world-sim comes back: its token and its s
 that world-sim sees it join with the nonce that it had.
 """
 
-import contextlib
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -131,7 +130,10 @@ class HubRouter(Router):
         self._drop = zenoh.CongestionControl.DROP
         self._patient_from_s: dict[ParticipantId, float] = {}
         """Time from which on each participant that did not read is waited for again."""
+        self._flooding: set[ParticipantId] = set()
+        """Participants that have exceeded their quota."""
         self._rx = {name: keys.rx(fleet, name) for name in roster}
+        self._senders = {keys.tx(fleet, name): name for name in roster}
         self._progress = keys.progress(fleet)
         if isinstance(identity, Certificate):
             wanted = (*roster, *identity.sites, OBSERVER)
@@ -165,8 +167,9 @@ class HubRouter(Router):
 
     def charge(self, name: ParticipantId, work: float) -> bool:
         """Charge a participant for the work that one of its messages causes; whether that is within its quota."""
-        with self._charging(name) as bucket:
-            return bucket.charge(work, time.monotonic())
+        with self._admitting:
+            within = self._buckets[name].charge(work, time.monotonic())
+        return within or self._note_excess(name)
 
     def limit(self, quotas: Mapping[ParticipantId, RateLimit]) -> None:
         """Set the quotas of participants; before that, little more than replies is admitted."""
@@ -183,11 +186,11 @@ class HubRouter(Router):
         self._session.put(self._progress, payload, congestion_control=self._drop)
 
     def _on_message(self, sample: zenoh.Sample) -> None:
-        key = keys.parse(str(sample.key_expr))
-        if key is None or not self._admits(key.name, len(sample.payload)):
+        name, payload = self._senders.get(str(sample.key_expr)), sample.payload
+        if name is None or not self._admits(name, len(payload)):
             return
         if self._events.qsize() < QUEUE_MAX:
-            self._events.put(Received(key.name, sample.payload.to_bytes()))
+            self._events.put(Received(name, payload.to_bytes()))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         key = keys.parse(str(sample.key_expr))
@@ -202,18 +205,18 @@ class HubRouter(Router):
         """Whether a message or a token of a participant is within its quota."""
         if name not in self._buckets:
             return False
-        with self._charging(name) as bucket:
-            return bucket.admit(size, time.monotonic())
-
-    @contextlib.contextmanager
-    def _charging(self, name: ParticipantId) -> Iterator[TokenBucket]:
-        """The bucket of a participant, for one thread at a time; the first excess is an event."""
         with self._admitting:  # messages and tokens come in different threads
-            bucket = self._buckets[name]
-            exceeded_before = bucket.exceeded
-            yield bucket
-            if bucket.exceeded and not exceeded_before:
-                self._events.put(Flooded(name))
+            within = self._buckets[name].admit(size, time.monotonic())
+        return within or self._note_excess(name)
+
+    def _note_excess(self, name: ParticipantId) -> bool:
+        """The first excess of a participant is an event. False."""
+        with self._admitting:
+            is_first = name not in self._flooding
+            self._flooding.add(name)
+        if is_first:
+            self._events.put(Flooded(name))
+        return False
 
 
 class RefusalResponder:

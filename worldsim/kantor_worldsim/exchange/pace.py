@@ -26,7 +26,8 @@ class Pace:
         self._filled_ns = now_ns
         self._due_before = 0
         """Times of its clock that were due when it made its last step."""
-        self._next_due_ns = 0
+        self._asked_ns, self._due = -1, 0
+        """A time, and how many times of its clock are due by then."""
         self._lead_ns = round(_LEAD * clock.period_ns)
 
     def restart(self) -> None:
@@ -35,18 +36,21 @@ class Pace:
 
     def permits(self, made_ns: int, now_ns: int) -> bool:
         """Whether a step is possible that was made at made_ns by the participant's clock. now_ns: true time."""
-        return self._steps_at(now_ns) >= 1.0 and self._clock.steps_by(made_ns) > self._due_before
+        return self._steps_at(now_ns) >= 1.0 and self._due_by(made_ns) > self._due_before
 
     def count(self, made_ns: int, now_ns: int) -> None:
         """Count a step that was accepted."""
         self._steps = max(0.0, self._steps_at(now_ns) - 1.0)
-        self._filled_ns, self._due_before = now_ns, self._clock.steps_by(made_ns)
+        self._filled_ns, self._due_before = now_ns, self._due_by(made_ns)
 
     def delivery_ns(self, now_ns: int) -> int:
         """The time from which on it needs what has arrived at it, for the next step that its clock has from now on."""
-        if now_ns >= self._next_due_ns:
-            self._next_due_ns = self._clock.due_ns(self._clock.steps_by(now_ns) + 1)
-        return self._next_due_ns - self._lead_ns
+        return self._clock.due_ns(self._clock.steps_by(now_ns) + 1) - self._lead_ns
+
+    def _due_by(self, made_ns: int) -> int:
+        if made_ns != self._asked_ns:
+            self._asked_ns, self._due = made_ns, self._clock.steps_by(made_ns)
+        return self._due
 
     def _steps_at(self, now_ns: int) -> float:
         return min(_AT_ONCE, self._steps + (now_ns - self._filled_ns) * self._steps_per_ns)

@@ -22,7 +22,7 @@ from kantor_worldsim.record.records import ProcessEvent
 _CLOCK_TOLERANCE_NS = 500_000_000
 """In real time: how far a robot's clock may be ahead of world-sim's."""
 _SKEW_MAX_NS = 2**52
-_GATHER = 0.05
+_GATHER = 0.1
 """Part of a participant's period in which reports gather to a batch: every answer has that much less time."""
 
 
@@ -64,6 +64,8 @@ class RealtimeExchange:
         beat_ns = min(clock.period_ns for clock in clocks.values()) / turns
         self._gather_s = _GATHER * beat_ns * 1e-9 / self._speed
         """Real time from one batch of reports to the next, at least."""
+        self._needed_ns = dict.fromkeys(clocks, 0)
+        """Time from which on each participant needs what has arrived, for its next step."""
         self._delivery_ns = NEVER_NS
         """Time of the next delivery."""
 
@@ -165,6 +167,7 @@ class RealtimeExchange:
             self._lobby.refused += 1
             return None
         pace.count(report.now_ns, now_ns)
+        self._needed_ns[name] = pace.delivery_ns(now_ns)
         self._moved_ns[name] = report.now_ns
         return Step(name, inputs, report.outputs, report.skew_ns)
 
@@ -182,13 +185,13 @@ class RealtimeExchange:
 
     def _deliver(self) -> None:
         """Hand out what has arrived at participants that are about to step. It can wait until then."""
-        now_ns, self._delivery_ns = self._now_ns, NEVER_NS
+        now_ns, next_ns, needed_ns = self._now_ns, NEVER_NS, self._needed_ns
         for name, arrival_ns in self._simulation.channel.arrivals():
-            delivery_ns = max(arrival_ns, self._paces[name].delivery_ns(now_ns))
-            if delivery_ns <= now_ns:
+            if arrival_ns <= now_ns and needed_ns[name] <= now_ns:
                 self._hand(name, now_ns)
             else:
-                self._delivery_ns = min(self._delivery_ns, delivery_ns)
+                next_ns = min(next_ns, max(arrival_ns, needed_ns[name]))
+        self._delivery_ns = next_ns
 
     def _hand(self, name: ParticipantId, now_ns: int) -> None:
         """Send a participant its observation, which acknowledges its step, and the envelopes that have arrived."""
