@@ -30,8 +30,8 @@ Grants = Sequence[Grant]
 
 
 def robot(fleet: str, name: ParticipantId) -> Grants:
-    """The rights of a robot, or of the supervisor."""
-    return _participants(fleet, (name,))
+    """The rights of a robot, or of the supervisor: to act for itself, and to learn which of its keys are observed."""
+    return (*_participants(fleet, (name,)), _awareness(fleet))
 
 
 def observer(fleet: str) -> Grants:
@@ -54,14 +54,8 @@ def anyone(fleet: str) -> Grants:
 
 
 def site(fleet: str, members: Iterable[ParticipantId]) -> Grants:
-    """The rights of a site at the hub: to act for its robots, and to learn which keys have subscribers.
-
-    That a key has a subscriber discloses nothing; without this a router does not forward what is put on it.
-    """
-    return (
-        *_participants(fleet, tuple(members)),
-        Grant("egress", "declare_subscriber", (keys.everything(fleet),)),
-    )
+    """The rights of a site at the hub: to act for its robots, and to learn which keys have subscribers."""
+    return (*_participants(fleet, tuple(members)), _awareness(fleet))
 
 
 def hub(fleet: str, members: Iterable[ParticipantId]) -> Grants:
@@ -95,6 +89,14 @@ def control(subjects: Iterable[tuple[str, dict[str, list[str]], Grants]]) -> dic
         "subjects": known,
         "policies": policies,
     }
+
+
+def _awareness(fleet: str) -> Grant:
+    """The right to learn which keys have subscribers.
+
+    That discloses nothing; without it neither a publisher nor a router passes on what is put there.
+    """
+    return Grant("egress", "declare_subscriber", (keys.everything(fleet),))
 
 
 def _participants(fleet: str, names: tuple[ParticipantId, ...]) -> Grants:

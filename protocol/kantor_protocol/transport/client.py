@@ -32,8 +32,10 @@ class ParticipantSession:
         self._identity = identity
         self._block = zenoh.CongestionControl.BLOCK
         self._drop = zenoh.CongestionControl.DROP
-        self._tx, self._pose = keys.tx(fleet, name), keys.pose(fleet, name)
-        self._weights = keys.weights(fleet, name)
+        self._tx = keys.tx(fleet, name)
+        # What a publisher puts does not leave this process while nobody observes it.
+        self._pose = session.declare_publisher(keys.pose(fleet, name))
+        self._weights = session.declare_publisher(keys.weights(fleet, name))
         self._declared: list[Any] = [
             session.declare_subscriber(keys.rx(fleet, name), self._on_message),
             session.liveliness().declare_token(keys.alive(fleet, name, nonce)),
@@ -63,11 +65,11 @@ class ParticipantSession:
 
     def publish_pose(self, payload: bytes) -> None:
         """Publish the own pose for observers."""
-        self._session.put(self._pose, payload)
+        self._pose.put(payload)
 
     def publish_weights(self, payload: bytes) -> None:
         """Publish the own weight vector for observers."""
-        self._session.put(self._weights, payload)
+        self._weights.put(payload)
 
     def close(self) -> None:
         """Leave the bus."""
