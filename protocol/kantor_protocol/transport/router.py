@@ -132,7 +132,7 @@ class HubRouter(Router):
         """Time from which on each participant that did not read is waited for again."""
         self._flooding: set[ParticipantId] = set()
         """Participants that have exceeded their quota."""
-        self._rx = {name: keys.rx(fleet, name) for name in roster}
+        self._publishers: dict[tuple[ParticipantId, bool], zenoh.Publisher] = {}
         self._senders = {keys.tx(fleet, name): name for name in roster}
         self._progress = keys.progress(fleet)
         if isinstance(identity, Certificate):
@@ -156,10 +156,19 @@ class HubRouter(Router):
         """
         started_s = time.monotonic()
         waits = blocking and started_s >= self._patient_from_s.get(name, started_s)
-        congestion = self._block if waits else self._drop
-        self._session.put(self._rx[name], payload, congestion_control=congestion, express=True)
+        self._publisher(name, waits=waits).put(payload)
         if waits and time.monotonic() - started_s > _SLOW_S:
             self._patient_from_s[name] = time.monotonic() + _IMPATIENT_S
+
+    def _publisher(self, name: ParticipantId, *, waits: bool) -> zenoh.Publisher:
+        """The publisher of a participant's `rx`, whose way is found once."""
+        if (name, waits) not in self._publishers:
+            self._publishers[name, waits] = self._session.declare_publisher(
+                keys.rx(self._fleet, name),
+                congestion_control=self._block if waits else self._drop,
+                express=True,
+            )
+        return self._publishers[name, waits]
 
     def grant_reply(self, name: ParticipantId) -> None:
         """Let a participant answer the request that is sent to it next."""
