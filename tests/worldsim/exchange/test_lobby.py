@@ -4,9 +4,17 @@ from typing import cast
 
 import pytest
 
+from kantor_protocol.base.machine import Outputs, Pose
 from kantor_protocol.transport.events import Event, Joined, Left, Received
 from kantor_protocol.transport.router import HubRouter
-from kantor_protocol.wire.messages import VERSION, Mission, Ready, decode_to_participant, encode
+from kantor_protocol.wire.messages import (
+    VERSION,
+    Mission,
+    Ready,
+    Report,
+    decode_to_participant,
+    encode,
+)
 from kantor_worldsim.engine.simulation import Simulation
 from kantor_worldsim.exchange.config import MissionConfig
 from kantor_worldsim.exchange.lobby import RETRY_S, Lobby
@@ -40,6 +48,16 @@ class Bus:
             return self.events.pop(0)
         self.now_s += timeout_s
         return None
+
+    def drain(self, timeout_s: float, _every_s: float) -> list[Event]:
+        """All events; without one, time passes."""
+        events = [event for event in [self.next(timeout_s)] if event] + self.events
+        self.events = []
+        return events
+
+    def charge(self, _name: str, _work: float) -> bool:
+        """Nobody has a quota."""
+        return True
 
     def send(self, name: str, payload: bytes, *, blocking: bool) -> None:
         """Keep a message."""
@@ -120,3 +138,25 @@ def test_in_lockstep_the_barrier_decides_who_has_left(*, back: bool) -> None:
 
     left = ProcessEvent(7, "r1", ProcessEventKind.LEAVE)
     assert records[known:] == ([] if back else [left])
+
+
+def test_reports_before_a_departure_are_settled_before_it() -> None:
+    """They come together, up to an arrival or departure, which is on record after the steps that came before it."""
+    bus, records = Bus(), list[Record]()
+    lobby = lobby_on(bus, records)
+    for name in ("r1", "r2"):
+        bus.events += [Joined(name, name), Received(name, encode(Ready(VERSION, name)))]
+    while bus.events:
+        lobby.next(1.0)
+    lobby.open(lambda: 7)
+    known = len(records)
+
+    def reported(name: str) -> Received:
+        return Received(name, encode(Report(VERSION, name, Outputs(0, Pose(0.0, 0.0)))))
+
+    bus.events += [reported("r1"), reported("r2"), Left("r1", "r1"), reported("r1"), reported("r2")]
+    assert [name for name, _ in lobby.reports(1.0, 0.0)] == ["r1", "r2"]
+    assert len(records) == known
+    assert [name for name, _ in lobby.reports(1.0, 0.0)] == ["r2"]
+    assert [event.who for event in records[known:] if isinstance(event, ProcessEvent)] == ["r1"]
+    assert lobby.reports(1.0, 0.0) == []

@@ -80,3 +80,13 @@ def test_every_step_of_an_honest_robot_is_accepted(
         assert pace.permits(made_ns, arrived_ns)
         pace.count(made_ns, arrived_ns)
         acknowledged_ns = arrived_ns
+
+
+@given(seed=st.integers(0, 50), now_ns=st.integers(0, 100 * PERIOD_NS))
+@examples(100)
+def test_what_has_arrived_is_needed_shortly_before_the_next_step(seed: int, now_ns: int) -> None:
+    """Less than half a period before the first time of its clock that is to come."""
+    clock = step_clocks(mission("clock.spread=0.4", "clock.jitter_s=0.02"), seed)["r1"]
+    next_ns = next(due for due in map(clock.due_ns, range(1, 1000)) if due > now_ns)
+
+    assert next_ns - PERIOD_NS * 0.4 < Pace(clock, 0).delivery_ns(now_ns) < next_ns

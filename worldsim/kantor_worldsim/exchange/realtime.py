@@ -1,4 +1,4 @@
-"""The realtime exchange: every participant steps by its own clock, and world-sim relays on arrival."""
+"""The realtime exchange: every participant steps by its own clock, and world-sim relays in time for its next step."""
 
 import time
 from collections import deque
@@ -29,7 +29,8 @@ _GATHER = 0.1
 class RealtimeExchange:
     """Relays between participants that step by their own clocks.
 
-    Messages are decided on and relayed when they arrive. Inboxes are recorded as participants report them. A step
+    Reports are settled in batches, and messages are relayed with the acknowledgement of the receiver's last step or
+    shortly before its next one. Inboxes are recorded as participants report them. A step
     is accepted once, and the next only after it: a participant takes no step before its last one is
     acknowledged, and repeats its report until then.
     """
@@ -62,7 +63,7 @@ class RealtimeExchange:
         """Time of each participant's last accepted step in this process of world-sim, by its own clock."""
         turns = len(clocks) if config.scenario.clock.order == "turn" else 1
         beat_ns = min(clock.period_ns for clock in clocks.values()) / turns
-        self._gather_s = _GATHER * beat_ns * 1e-9 / self._speed
+        self._gather_s = min(POLL_S, _GATHER * beat_ns * 1e-9 / self._speed)
         """Real time from one batch of reports to the next, at least."""
         self._needed_ns = dict.fromkeys(clocks, 0)
         """Time from which on each participant needs what has arrived, for its next step."""
