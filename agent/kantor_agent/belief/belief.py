@@ -14,7 +14,7 @@ from kantor_agent.belief.sample_index import (
     remove,
     remove_empty,
 )
-from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.kernels import kernel, typed
 from kantor_protocol.base.random_walk import RandomWalk
 from kantor_protocol.base.varint import pack_pairs
 from kantor_protocol.replication.registers import Registers
@@ -174,6 +174,9 @@ class Belief:
         """Arguments of `_drop_empty`: the arrays of `grid` and of the replica's store, which keeps these three."""
         self._follow_store()
 
+        self._ship = typed(_ship_packed, *self._to_ship, 0.0, 0.0)
+        self._drop_empty = typed(_drop_empty, *self._to_drop)
+
     def _follow_store(self) -> None:
         """Take the arrays of the replica's store, which are replaced when logs grow or incarnations come."""
         store, config = self.replica.store, self.replica.config
@@ -244,13 +247,13 @@ class Belief:
             build(self.grid, self.weights)
             return
         if self.replica.fell:
-            _drop_empty(*self._to_drop)
+            self._drop_empty(*self._to_drop)
 
     def spend(self, x_m: float, y_m: float) -> bytes:
         """Ship one robot point from here (Prop. 1); packed pairs (sample, units), nearest first."""
-        used = _ship_packed(*self._to_ship, x_m, y_m)
+        used: int = self._ship(*self._to_ship, x_m, y_m)
         if used < 0:
             self.replica.reserve(self._shipment.sample.shape[0])
             self._follow_store()
-            used = _ship_packed(*self._to_ship, x_m, y_m)
+            used = self._ship(*self._to_ship, x_m, y_m)
         return self._packed[:used].tobytes()

@@ -6,13 +6,14 @@ step into a sample depends on the sample before and on that sample alone.
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
 from kantor_agent.belief.belief import Belief
 from kantor_agent.belief.sample_index import SampleIndex, nearest
 from kantor_agent.planners.base import Goal
-from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.kernels import kernel, typed
 from kantor_protocol.base.machine import Pose
 from kantor_protocol.replication.replica_kernels import NO_INDEX, claim, claimed_by_others
 
@@ -121,8 +122,13 @@ class Transport:
             np.zeros(horizon, dtype=np.int64),
             np.zeros((1 << horizon, horizon), dtype=np.float64),
         )
+        self._choose: Callable[..., tuple[int, float, float]] | None = None
+        """`_choose` for a robot's belief, from the first choice on."""
 
     def choose(self, belief: Belief, pose: Pose, now_ns: int, /) -> Goal | None:
         """The first sample of the best order; one that another robot has claimed only if all are claimed."""
-        sample, x_m, y_m = _choose(*belief.to_choose, *self._scratch, pose.x_m, pose.y_m, now_ns)
+        arguments = (*belief.to_choose, *self._scratch, pose.x_m, pose.y_m, now_ns)
+        if self._choose is None:
+            self._choose = typed(_choose, *arguments)
+        sample, x_m, y_m = self._choose(*arguments)
         return None if sample == NO_INDEX else Goal(x_m, y_m, sample)

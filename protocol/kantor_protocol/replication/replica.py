@@ -42,6 +42,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX, known_ids
+from kantor_protocol.base.kernels import typed
 from kantor_protocol.base.varint import Pairs
 from kantor_protocol.replication.registers import OTHERS_MAX, STAMP_MAX, Registers
 from kantor_protocol.replication.replica_kernels import (
@@ -143,6 +144,10 @@ class Replica:
         """The arrays that kernels work on. ReplicaArrays states which of them agree with which."""
         self._settings = np.array(self.config, dtype=np.int64)
         self._make_scratch()
+        self._merge = typed(merge, *self._fields, b"", b"", b"", 0)
+        self._compose = typed(compose, *self._fields, self._out, self._least, NO_INDEX)
+        self._pack = typed(pack_lowered, *self._to_pack)
+        self._end_step = typed(end_step, self.store.counters)
 
     def _make_scratch(self) -> None:
         """Have kernels work on the store as it is, with scratch arrays for as many origins."""
@@ -150,6 +155,7 @@ class Replica:
         self._out = np.zeros(20 * ENTRIES_MAX + 120 * origins + 64, dtype=np.uint8)
         self._least = np.zeros(2 * origins, dtype=np.int32)
         self._fields = (*self.store, self._settings)
+        self._to_pack = (self.store.weights, self.store.lowered, self.store.counters, self._out)
 
     @property
     def origins(self) -> int:
@@ -176,12 +182,12 @@ class Replica:
             covered = count_ids(version_vector, self.config.roster, parts)
             if not self.registers.is_well_formed(registers, covered):
                 return False
-        outcome = merge(*self._fields, version_vector, logs, claims, source)
+        outcome = self._merge(*self._fields, version_vector, logs, claims, source)
         while outcome != MERGED:
             if outcome == MALFORMED:
                 return False
             self._make_room(outcome)
-            outcome = merge(*self._fields, version_vector, logs, claims, source)
+            outcome = self._merge(*self._fields, version_vector, logs, claims, source)
         if registers:
             self.registers.merge(source, registers, covered)
         return True
@@ -244,7 +250,9 @@ class Replica:
 
     def compose(self, target: int = NO_INDEX) -> tuple[bytes, bytes, bytes]:
         """(version vector, logs, claims) of one message to all in range, or to one origin."""
-        end_of_vector, end_of_logs, end = compose(*self._fields, self._out, self._least, target)
+        end_of_vector, end_of_logs, end = self._compose(
+            *self._fields, self._out, self._least, target
+        )
         message = self._out[:end].tobytes()
         return message[:end_of_vector], message[end_of_vector:end_of_logs], message[end_of_logs:]
 
@@ -272,16 +280,15 @@ class Replica:
 
     def packed_lowered(self) -> bytes:
         """Packed pairs (sample, units left) of what fell in this step."""
-        store = self.store
-        used = pack_lowered(store.weights, store.lowered, store.counters, self._out)
+        used = self._pack(*self._to_pack)
         if used == NO_ROOM_TO_PACK:
             index = self.lowered()
-            return Pairs().encode(index, store.weights[index], index.shape[0])
+            return Pairs().encode(index, self.weights[index], index.shape[0])
         return self._out[:used].tobytes()
 
     def end_step(self) -> None:
         """Begin the next step."""
-        end_step(self.store.counters)
+        self._end_step(self.store.counters)
         self.registers.end_step()
 
     # Invariants.

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.kernels import kernel, typed
 from kantor_protocol.base.varint import Pairs
 
 Weights = npt.NDArray[np.signedinteger]
@@ -84,6 +84,7 @@ class WeightsPublisher:
         self._count = 0
         self._noted_in = np.zeros(weights.shape[0], dtype=np.int32)
         self._pairs = Pairs()
+        self._note = typed(_note, self._changed, self._changed, 0, self._noted_in, 1)
 
     def step(self, lowered: npt.NDArray[np.int32], *, last: bool) -> bytes:
         """Add the indices that fell in a step; the encoded message when one is due, else nothing.
@@ -91,7 +92,7 @@ class WeightsPublisher:
         last: no entry will fall any more, so a message is due now.
         """
         if lowered.size:
-            self._count = _note(
+            self._count = self._note(
                 lowered, self._changed, self._count, self._noted_in, self._sequence + 1
             )
         due = self._steps % self._every == 0 or (last and self._count > 0)

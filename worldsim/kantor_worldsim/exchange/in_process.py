@@ -1,8 +1,6 @@
-"""The in-process exchange: participants are objects in this process; messages still pass through the codec."""
+"""The in-process exchange: participants are objects in this process. What they say to one another is still encoded."""
 
 from collections.abc import Mapping
-
-import msgspec
 
 from kantor_protocol.base.machine import (
     WORLD_SIM,
@@ -14,21 +12,14 @@ from kantor_protocol.base.machine import (
 )
 from kantor_protocol.node.recovery import KillableNode
 from kantor_protocol.scenario.faults.processes import Disk
-from kantor_protocol.wire.messages import decode_inputs, encode
 from kantor_worldsim.exchange.membership import JoinDecision, Membership
-
-_decode_outputs = msgspec.msgpack.Decoder(Outputs).decode
-"""Their numbers are checked by the simulation."""
 
 
 class _PermanentNode:
-    """A participant that no fault of the scenario kills: its state machine, with encoded inputs."""
+    """A participant that no fault of the scenario kills: its state machine."""
 
     def __init__(self, machine: StateMachine) -> None:
-        self._machine = machine
-
-    def step_encoded(self, entry: bytes, /) -> Outputs:
-        return self._machine.step(decode_inputs(entry))
+        self.step = machine.step
 
     def start(self, body: Body, _disk: Disk) -> tuple[int, int]:
         """A late joiner has existed since the start, and was not asked until now."""
@@ -38,7 +29,7 @@ class _PermanentNode:
 class InProcessExchange:
     """Exchange and process control for participants in this process.
 
-    Inputs and outputs pass through the codec, so that participants share no objects.
+    Inputs and outputs are values, which nobody can change: they are passed as they are. Messages are bytes in them.
     """
 
     def __init__(self, machines: Mapping[ParticipantId, StateMachine]) -> None:
@@ -58,10 +49,7 @@ class InProcessExchange:
     ) -> Mapping[ParticipantId, Outputs]:
         """Step all participants of a batch."""
         nodes = self._nodes
-        return {
-            name: _decode_outputs(encode(nodes[name].step_encoded(encode(given))))
-            for name, given in inputs.items()
-        }
+        return {name: nodes[name].step(given) for name, given in inputs.items()}
 
     def kill(self, name: ParticipantId) -> None:
         """Kill a participant. World-sim itself is rebuilt from its records by the event loop."""

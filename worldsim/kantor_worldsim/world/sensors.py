@@ -15,7 +15,7 @@ from kantor_worldsim.world.maps import Ground
 
 @kernel
 def sense_targets(
-    targets_m: np.ndarray, found: np.ndarray, x: float, y: float, range_m: float, out: np.ndarray
+    targets_m: np.ndarray, found: np.ndarray, range_m: float, out: np.ndarray, x: float, y: float
 ) -> int:
     """Mark the targets within range that were not found yet; returns their number, with their indices in `out`.
 
@@ -41,10 +41,10 @@ def sense_targets_in_sight(
     resolution_m: float,
     targets_m: np.ndarray,
     found: np.ndarray,
-    x: float,
-    y: float,
     range_m: float,
     out: np.ndarray,
+    x: float,
+    y: float,
 ) -> int:
     """As `sense_targets`, on a map: a target in a cell that is not free, or behind one, is not seen."""
     rows, columns = cells.shape

@@ -1,7 +1,7 @@
 """The truth: poses of robots and targets, energy that was spent, and targets that were found."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from kantor_protocol.base.counter_rng import Purpose
 from kantor_protocol.base.grid import FREE, NOWHERE, free_way
+from kantor_protocol.base.kernels import typed
 from kantor_protocol.base.machine import SUPERVISOR, Body, Observation, Outputs, ParticipantId, Pose
 from kantor_protocol.base.random_walk import RandomWalk
 from kantor_protocol.base.varint import sum_pairs
@@ -156,10 +157,20 @@ class World:
         self._samples = setup.samples_m.shape[0]
         self._budget = scenario.steps_per_robot
         self._speed_m_s = scenario.vehicle.speed_m_s
-        self._range_m = scenario.sensor.range_m
         self._room = np.zeros(setup.targets_m.shape[0], dtype=np.int64)
         self._bodies = {name: _Body(pose) for name, pose in setup.poses(scenario).items()}
         self._ground = setup.ground
+        self._to_look: tuple[Any, ...] = (
+            *(self._targets.xy_m, self.found),
+            *(scenario.sensor.range_m, self._room),
+        )
+        """Arguments of `_look`, which end with a place."""
+        look: Any = sense_targets
+        if setup.ground is not None:
+            frame, cells = setup.ground
+            self._to_look = (cells, *frame.origin_m, frame.resolution_m, *self._to_look)
+            look = sense_targets_in_sight
+        self._look = typed(look, *self._to_look, 0.0, 0.0)
         if setup.ground is not None:
             self._range_finder = RangeFinder(scenario.sensor, setup.ground, seed)
             self._places = {name: i for i, name in enumerate(scenario.robot_ids)}
@@ -250,13 +261,8 @@ class World:
     def _sense(self, name: ParticipantId) -> tuple[Found, ...]:
         if not self.found.size:
             return ()
-        body, ground, targets_m = self._bodies[name], self._ground, self._targets.xy_m
-        arguments = (targets_m, self.found, body.pose.x_m, body.pose.y_m, self._range_m, self._room)
-        if ground is None:
-            count = sense_targets(*arguments)
-        else:
-            frame, cells = ground
-            count = sense_targets_in_sight(cells, *frame.origin_m, frame.resolution_m, *arguments)
+        body, targets_m = self._bodies[name], self._targets.xy_m
+        count = self._look(*self._to_look, body.pose.x_m, body.pose.y_m)
         if not count:
             return ()
         indices = self._room[:count].tolist()
