@@ -110,6 +110,26 @@ def test_links_are_mutual(places: list[tuple[float, float]], range_m: float) -> 
     assert links(np.array(places), range_m) == len(pairs) / 2
 
 
+@examples(100)
+@given(
+    places=st.lists(st.tuples(st.integers(-9, 9), st.integers(-9, 9)), min_size=12, max_size=12),
+    range_m=st.sampled_from([0.0, 1.0, 2.5, 6.0, 40.0]),
+    others=st.sampled_from([(), (CENTRALIZED,)]),
+)
+def test_many_envelopes_are_decided_as_each_by_itself(
+    places: list[tuple[int, int]], range_m: float, others: tuple[str, ...]
+) -> None:
+    """Only for many are participants sorted by place; that changes no decision, no order and no count."""
+    options = (f"radio.range_m={range_m}", "robots.count=12", "starts.random=true", *others)
+    at = {f"r{i + 1}": (float(x), float(y)) for i, (x, y) in enumerate(places)}
+    together, alone = channel(*options, at=at), channel(*options, at=at)
+    sent = [sent_by(name, 1) for name in (*at, *([SUPERVISOR] if others else []))]
+    one_by_one = [alone.transmit([each]) for each in sent]
+
+    decisions = [decision for decided, _ in one_by_one for decision in decided]
+    assert together.transmit(sent) == (decisions, sum(lost for _, lost in one_by_one))
+
+
 def test_range_is_measured_at_the_time_of_sending() -> None:
     """An envelope in flight reaches a robot that has left; one that was out of range never arrives."""
     radio = channel("radio.range_m=5", "radio.delay_s=1.0", at={"r3": (50.0, 0.0)})

@@ -6,6 +6,7 @@ keyed by (seed, purpose, link, sequence, copy) and independent of what happened 
 more robot changes no other draw.
 """
 
+import math
 import struct
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -16,9 +17,10 @@ import msgspec
 import numpy as np
 
 from kantor_protocol.base.counter_rng import Purpose, uniform
-from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.kernels import kernel, typed
 from kantor_protocol.base.machine import EVERYBODY, SUPERVISOR, Envelope, ParticipantId, Pose
 from kantor_protocol.scenario.schema import RadioOptions, Scenario
+from kantor_worldsim.radio.neighbours import Neighbourhood, candidates, sort_by_place
 from kantor_worldsim.world.maps import Ground
 from kantor_worldsim.world.sensors import walls_between
 
@@ -26,6 +28,11 @@ LINK_WIDTH = 4096
 """Links are numbered source * LINK_WIDTH + target; rosters are smaller, and the supervisor has the last number."""
 DROPPED = -1
 """The due time of a copy that is lost."""
+
+_MANY = 8
+"""From so many envelopes on it pays to sort the participants by place first."""
+
+_NOBODY = Neighbourhood.of(0)
 
 _SENT = struct.Struct("=qqqq")
 """A row of the kernel's input; packing it costs a fifth of building an array."""
@@ -205,6 +212,26 @@ def _delay(config: _ChannelConfig, link: int, sequence: int, copy: int) -> int:
 
 
 @kernel
+def _possible(
+    source: int, target: int, by_place: bool, geometry: LinkGeometry, around: Neighbourhood
+) -> int:
+    """Write into `near` who may receive an envelope, by index; their number.
+
+    target: an index, -1 for all, or an index that nobody has. by_place: after `sort_by_place`.
+    """
+    participants = geometry.xy_m.shape[0]
+    if target >= 0:
+        around.near[0] = target
+        return 1 if target < participants else 0
+    if by_place:
+        count: int = candidates(geometry.xy_m, source, around)
+        return count
+    for other in range(participants):
+        around.near[other] = other
+    return participants
+
+
+@kernel
 def _transmit(
     seed: int,
     robot_range_m: float,
@@ -224,9 +251,15 @@ def _transmit(
     xy_m: np.ndarray,
     supervisor: int,
     supervisor_placed: bool,
+    side: int,
+    first: np.ndarray,
+    order: np.ndarray,
+    near: np.ndarray,
+    runs: np.ndarray,
+    frame: np.ndarray,
     sent: np.ndarray,
-    envelopes: int,
     decided: np.ndarray,
+    envelopes: int,
 ) -> tuple[int, int]:
     """Decide on every envelope for every possible receiver.
 
@@ -255,19 +288,27 @@ def _transmit(
         supervisor,
         supervisor_placed,
     )
+    around = Neighbourhood(side, first, order, near, runs, frame)
+    participants = xy_m.shape[0]
+    by_place = envelopes >= _MANY and math.isfinite(robot_range_m)
+    if by_place:
+        sort_by_place(xy_m, robot_range_m, supervisor, around)
     receiver, which, due_ns = decided[:, 0], decided[:, 1], decided[:, 2]
     count = 0
     out_of_range = 0
     for i in range(envelopes):
         source, sequence, target = sent[i, 1], sent[i, 2], sent[i, 3]
-        for other in range(xy_m.shape[0]):
-            if other == source or (target >= 0 and other != target):
+        possible = _possible(source, target, by_place and source != supervisor, geometry, around)
+        out_of_range += participants - 1 if target < 0 else min(possible, int(target != source))
+        for j in range(possible):
+            other = near[j]
+            if other == source:
                 continue
             by_supervisor = supervisor in (other, source)
             range_m = config.supervisor_range_m if by_supervisor else config.range_m
             if not hears(geometry, source, other, range_m):
-                out_of_range += 1
                 continue
+            out_of_range -= 1
             link = link_of(source, other, supervisor)
             copies = 1
             if config.duplicate > 0.0:
@@ -320,7 +361,7 @@ class Channel:
             self._places.get(SUPERVISOR, -1),
             scenario.supervisor.pose_m is not None,
         )
-        self._arguments: tuple[Any, ...] = (*self._config, *self._geometry)
+        self._around = Neighbourhood.of(len(scenario.roster))
         self._in_flight: dict[ParticipantId, list[_Flight]] = {name: [] for name in scenario.roster}
         """A heap of envelopes for each receiver, the next arrival first; no copy that is lost."""
         self._boxes = list(self._in_flight.items())
@@ -328,6 +369,7 @@ class Channel:
         """Number of copies put in flight so far; each has a number of its own, up to this one."""
         self._sent = np.zeros((0, 4), dtype=np.int64)
         self._make_room(1)
+        self._transmit = typed(_transmit, *self._arguments, 0)
 
     @property
     def lookahead_ns(self) -> int:
@@ -353,7 +395,7 @@ class Channel:
             source, sequence = places[envelope.source], envelope.sequence
             target = targets.get(envelope.target, nowhere)
             _SENT.pack_into(self._sent_bytes, _SENT.size * i, now_ns, source, sequence, target)
-        count, out_of_range = _transmit(*self._arguments, self._sent, len(sent), self._decided)
+        count, out_of_range = self._transmit(*self._arguments, len(sent))
         decided = Decisions(self._decided, count)
         if self._interference is not None:
             sent, decided, lost = self._interference(sent, self._sent, decided, self._geometry)
@@ -368,16 +410,15 @@ class Channel:
             self._flights,
             len(self._roster),
         )
+        air = [(e, e.source, e.sequence, places.get(e.source, nowhere)) for _, e in on_air]
         decisions = []
         rows = decided.rows.data.cast("B")[: _DECIDED.size * decided.size]
         for to, row, due_ns in _DECIDED.iter_unpack(rows):
-            envelope = on_air[row][1]
-            source, sequence = envelope.source, envelope.sequence
+            envelope, source, sequence, place = air[row]
             receiver, box = boxes[to]
             decisions.append(DeliveryDecision(source, sequence, receiver, due_ns))
             if due_ns != DROPPED:
                 flights += 1
-                place = places.get(source, nowhere)
                 heappush(box, (due_ns, place, sequence, flights, envelope))
         self._flights = flights
         return decisions
@@ -444,11 +485,16 @@ class Channel:
             self._sent = np.zeros((2 * envelopes, 4), dtype=np.int64)
             self._sent_bytes = self._sent.data
             self._decided = np.zeros((4 * envelopes * len(self._roster), 3), dtype=np.int64)
+            self._arguments: tuple[Any, ...] = (
+                *(*self._config, *self._geometry, *self._around),
+                *(self._sent, self._decided),
+            )
 
 
 def links(xy_m: np.ndarray, range_m: float, walls: Walls = OPEN) -> int:
     """Number of pairs of robots whose link is up. xy_m: (n, 2)."""
-    return int(_links(*walls, xy_m, range_m))
+    around = Neighbourhood.of(xy_m.shape[0]) if xy_m.shape[0] >= _MANY else _NOBODY
+    return int(_links(*walls, *around, xy_m, range_m))
 
 
 @kernel
@@ -459,12 +505,25 @@ def _links(
     line_of_sight: bool,
     loss_m: float,
     cells: np.ndarray,
+    side: int,
+    first: np.ndarray,
+    order: np.ndarray,
+    near: np.ndarray,
+    runs: np.ndarray,
+    frame: np.ndarray,
     xy_m: np.ndarray,
     range_m: float,
 ) -> int:
     walls = (left_m, bottom_m, resolution_m, line_of_sight, loss_m, cells)
+    around = Neighbourhood(side, first, order, near, runs, frame)
+    by_place = xy_m.shape[0] >= _MANY and math.isfinite(range_m)
+    if by_place:
+        sort_by_place(xy_m, range_m, -1, around)
     count = 0
     for i in range(xy_m.shape[0]):
-        for j in range(i):
-            count += _in_range(*walls, xy_m, i, j, range_m, False)
+        possible = candidates(xy_m, i, around) if by_place else i
+        for j in range(possible):
+            other = near[j] if by_place else j
+            if other < i:
+                count += _in_range(*walls, xy_m, i, other, range_m, False)
     return count
