@@ -26,7 +26,9 @@ class StepTimer:
 
     def elapsed_s(self, now_ns: int) -> float:
         """Seconds since the call before: between 0 and a period, whatever the clock says."""
-        elapsed_ns = max(0, min(now_ns - self._last_ns, self._period_ns))
+        elapsed_ns = now_ns - self._last_ns
+        if not 0 <= elapsed_ns <= self._period_ns:
+            elapsed_ns = 0 if elapsed_ns < 0 else self._period_ns
         self._last_ns = now_ns
         return elapsed_ns * 1e-9
 

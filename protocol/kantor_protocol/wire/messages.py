@@ -6,6 +6,7 @@ that does not decode, has another version or a number that is not finite is refu
 """
 
 import math
+from functools import lru_cache
 from typing import Annotated, Any
 
 import msgspec
@@ -271,6 +272,8 @@ _TO_PARTICIPANT = msgspec.msgpack.Decoder(ToParticipant)
 _PROGRESS = msgspec.msgpack.Decoder(Progress)
 
 encode = _ENCODER.encode
+_SHORT_BYTES, _SHARED = 1024, 2048
+"""Bodies that are kept decoded: how long, and how many. They take a few MB at most."""
 _decode_gossip = msgspec.msgpack.Decoder(GossipMessage).decode
 _decode_inputs = msgspec.msgpack.Decoder(Inputs).decode
 _NO_ATTESTATIONS = encode(()) + encode(())
@@ -297,6 +300,16 @@ def encode_gossip(message: GossipMessage) -> bytes:
 
 def decode_gossip(body: bytes) -> GossipMessage:
     """The body of an envelope. Raises RefusedError."""
+    return _decode_once(body) if len(body) <= _SHORT_BYTES else _decode_body(body)
+
+
+@lru_cache(maxsize=_SHARED)
+def _decode_once(body: bytes) -> GossipMessage:
+    """A broadcast is decoded once for all its receivers in this process."""
+    return _decode_body(body)
+
+
+def _decode_body(body: bytes) -> GossipMessage:
     if len(body) > BODY_BYTES_MAX:
         raise RefusedError(f"body of {len(body)} bytes")
     try:
@@ -356,9 +369,13 @@ def decode_inputs(payload: bytes) -> Inputs:
 def check_outputs(outputs: Outputs) -> None:
     """Raise RefusedError for numbers that no participant may send."""
     pose, goal = outputs.pose, outputs.goal
-    numbers = (pose.x_m, pose.y_m, pose.heading_rad, pose.speed_m_s, *(goal or ()))
+    total = pose.x_m + pose.y_m + pose.heading_rad + pose.speed_m_s
+    if goal is not None:
+        total += goal[0] + goal[1]
     # One number that is not finite spoils the sum; only sums of absurd numbers overflow by themselves.
-    if not math.isfinite(sum(numbers)) and not all(map(math.isfinite, numbers)):
+    if not math.isfinite(total) and not all(
+        map(math.isfinite, (*msgspec.structs.astuple(pose), *(goal or ())))
+    ):
         raise RefusedError("outputs with a number that is not finite")
     if not (
         0 <= outputs.step < 2**63

@@ -32,7 +32,7 @@ def publish(
     for step in steps:
         for sample, units in step:
             weights[sample] = max(0, weights[sample] - units)
-        fallen = np.array(sorted({sample for sample, _ in step}), dtype=np.int64)
+        fallen = np.array(sorted({sample for sample, _ in step}), dtype=np.int32)
         messages.append((publisher.step(fallen, last=False), weights.tolist()))
     return [(content, vector) for content, vector in messages if content]
 
@@ -109,11 +109,11 @@ def test_last_step_is_published_at_once() -> None:
     """When nothing will fall any more, observers get the final vector without waiting; once."""
     weights = np.full(3, 9, dtype=np.int64)
     publisher, subscriber = WeightsPublisher(weights, 10, 20), WeightsSubscriber()
-    nothing = np.zeros(0, dtype=np.int64)
+    nothing = np.zeros(0, dtype=np.int32)
     subscriber.apply(publisher.step(nothing, last=False))
     weights[1] = 4
 
-    assert publisher.step(np.array([1]), last=False) == b""
+    assert publisher.step(np.array([1], dtype=np.int32), last=False) == b""
     assert subscriber.apply(publisher.step(nothing, last=True))
     assert vector_of(subscriber) == [9, 4, 9]
     assert publisher.step(nothing, last=True) == b""

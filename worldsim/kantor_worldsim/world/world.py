@@ -160,6 +160,7 @@ class World:
         self._room = np.zeros(setup.targets_m.shape[0], dtype=np.int64)
         self._bodies = {name: _Body(pose) for name, pose in setup.poses(scenario).items()}
         self._ground = setup.ground
+        self._sum_pairs = typed(sum_pairs, b"", self._samples)
         self._to_look: tuple[Any, ...] = (
             *(self._targets.xy_m, self.found),
             *(scenario.sensor.range_m, self._room),
@@ -234,7 +235,9 @@ class World:
         start = body.pose
         way_m = math.hypot(pose.x_m - start.x_m, pose.y_m - start.y_m)
         if limit_m > 0.0:
-            limit_m = limit_m * (1.0 + SPEED_TOLERANCE) + rounding_m(start)
+            limit_m *= 1.0 + SPEED_TOLERANCE
+            if way_m > limit_m:
+                limit_m += rounding_m(start)
         if not way_m <= limit_m:  # also for a pose that is not finite
             return False
         body.pose = pose
@@ -251,7 +254,7 @@ class World:
         body.scan = self._range_finder.scan(self._places[name], 0, body.pose)
 
     def _spend(self, body: _Body, spent: bytes) -> list[str]:
-        if not 0 < sum_pairs(spent, self._samples) <= self._units.point:
+        if not 0 < self._sum_pairs(spent, self._samples) <= self._units.point:
             return ["units"]
         if body.energy_spent >= self._budget:
             return ["energy"]
