@@ -1,7 +1,7 @@
 """Robot-steps that one CPU second buys when the whole fleet runs in one process.
 
 Five robots on section VI-A's world, all in contact through the supervisor, at once or in turn, or as
-they meet; and a hundred robots with about five in range each. Messages pass the codec as they do over the bus. `bare` is
+they meet; and a hundred robots with about five in range each. Messages between robots pass the codec. `bare` is
 world, radio and robots; `recorded` adds checker, metrics and digest, as in every real run.
 """
 
