@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -244,14 +245,14 @@ def test_an_envelope_is_received_once_at_the_first_step_after_it_is_due(
 # The exchange.
 
 
-def test_inputs_and_outputs_pass_the_codec() -> None:
-    """In process too, nothing is shared: a robot receives copies, equal to the values that were sent."""
+def test_outputs_pass_the_codec() -> None:
+    """In process too, world-sim receives a copy, of the types of the bus; inputs are frozen and passed as they are."""
     given, returned = [], []
 
     class Echo:
         def step(self, inputs: Inputs, /) -> Outputs:
             given.append(inputs)
-            returned.append(Outputs(1, Pose(1.0, 2.0), goal=(3.0, 4.0), spent=b"abc"))
+            returned.append(Outputs(1, Pose(1.0, 2.0), goal=(3, 4), spent=b"abc"))
             return returned[-1]
 
     inputs = Inputs(
@@ -260,9 +261,23 @@ def test_inputs_and_outputs_pass_the_codec() -> None:
     outputs = InProcessExchange({"r1": Echo()})({"r1": inputs})["r1"]
 
     assert given == [inputs]
-    assert given[0] is not inputs
+    assert_frozen(given[0])
     assert outputs == returned[0]
     assert outputs is not returned[0]
+    assert outputs.goal is not None
+    assert [type(metres) for metres in outputs.goal] == [float, float]
+
+
+def assert_frozen(value: object) -> None:
+    """Nobody can change a value, nor anything in it."""
+    if isinstance(value, msgspec.Struct):
+        assert value.__struct_config__.frozen
+        value = msgspec.structs.astuple(value)
+    if isinstance(value, tuple):
+        for each in value:
+            assert_frozen(each)
+    else:
+        assert isinstance(value, int | float | str | bytes)
 
 
 def without(name: ParticipantId, since_ns: int) -> Callable[[Exchange], Exchange]:

@@ -2,6 +2,8 @@
 
 from collections.abc import Mapping
 
+import msgspec
+
 from kantor_protocol.base.machine import (
     WORLD_SIM,
     Body,
@@ -12,7 +14,11 @@ from kantor_protocol.base.machine import (
 )
 from kantor_protocol.node.recovery import KillableNode
 from kantor_protocol.scenario.faults.processes import Disk
+from kantor_protocol.wire.messages import encode
 from kantor_worldsim.exchange.membership import JoinDecision, Membership
+
+_decode_outputs = msgspec.msgpack.Decoder(Outputs).decode
+"""Their numbers are checked by the simulation."""
 
 
 class _PermanentNode:
@@ -29,7 +35,8 @@ class _PermanentNode:
 class InProcessExchange:
     """Exchange and process control for participants in this process.
 
-    Inputs and outputs are values, which nobody can change: they are passed as they are. Messages are bytes in them.
+    Outputs pass through the codec, so that they are of the types that they have on the bus. Inputs are passed as they
+    are: frozen values of world-sim, with what participants say to one another as bytes.
     """
 
     def __init__(self, machines: Mapping[ParticipantId, StateMachine]) -> None:
@@ -49,7 +56,9 @@ class InProcessExchange:
     ) -> Mapping[ParticipantId, Outputs]:
         """Step all participants of a batch."""
         nodes = self._nodes
-        return {name: nodes[name].step(given) for name, given in inputs.items()}
+        return {
+            name: _decode_outputs(encode(nodes[name].step(given))) for name, given in inputs.items()
+        }
 
     def kill(self, name: ParticipantId) -> None:
         """Kill a participant. World-sim itself is rebuilt from its records by the event loop."""

@@ -193,7 +193,9 @@ class LinkFaults:
         if self._queued.shape[0] < len(sent):
             self._queued = np.zeros((2 * len(sent), len(self._queues)), dtype=np.int64)
         if self._queues:
-            self._queued[: len(sent)] = [[q.send(*each) for q in self._queues] for each in sent]
+            self._queued[: len(sent)] = [
+                [q.send(each.now_ns, each.envelope) for q in self._queues] for each in sent
+            ]
         for history in self._histories.values():
             for each in sent:
                 history.remember(each)
