@@ -182,9 +182,9 @@ def world_sim_forgets_what_was_under_way(patch: Patch) -> None:
 @mutant("a link fault ends a tenth of its window too early", _cutting)
 def link_fault_ends_early(patch: Patch) -> None:
     def changed(table: FaultTable) -> None:
-        window = table.rules[:, [rules._FROM_NS, rules._UNTIL_NS]]
-        lasting = window[:, 1] < rules.DUE_MAX_NS
-        table.rules[lasting, rules._UNTIL_NS] -= (window[lasting, 1] - window[lasting, 0]) // 10
+        from_ns, until_ns = table.rules["from_ns"], table.rules["until_ns"]
+        lasting = until_ns < rules.DUE_MAX_NS
+        until_ns[lasting] -= (until_ns[lasting] - from_ns[lasting]) // 10
 
     _with_table(patch, changed)
 
@@ -199,11 +199,11 @@ def robots_of_a_fault_are_off_by_one(patch: Patch) -> None:
 
 def _cut_backwards(table: FaultTable, rule: int, now_ns: int, source: int, target: int) -> bool:
     row = table.rules[rule]
-    if table.severed[row[rules._AT], target, source] == 0:
+    if table.severed[row.at, target, source] == 0:
         return False
-    if row[rules._SPAN_NS] == 0:
+    if row.span_ns == 0:
         return True
-    index, slot = row[rules.FAULT] << rules.FAULT_SHIFT, now_ns // row[rules._SPAN_NS]
+    index, slot = row.fault << rules.FAULT_SHIFT, now_ns // row.span_ns
     draw = uniform(table.seed, Purpose.FAULT_FLAP.value, 0, slot, index)
     return draw < table.numbers[rule, rules._SHARE]
 
@@ -215,11 +215,11 @@ def cut_backwards(patch: Patch) -> None:
 
 def _cut_late(table: FaultTable, rule: int, now_ns: int, source: int, target: int) -> bool:
     row = table.rules[rule]
-    if table.severed[row[rules._AT], source, target] == 0:
+    if table.severed[row.at, source, target] == 0:
         return False
-    if row[rules._SPAN_NS] == 0:
+    if row.span_ns == 0:
         return True
-    index, slot = row[rules.FAULT] << rules.FAULT_SHIFT, now_ns // row[rules._SPAN_NS]
+    index, slot = row.fault << rules.FAULT_SHIFT, now_ns // row.span_ns
     draw = uniform(table.seed, Purpose.FAULT_FLAP.value, 0, slot + 1, index)
     return draw < table.numbers[rule, rules._SHARE]
 

@@ -114,9 +114,10 @@ def _compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 kernel = _compiled()
-"""Compiles a function that allocates nothing. Numba then counts no references to its arrays, which
-would cost more than the work itself; at the border to Python an array costs 0.02 us. A NamedTuple of
-arrays costs a whole one there, so that a kernel that is called in every step takes the fields one by one."""
+"""Compiles a function that allocates nothing. Numba then counts no references to its arrays, which would cost more
+than the work itself. At the border to Python an array costs 0.02 us, also one within a plain tuple; a NamedTuple costs
+a whole one. A kernel that is called for each batch takes each NamedTuple as the plain tuple of its fields, and names
+them again: `state = State(*fields)`."""
 
 sum_kernel = _compiled(fastmath={"reassoc"})
 """For a long sum of which the last digits do not matter: its terms are added in the order in which the
@@ -131,3 +132,10 @@ def typed(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
     same layout is not looked at again.
     """
     return function.typed(*arguments) if isinstance(function, Kernel) else function
+Row = Any
+"""A row of a table in a kernel: its fields are its attributes."""
+
+
+def integers(*names: str) -> "np.dtype[np.void]":
+    """The type of a row of whole numbers, each with its name; in kernels a table is an array of rows."""
+    return np.dtype([(name, np.int64) for name in names])

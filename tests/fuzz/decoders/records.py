@@ -50,7 +50,7 @@ def batch_tables(_folder: Path) -> Decode:
     sizes = tables._tables[0]
 
     def read(content: bytes) -> bool:
-        at = columnar._read_batch(content, *tables._tables, tables._pose_bits, 3, 3, 12)
+        at = columnar._read_batch(content, tables._tables, tables._pose_bits, 3, 3, 12)
         assert at <= len(content), "read beyond the end"
         if at >= 0:
             counts = sizes[

@@ -94,44 +94,36 @@ def contents(columns: ColumnarBatch) -> list[Any]:
     """The same contents, taken from the columns."""
 
     def rows(table: np.ndarray, first: int, count: int) -> list[list[int]] | None:
-        return None if count == of.NOT_DECODED else table[first : first + count].tolist()
+        if count == of.NOT_DECODED:
+            return None
+        return [list(row) for row in table[first : first + count].tolist()]
 
     def bodies(sent: list[list[int]] | None) -> list[Any]:
         return [[*head, columns.payload[at:end]] for *head, at, end in sent or ()]
 
     step_records: list[Any] = []
     for row in range(int(columns.sizes[of.STEP_RECORDS])):
-        step_record = columns.step_records[row].tolist()
-        heard = rows(columns.heard, step_record[of.HEARD], step_record[of.HEARD_COUNT])
-        values: list[Any] = [step_record[of.PLACE], step_record[of.NOW_NS], heard]
-        values += [step_record[of.OBSERVED], step_record[of.SKEW_NS]]
-        if step_record[of.PRESENT]:
-            values += [
-                step_record[of.STEP],
-                step_record[of.ENERGY],
-                step_record[of.STATE],
-                step_record[of.REFUSED],
-                step_record[of.FINDS],
-            ]
-            values += [
-                step_record[of.VIOLATIONS],
-                bool(step_record[of.UNSHIPPED]),
-                step_record[of.TOO_FAST],
-            ]
-            values += [step_record[of.WEIGHTS_BYTES]]
+        numbers = columns.step_records[row].tolist()
+        step_record = dict(zip(of.STEP_RECORD.names or (), numbers, strict=True))
+        heard = rows(columns.heard, step_record["heard"], step_record["heard_count"])
+        values: list[Any] = [step_record["place"], step_record["now_ns"], heard]
+        values += [step_record["observed"], step_record["skew_ns"]]
+        if step_record["present"]:
+            names = ("step", "energy", "state", "refused", "finds", "violations")
+            values += [step_record[name] for name in names]
+            values += [bool(step_record["unshipped"]), step_record["too_fast"]]
+            values += [step_record["weights_bytes"]]
             *pose_m, goal_x_m, goal_y_m = columns.poses_m[row].tolist()
-            begin, end = (
-                step_record[of.WEIGHTS],
-                step_record[of.WEIGHTS] + step_record[of.WEIGHTS_BYTES],
-            )
-            values += [step_record[of.BODY_BYTES], pose_m]
+            begin = step_record["weights"]
+            end = begin + step_record["weights_bytes"]
+            values += [step_record["body_bytes"], pose_m]
             values += [
-                [goal_x_m, goal_y_m] if step_record[of.HEADS] else None,
+                [goal_x_m, goal_y_m] if step_record["heads"] else None,
                 columns.payload[begin:end],
             ]
-            values += [rows(columns.pairs, step_record[of.SPENT], step_record[of.SPENT_COUNT])]
-            values += [rows(columns.pairs, step_record[of.LOWERED], step_record[of.LOWERED_COUNT])]
-            values += [bodies(rows(columns.sent, step_record[of.SENT], step_record[of.SENT_COUNT]))]
+            for name in ("spent", "lowered"):
+                values += [rows(columns.pairs, step_record[name], step_record[f"{name}_count"])]
+            values += [bodies(rows(columns.sent, step_record["sent"], step_record["sent_count"]))]
         step_records.append(values)
     decisions = rows(columns.decisions, 0, int(columns.sizes[of.DECISIONS]))
     injected = rows(columns.injected, 0, int(columns.sizes[of.INJECTED]))
@@ -391,7 +383,7 @@ def test_fields_added_to_a_record_are_skipped(played: Play) -> None:
     payload = msgspec.msgpack.encode(tree)
     bits = tables[1].view(np.int64)
 
-    assert of._read_batch(payload, sizes, *tables, bits, 3, of.UNKNOWN_PLACE, 60) > 0
+    assert of._read_batch(payload, (sizes, *tables), bits, 3, of.UNKNOWN_PLACE, 60) > 0
     assert contents(ColumnarBatch(payload, sizes, *tables)) == values
 
 
@@ -404,11 +396,12 @@ def test_a_garbled_batch_stays_within_its_arrays(changes: list[tuple[int, int]])
     for at, byte in changes:
         payload[at % len(payload)] = byte
     rows = len(payload) // 2 + 1
-    around = [np.full((rows + 8, columns), 77, dtype=np.int64) for columns in (25, 2, 5, 4, 2, 5)]
+    kinds = (of.STEP_RECORD, of.REFERENCE, of.ENVELOPE, of.DECISION, of.PAIR, of.ENVELOPE)
+    around = [np.full(rows + 8, 77, dtype=np.int64).astype(kind) for kind in kinds]
     step_records, heard, sent, decisions, pairs, injected = (table[:rows] for table in around)
     poses_m = np.zeros((rows, 4))
     sizes, bits = np.zeros(6, dtype=np.int64), poses_m.view(np.int64)
-    tables = (sizes, step_records, poses_m, heard, sent, decisions, pairs, injected, bits)
-    of._read_batch(bytes(payload), *tables, 3, of.UNKNOWN_PLACE, 60)
+    tables = (sizes, step_records, poses_m, heard, sent, decisions, pairs, injected)
+    of._read_batch(bytes(payload), tables, bits, 3, of.UNKNOWN_PLACE, 60)
 
-    assert all(bool((table[rows:] == 77).all()) for table in around)
+    assert all(set(row.tolist()) == {77} for table in around for row in table[rows:])

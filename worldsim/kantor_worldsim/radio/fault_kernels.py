@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.counter_rng import Purpose, uniform
-from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.kernels import integers, kernel
 from kantor_protocol.scenario.faults.base import Fault
 from kantor_protocol.scenario.faults.links import (
     COPIES_MAX,
@@ -53,11 +53,13 @@ _REPLAYED = 1 << 15
 _DROP, _BURST, _ONE_WAY, _PARTITION, _DELAY, _REORDER = 0, 1, 2, 3, 4, 5
 _CLOG, _BANDWIDTH, _RANGE, _DUPLICATE, _REPLAY, _HOSTILE = 6, 7, 8, 9, 10, 11
 
-# Columns of FaultTable.rules.
-_KIND, FAULT, _FROM_NS, _UNTIL_NS, _AT, _SPAN_NS, _COPIES = 0, 1, 2, 3, 4, 5, 6
-_RULE_COLUMNS = 7
-"""AT: row of a cut in `severed`, column of a queue in `queued`. SPAN_NS: slot of a burst or of a cut that flaps,
-greatest age of a replayed message."""
+RULE = integers("kind", "fault", "from_ns", "until_ns", "at", "span_ns", "copies")
+"""A row of FaultTable.rules: kind, index in the scenario's list, window. at: row of a cut in `severed`, column of a queue
+in `queued`. span_ns: slot of a burst or of a cut that flaps, greatest age of a replayed message."""
+
+EXTRA = integers("first", "rule", "latest_ns", "on_air")
+"""An extra envelope: row of the first decision on the delivered envelope with which it comes, rule, the latest time of
+sending of an older message, and its index on the air, or less than 0 where there is none."""
 
 # Columns of FaultTable.numbers, by kind.
 _PROBABILITY = 0  # drop, duplicate, reorder, replay, hostile
@@ -71,22 +73,32 @@ _NUMBER_COLUMNS = 4
 # Columns of the counters, in the order of `FaultStats`.
 _DROPPED, _DELAYED, _DOUBLED, _REPLAYS, _FORGERIES = 0, 1, 2, 3, 4
 
-# Columns of extra envelopes, see `find_extra`.
-_FIRST, _RULE, _LATEST_NS, ON_AIR = 0, 1, 2, 3
-
 
 class FaultTable(NamedTuple):
     """The link faults of a scenario for kernels. n faults, p participants."""
 
     seed: int
-    rules: npt.NDArray[np.int64]
-    """(n, 7): kind, index in the scenario's list, window, AT, SPAN_NS, copies."""
+    robots_m: float
+    """How far links reach without faults."""
+    supervisors_m: float
+    """The same of links of the supervisor."""
+    rules: npt.NDArray[Any]
+    """(n,) of RULE."""
     numbers: npt.NDArray[np.float64]
     """(n, 4), by kind."""
     named: npt.NDArray[np.uint8]
     """(n, p): whether a fault applies to the links of a participant."""
     severed: npt.NDArray[np.uint8]
     """(cuts, p, p): whether a cut, while it holds, severs the link from source to target."""
+
+
+class Radioed(NamedTuple):
+    """The radio's decisions; see `Interference`."""
+
+    sent: npt.NDArray[np.int64]
+    decided: npt.NDArray[np.int64]
+    size: int
+    """Number of valid rows of decided."""
 
 
 class _Hop(NamedTuple):
@@ -121,14 +133,14 @@ def in_burst(seed: int, link: int, index: int, slot: int, to_bad: float, to_good
 def _applies(table: FaultTable, rule: int, now_ns: int, source: int, target: int) -> bool:
     """Whether a fault's window holds and the fault applies to the link."""
     row = table.rules[rule]
-    if not row[_FROM_NS] <= now_ns < row[_UNTIL_NS]:
+    if not row.from_ns <= now_ns < row.until_ns:
         return False
     return table.named[rule, source] != 0 or table.named[rule, target] != 0
 
 
 @kernel
 def _draw(table: FaultTable, rule: int, purpose: int, hop: _Hop, copy: int) -> float:
-    index = table.rules[rule, FAULT] << FAULT_SHIFT | copy
+    index = table.rules[rule].fault << FAULT_SHIFT | copy
     return uniform(table.seed, purpose, hop.link, hop.sequence, index)
 
 
@@ -136,11 +148,11 @@ def _draw(table: FaultTable, rule: int, purpose: int, hop: _Hop, copy: int) -> f
 def _cuts(table: FaultTable, rule: int, now_ns: int, source: int, target: int) -> bool:
     """Whether a cut whose window is open severs a link."""
     row = table.rules[rule]
-    if table.severed[row[_AT], source, target] == 0:
+    if table.severed[row.at, source, target] == 0:
         return False
-    if row[_SPAN_NS] == 0:
+    if row.span_ns == 0:
         return True
-    index, slot = row[FAULT] << FAULT_SHIFT, now_ns // row[_SPAN_NS]
+    index, slot = row.fault << FAULT_SHIFT, now_ns // row.span_ns
     draw = uniform(table.seed, Purpose.FAULT_FLAP.value, 0, slot, index)
     return draw < table.numbers[rule, _SHARE]
 
@@ -156,7 +168,7 @@ def severs(table: FaultTable, now_ns: int, source: int, target: int) -> bool:
     """Whether a cut severs the link between two indices in the roster now, whatever their distance."""
     if _is_in(table, source, target):
         for rule in range(table.rules.shape[0]):
-            kind = table.rules[rule, _KIND]
+            kind = table.rules[rule].kind
             if (
                 kind in (_ONE_WAY, _PARTITION)
                 and _applies(table, rule, now_ns, source, target)
@@ -179,7 +191,7 @@ def reach_m(table: FaultTable, now_ns: int, source: int, target: int, whole_m: f
     least_m = whole_m
     if _is_in(table, source, target):
         for rule in range(table.rules.shape[0]):
-            if table.rules[rule, _KIND] == _RANGE and _applies(table, rule, now_ns, source, target):
+            if table.rules[rule].kind == _RANGE and _applies(table, rule, now_ns, source, target):
                 least_m = min(least_m, _reach_m(table, rule, whole_m))
     return least_m
 
@@ -189,16 +201,14 @@ def _is_lost(
     table: FaultTable,
     geometry: LinkGeometry,
     hop: _Hop,
-    robots_m: float,
-    supervisors_m: float,
     effects: np.ndarray,
 ) -> bool:
     """Whether a receiver is beyond the range that faults leave; each fault that excludes it is counted."""
     lost = False
     by_supervisor = geometry.supervisor in (hop.source, hop.target)
-    whole_m = supervisors_m if by_supervisor else robots_m
+    whole_m = table.supervisors_m if by_supervisor else table.robots_m
     for rule in range(table.rules.shape[0]):
-        if table.rules[rule, _KIND] != _RANGE:
+        if table.rules[rule].kind != _RANGE:
             continue
         if not _applies(table, rule, hop.now_ns, hop.source, hop.target):
             continue
@@ -212,16 +222,16 @@ def _is_lost(
 def _drops(table: FaultTable, rule: int, hop: _Hop, queued: np.ndarray) -> bool:
     """Whether a fault drops a copy. queued: waiting times of its envelope, see `apply_rules`."""
     row, numbers = table.rules[rule], table.numbers[rule]
-    kind = row[_KIND]
+    kind = row.kind
     if kind == _BANDWIDTH:
-        return queued[row[_AT]] < 0
+        return queued[row.at] < 0
     if kind > _PARTITION or not _applies(table, rule, hop.now_ns, hop.source, hop.target):
         return False
     if kind in (_ONE_WAY, _PARTITION):
         return _cuts(table, rule, hop.now_ns, hop.source, hop.target)
     probability = numbers[_PROBABILITY]
     if kind == _BURST:
-        index, slot = row[FAULT] << FAULT_SHIFT, hop.now_ns // row[_SPAN_NS]
+        index, slot = row.fault << FAULT_SHIFT, hop.now_ns // row.span_ns
         bad = in_burst(table.seed, hop.link, index, slot, numbers[_TO_BAD], numbers[_TO_GOOD])
         probability = numbers[_DROP_BAD] if bad else numbers[_DROP_GOOD]
     return _draw(table, rule, Purpose.FAULT_DROP.value, hop, hop.copy) < probability
@@ -231,13 +241,13 @@ def _drops(table: FaultTable, rule: int, hop: _Hop, queued: np.ndarray) -> bool:
 def _delays(table: FaultTable, rule: int, hop: _Hop, queued: np.ndarray) -> tuple[int, int]:
     """Delay of a copy by a fault, and the earliest time at which the fault lets it arrive, in ns."""
     row, numbers = table.rules[rule], table.numbers[rule]
-    kind = row[_KIND]
+    kind = row.kind
     if kind == _BANDWIDTH:
-        return queued[row[_AT]], 0
+        return queued[row.at], 0
     if not _DELAY <= kind <= _CLOG or not _applies(table, rule, hop.now_ns, hop.source, hop.target):
         return 0, 0
     if kind == _CLOG:
-        return 0, row[_UNTIL_NS]
+        return 0, row.until_ns
     if kind == _DELAY:
         delay_s = numbers[_DELAY_S]
         if numbers[_JITTER_S] > 0.0:
@@ -327,15 +337,15 @@ def _double(
 ) -> int:
     """Decide on duplicates of an envelope that arrives; returns the number of decisions so far."""
     for rule in range(table.rules.shape[0]):
-        if table.rules[rule, _KIND] != _DUPLICATE:
+        if table.rules[rule].kind != _DUPLICATE:
             continue
         if not _applies(table, rule, hop.now_ns, hop.source, hop.target):
             continue
         draw = _draw(table, rule, Purpose.FAULT_DUPLICATE.value, hop, 0)
         if draw >= table.numbers[rule, _PROBABILITY]:
             continue
-        copy = _FIRST_EXTRA + COPIES_MAX * table.rules[rule, FAULT]
-        for _ in range(table.rules[rule, _COPIES]):
+        copy = _FIRST_EXTRA + COPIES_MAX * table.rules[rule].fault
+        for _ in range(table.rules[rule].copies):
             effects[rule, _DOUBLED] += 1
             share = _draw(table, rule, Purpose.FAULT_DELAY.value, hop, copy)
             due_ns = arrival_ns + round(share * table.numbers[rule, _LATER_S] * 1e9)
@@ -347,122 +357,69 @@ def _double(
 
 @kernel
 def find_extra(
-    seed: int,
-    rules: np.ndarray,
-    numbers: np.ndarray,
-    named: np.ndarray,
-    severed: np.ndarray,
-    left_m: float,
-    bottom_m: float,
-    resolution_m: float,
-    line_of_sight: bool,
-    loss_m: float,
-    cells: np.ndarray,
-    xy_m: np.ndarray,
-    supervisor: int,
-    supervisor_placed: bool,
-    robots_m: float,
-    supervisors_m: float,
-    sent: np.ndarray,
-    decided: np.ndarray,
-    count: int,
+    faults: tuple[Any, ...],
+    links: tuple[Any, ...],
+    radioed: tuple[Any, ...],
     effects: np.ndarray,
     extra: np.ndarray,
 ) -> int:
     """Find the extra envelopes that come with delivered ones: older messages and forgeries. Returns their number.
 
-    extra (rows, 4): row of the first decision on the delivered envelope, rule, the latest time of sending of an
-    older message, and a column that `LinkFaults` fills. Extra envelopes beyond its rows are only counted.
-    effects: scratch, see `apply_rules`.
+    faults, links, radioed: the fields of a FaultTable, a LinkGeometry and a Radioed. extra (rows,) of EXTRA, but for
+    what is on the air, which `LinkFaults` fills. Extra envelopes beyond its rows are only counted. effects: scratch, see
+    `apply_rules`.
     """
-    table = FaultTable(seed, rules, numbers, named, severed)
-    geometry = LinkGeometry(
-        left_m,
-        bottom_m,
-        resolution_m,
-        line_of_sight,
-        loss_m,
-        cells,
-        xy_m,
-        supervisor,
-        supervisor_placed,
-    )
+    table, geometry = FaultTable(*faults), LinkGeometry(*links)
+    sent, decided, count = radioed
     found = 0
     end = 0
     while end < count:
         first = end
         end = _end_of(decided, count, first)
-        hop = _hop_of(sent, decided, first, supervisor)
+        hop = _hop_of(sent, decided, first, geometry.supervisor)
         if _arrival(decided, first, end) == DROPPED:
             continue
-        if _is_lost(table, geometry, hop, robots_m, supervisors_m, effects):
+        if _is_lost(table, geometry, hop, effects):
             continue
-        for rule in range(rules.shape[0]):
-            kind = rules[rule, _KIND]
+        for rule in range(table.rules.shape[0]):
+            kind = table.rules[rule].kind
             if kind < _REPLAY or not _applies(table, rule, hop.now_ns, hop.source, hop.target):
                 continue
             replays = kind == _REPLAY
             purpose = Purpose.FAULT_REPLAY.value if replays else Purpose.FAULT_HOSTILE.value
-            if _draw(table, rule, purpose, hop, 0) >= numbers[rule, _PROBABILITY]:
+            if _draw(table, rule, purpose, hop, 0) >= table.numbers[rule, _PROBABILITY]:
                 continue
             latest_ns = hop.now_ns
             if replays:
                 share = 1.0 - _draw(table, rule, Purpose.FAULT_DELAY.value, hop, 0)
-                latest_ns -= max(1, round(share * rules[rule, _SPAN_NS]))
+                latest_ns -= max(1, round(share * table.rules[rule].span_ns))
             if found < extra.shape[0]:
                 row = extra[found]
-                row[_FIRST], row[_RULE], row[_LATEST_NS] = first, rule, latest_ns
+                row.first, row.rule, row.latest_ns = first, rule, latest_ns
             found += 1
     return found
 
 
 @kernel
 def apply_rules(
-    seed: int,
-    rules: np.ndarray,
-    numbers: np.ndarray,
-    named: np.ndarray,
-    severed: np.ndarray,
-    left_m: float,
-    bottom_m: float,
-    resolution_m: float,
-    line_of_sight: bool,
-    loss_m: float,
-    cells: np.ndarray,
-    xy_m: np.ndarray,
-    supervisor: int,
-    supervisor_placed: bool,
-    robots_m: float,
-    supervisors_m: float,
-    sent: np.ndarray,
-    decided: np.ndarray,
-    count: int,
+    faults: tuple[Any, ...],
+    links: tuple[Any, ...],
+    radioed: tuple[Any, ...],
     queued: np.ndarray,
     extra: np.ndarray,
-    extras: int,
     effects: np.ndarray,
     fault_stats: np.ndarray,
     out: np.ndarray,
 ) -> tuple[int, int]:
     """Apply the rules to the radio's decisions. Returns the number of decisions and of receivers out of range.
 
-    sent, decided, count: see `Interference`. queued (envelopes, queues): waiting time of each envelope in ns, or
-    DROPPED. extra (the first `extras` rows are valid): see `find_extra`; with the index on the air of each, or
-    less than 0 where there is none. effects (n, 5): scratch. fault_stats (n, 5): the effects of each fault are
-    added. out (rows, 3): the decisions; if they do not fit, nothing else has changed.
+    faults, links, radioed: the fields of a FaultTable, a LinkGeometry and a Radioed. queued (envelopes, queues): waiting
+    time of each envelope in ns, or DROPPED. extra (rows,) of EXTRA: see `find_extra`; after the last one comes a row whose
+    `first` is less than 0, or none. effects (n, 5): scratch. fault_stats (n, 5): the effects of each fault are added.
+    out (rows, 3): the decisions; if they do not fit, nothing else has changed.
     """
-    table = FaultTable(seed, rules, numbers, named, severed)
-    geometry = LinkGeometry(
-        left_m,
-        bottom_m,
-        resolution_m,
-        line_of_sight,
-        loss_m,
-        cells,
-        xy_m,
-        supervisor,
-        supervisor_placed,
-    )
+    table, geometry = FaultTable(*faults), LinkGeometry(*links)
+    sent, decided, count = radioed
     effects[:] = 0
     made = 0
     lost = 0
@@ -471,9 +428,9 @@ def apply_rules(
     while end < count:
         first = end
         end = _end_of(decided, count, first)
-        hop = _hop_of(sent, decided, first, supervisor)
+        hop = _hop_of(sent, decided, first, geometry.supervisor)
         to, row = decided[first, 0], decided[first, 1]
-        if _is_lost(table, geometry, hop, robots_m, supervisors_m, effects):
+        if _is_lost(table, geometry, hop, effects):
             lost += 1
             continue
         for i in range(first, end):
@@ -483,23 +440,23 @@ def apply_rules(
         if arrival_ns == DROPPED:
             continue
         made = _double(table, hop, row, arrival_ns, queued[row], effects, made, out)
-        while passed < extras and extra[passed, _FIRST] == first:
-            rule, on_air = extra[passed, _RULE], extra[passed, ON_AIR]
+        while passed < extra.shape[0] and extra[passed].first == first:
+            rule, on_air = extra[passed].rule, extra[passed].on_air
             passed += 1
             if on_air >= 0:
-                replays = rules[rule, _KIND] == _REPLAY
+                replays = table.rules[rule].kind == _REPLAY
                 effects[rule, _REPLAYS if replays else _FORGERIES] += 1
-                copy = (_REPLAYED if replays else _FORGED) + rules[rule, FAULT]
+                copy = (_REPLAYED if replays else _FORGED) + table.rules[rule].fault
                 due_ns = _decide(table, _with(hop, copy), arrival_ns, queued[row], effects)
                 made = _put(out, made, to, on_air, due_ns)
     if made <= out.shape[0]:
-        for rule in range(rules.shape[0]):
+        for rule in range(table.rules.shape[0]):
             for counter in range(effects.shape[1]):
                 fault_stats[rule, counter] += effects[rule, counter]
     return made, lost
 
 
-def until_ns(fault: Fault) -> int:
+def end_ns(fault: Fault) -> int:
     """End of a fault's window; DUE_MAX_NS if it has none."""
     return DUE_MAX_NS if fault.until_ns is None else fault.until_ns
 
@@ -550,7 +507,7 @@ def table_of(scenario: Scenario, seed: int) -> FaultTable:
     """The link faults of a scenario, in the order of its list."""
     roster = scenario.roster
     faults = [(i, fault) for i, fault in enumerate(scenario.faults) if type(fault) in KINDS]
-    rules = np.zeros((len(faults), _RULE_COLUMNS), dtype=np.int64)
+    rules = np.zeros(len(faults), dtype=RULE)
     numbers = np.zeros((len(faults), _NUMBER_COLUMNS))
     named = np.ones((len(faults), len(roster)), dtype=np.uint8)
     severed: list[list[list[bool]]] = []
@@ -564,8 +521,11 @@ def table_of(scenario: Scenario, seed: int) -> FaultTable:
             at, queues = queues, queues + 1
         elif isinstance(fault, OnLinks) and fault.robots:
             named[rule] = [name in fault.robots for name in roster]
-        window_ns = fault.from_ns, until_ns(fault)
+        window_ns = fault.from_ns, end_ns(fault)
         rules[rule] = row.kind, place, *window_ns, at, row.span_ns, row.copies
         numbers[rule, : len(row.numbers)] = row.numbers
     shape = len(severed), len(roster), len(roster)
-    return FaultTable(seed, rules, numbers, named, np.array(severed, dtype=np.uint8).reshape(shape))
+    ranges_m = scenario.radio.range_m, scenario.supervisor.range_m
+    return FaultTable(
+        seed, *ranges_m, rules, numbers, named, np.array(severed, dtype=np.uint8).reshape(shape)
+    )

@@ -24,13 +24,14 @@ from kantor_worldsim.radio import fault_kernels as of
 from kantor_worldsim.radio.channel import DROPPED, Decisions, LinkGeometry, Sent, link_of
 from kantor_worldsim.radio.fault_kernels import (
     DUE_MAX_NS,
+    EXTRA,
     KINDS,
     apply_rules,
+    end_ns,
     find_extra,
     reach_m,
     severs,
     table_of,
-    until_ns,
 )
 from kantor_worldsim.radio.forgeries import ForgeryDraws, forge, strangers
 
@@ -57,7 +58,7 @@ class _History:
 
     def __init__(self, fault: Replay) -> None:
         self._age_ns = round(fault.age_s * 1e9)
-        self._until_ns = until_ns(fault)
+        self._until_ns = end_ns(fault)
         self._sent: dict[tuple[ParticipantId, ParticipantId], deque[Sent]] = {}
 
     def remember(self, sent: Sent) -> None:
@@ -80,7 +81,7 @@ class _Queue:
 
     def __init__(self, fault: Bandwidth) -> None:
         self._fault = fault
-        self._until_ns = until_ns(fault)
+        self._until_ns = end_ns(fault)
         self._names = frozenset(fault.robots)
         self._free_ns: dict[ParticipantId, int] = {}
 
@@ -107,24 +108,24 @@ class LinkFaults:
         """Use `of`, which is None for a scenario without link faults."""
         self.table = table_of(scenario, seed)
         """The rules, for kernels."""
-        self._order: list[int] = self.table.rules[:, of.FAULT].tolist()
+        self._order: list[int] = self.table.rules["fault"].tolist()
         faults = {fault: scenario.faults[fault] for fault in self._order}
         self._histories = {i: _History(f) for i, f in faults.items() if isinstance(f, Replay)}
         self._queues = [_Queue(fault) for fault in faults.values() if isinstance(fault, Bandwidth)]
-        self._over_ns = max(map(until_ns, faults.values()), default=0)
+        self._over_ns = max(map(end_ns, faults.values()), default=0)
         """Messages that are sent from this time on are not affected."""
         self._has_extra = any(isinstance(f, Replay | Hostile) for f in faults.values())
         self._roster = scenario.roster
         self._strangers = strangers(scenario.roster)
         self._places = {name: i for i, name in enumerate(scenario.roster)}
-        self._ranges_m = scenario.radio.range_m, scenario.supervisor.range_m
         self._seed = seed
         self._forged: list[Envelope] = []
         self._next_forged = FORGED_SEQUENCE_MIN
         self._effects = np.zeros((len(faults), _COUNTERS), dtype=np.int64)
         self._totals = np.zeros((len(faults), _COUNTERS), dtype=np.int64)
         self._queued = np.zeros((1, len(self._queues)), dtype=np.int64)
-        self._extra = np.zeros((1, 4), dtype=np.int64)
+        self._extra = np.zeros(1, dtype=EXTRA)
+        self._extra["first"] = -1
         self._out = np.zeros((1, 3), dtype=np.int64)
         self._geometry: LinkGeometry | None = None
         self._constant: tuple[Any, ...] = ()
@@ -142,7 +143,8 @@ class LinkFaults:
 
     def reach_m(self, now_ns: int, source: ParticipantId, target: ParticipantId) -> float:
         """The range of a link now, before walls."""
-        whole_m = self._ranges_m[SUPERVISOR in {source, target}]
+        by_supervisor = SUPERVISOR in {source, target}
+        whole_m = self.table.supervisors_m if by_supervisor else self.table.robots_m
         left_m: float = reach_m(
             self.table, now_ns, self._place(source), self._place(target), whole_m
         )
@@ -156,13 +158,13 @@ class LinkFaults:
             return sent, decided, 0
         self._enqueue(sent)
         if geometry is not self._geometry:
-            self._geometry, self._constant = geometry, (*self.table, *geometry, *self._ranges_m)
-        arguments = (*self._constant, rows, *decided)
-        on_air, extras = self._add_extra(sent, arguments) if self._has_extra else (sent, 0)
-        made, lost = self._apply_rules(arguments, extras)
+            self._geometry, self._constant = geometry, (tuple(self.table), tuple(geometry))
+        arguments = (*self._constant, (rows, *decided))
+        on_air = self._add_extra(sent, decided, arguments) if self._has_extra else sent
+        made, lost = self._apply_rules(arguments)
         if made > self._out.shape[0]:
             self._out = np.zeros((2 * made, 3), dtype=np.int64)
-            made, lost = self._apply_rules(arguments, extras)
+            made, lost = self._apply_rules(arguments)
         return on_air, Decisions(self._out, made), lost
 
     def pop_stats(self) -> tuple[FaultStats, ...]:
@@ -182,9 +184,9 @@ class LinkFaults:
     def _place(self, name: ParticipantId) -> int:
         return self._places.get(name, -1)
 
-    def _apply_rules(self, arguments: tuple[Any, ...], extras: int) -> tuple[int, int]:
+    def _apply_rules(self, arguments: tuple[Any, ...]) -> tuple[int, int]:
         made, lost = apply_rules(
-            *arguments, self._queued, self._extra, extras, self._effects, self._totals, self._out
+            *arguments, self._queued, self._extra, self._effects, self._totals, self._out
         )
         return made, lost
 
@@ -201,21 +203,22 @@ class LinkFaults:
                 history.remember(each)
 
     def _add_extra(
-        self, sent: Sequence[Sent], arguments: tuple[Any, ...]
-    ) -> tuple[list[Sent], int]:
-        """Put extra envelopes on the air; returns all envelopes on the air and the number of rows of `_extra`."""
+        self, sent: Sequence[Sent], decided: Decisions, arguments: tuple[Any, ...]
+    ) -> list[Sent]:
+        """Put extra envelopes on the air; returns all envelopes on the air."""
         found = find_extra(*arguments, self._effects, self._extra)
-        if found > self._extra.shape[0]:
-            self._extra = np.zeros((2 * found, 4), dtype=np.int64)
+        if found >= self._extra.shape[0]:
+            self._extra = np.zeros(2 * found, dtype=EXTRA)
             find_extra(*arguments, self._effects, self._extra)
-        on_air, decided = list(sent), arguments[-2]
+        self._extra["first"][found:] = -1
+        on_air = list(sent)
         for row, (first, rule, latest_ns, _) in enumerate(self._extra[:found].tolist()):
-            to, which, _ = decided[first].tolist()
+            to, which, _ = decided.rows[first].tolist()
             more = self._extra_envelope(on_air[which], to, rule, latest_ns)
-            self._extra[row, of.ON_AIR] = -1 if more is None else len(on_air)
+            self._extra["on_air"][row] = -1 if more is None else len(on_air)
             if more is not None:
                 on_air.append(Sent(sent[which].now_ns, more))
-        return on_air, found
+        return on_air
 
     def _extra_envelope(self, sent: Sent, to: int, rule: int, latest_ns: int) -> Envelope | None:
         """The envelope that a rule sends with another one, or None."""

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.incarnations import INCARNATIONS_MAX
-from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.kernels import Row, integers, kernel
 from kantor_protocol.base.machine import SUPERVISOR
 from kantor_protocol.base.varint import read_int, read_uint
 from kantor_protocol.wire.messages import BODY_BYTES_MAX, VERSION, GossipMessage
@@ -27,26 +27,24 @@ ALL_PLACES = -1
 UNKNOWN_PLACE = -2
 """The index of a name that is not in the roster."""
 
-# Columns of ColumnarBatch.step_records. Ranges of other arrays are a first row and a count.
-PLACE, NOW_NS, PRESENT, STEP, ENERGY, STATE, REFUSED = 0, 1, 2, 3, 4, 5, 6
-FINDS, VIOLATIONS, UNSHIPPED, WEIGHTS_BYTES, BODY_BYTES = 7, 8, 9, 10, 11
-HEARD, HEARD_COUNT, SENT, SENT_COUNT = 12, 13, 14, 15
-SPENT, SPENT_COUNT, LOWERED, LOWERED_COUNT = 16, 17, 18, 19
-HEADS, WEIGHTS = 20, 21
-OBSERVED, SKEW_NS, TOO_FAST = 22, 23, 24
-_STEP_RECORD_COLUMNS = 25
-"""PRESENT: the step record has outputs and a verdict; all columns from STEP on are valid only then, but for HEARD,
-OBSERVED and SKEW_NS. OBSERVED: the step in the observation that the participant received. TOO_FAST: 1 + index of the
-violation that is of speed, or 0.
-UNSHIPPED: the world refused the step, its energy or its units, so that nothing was shipped. HEADS: the outputs have a
-goal. WEIGHTS: position in the payload at which the published weights begin."""
+STEP_RECORD = integers(
+    "place", "now_ns", "present", "step", "energy", "state", "refused", "finds", "violations",
+    "unshipped", "weights_bytes", "body_bytes", "heard", "heard_count", "sent", "sent_count",
+    "spent", "spent_count", "lowered", "lowered_count", "heads", "weights", "observed", "skew_ns",
+    "too_fast",
+)  # fmt: skip
+"""A row of ColumnarBatch.step_records. Ranges of other tables are a first row and a count.
 
-# Columns of ColumnarBatch.heard, .sent, .injected and .decisions.
-SOURCE, SEQUENCE, TARGET, DUE_NS = 0, 1, 2, 3
-BODY, BODY_END = 3, 4
+present: the step record has outputs and a verdict; all fields from `step` on are valid only then, but for heard,
+observed and skew_ns. observed: the step in the observation that the participant received. too_fast: 1 + index of the
+violation that is of speed, or 0. unshipped: the world refused the step, its energy or its units, so that nothing was
+shipped. heads: the outputs have a goal. weights: position in the payload at which the published weights begin."""
 
-# Columns of ColumnarBatch.pairs.
-SAMPLE, UNITS = 0, 1
+REFERENCE = integers("source", "sequence")
+ENVELOPE = integers("source", "sequence", "target", "body", "body_end")
+"""An envelope; its body lies between two positions in the payload."""
+DECISION = integers("source", "sequence", "target", "due_ns")
+PAIR = integers("sample", "units")
 
 # Indices of ColumnarBatch.sizes: rows of step_records, decisions, heard, sent, pairs and injected.
 STEP_RECORDS, DECISIONS, ALL_HEARD, ALL_SENT, PAIRS, INJECTED = 0, 1, 2, 3, 4, 5
@@ -59,20 +57,20 @@ class ColumnarBatch(NamedTuple):
     """The encoded record."""
     sizes: npt.NDArray[np.int64]
     """(6,): number of valid rows of each array."""
-    step_records: npt.NDArray[np.int64]
-    """(rows, 25)"""
+    step_records: npt.NDArray[Any]
+    """(rows,) of STEP_RECORD."""
     poses_m: npt.NDArray[np.float64]
     """(rows, 4): x and y of the pose in each verdict and of each goal, world frame."""
-    heard: npt.NDArray[np.int64]
-    """(rows, 2): source, sequence."""
-    sent: npt.NDArray[np.int64]
-    """(rows, 5): source, sequence, target, positions in the payload at which the body begins and ends."""
-    decisions: npt.NDArray[np.int64]
-    """(rows, 4): source, sequence, target, due_ns."""
-    pairs: npt.NDArray[np.int64]
-    """(rows, 2): sample, units."""
-    injected: npt.NDArray[np.int64]
-    """(rows, 5): like sent; envelopes that a fault injected."""
+    heard: npt.NDArray[Any]
+    """(rows,) of REFERENCE."""
+    sent: npt.NDArray[Any]
+    """(rows,) of ENVELOPE."""
+    decisions: npt.NDArray[Any]
+    """(rows,) of DECISION."""
+    pairs: npt.NDArray[Any]
+    """(rows,) of PAIR."""
+    injected: npt.NDArray[Any]
+    """(rows,) of ENVELOPE: those that a fault injected."""
 
 
 # Msgpack. Kinds of a value by its head; SIMPLE: nil and truth values.
@@ -186,17 +184,9 @@ _ATTESTED_MIN, _CLAIMED = 4, 3
 
 
 class BatchColumns(NamedTuple):
-    """The arrays into which a batch is decoded, for the kernels; see `ColumnarBatch`."""
+    """The tables into which a batch is decoded, for the kernels."""
 
-    payload: bytes
-    sizes: npt.NDArray[np.int64]
-    step_records: npt.NDArray[np.int64]
-    poses_m: npt.NDArray[np.float64]
-    heard: npt.NDArray[np.int64]
-    sent: npt.NDArray[np.int64]
-    decisions: npt.NDArray[np.int64]
-    pairs: npt.NDArray[np.int64]
-    injected: npt.NDArray[np.int64]
+    batch: ColumnarBatch
     pose_bits: npt.NDArray[np.int64]
     """The memory of poses_m as integers."""
     robots: int
@@ -206,9 +196,9 @@ class BatchColumns(NamedTuple):
 
 @kernel
 def _read_metres(columns: BatchColumns, row: int, axis: int, at: int) -> int:
-    kind, value, at = head_of(columns.payload, at)
+    kind, value, at = head_of(columns.batch.payload, at)
     if kind == NUMBER:
-        columns.poses_m[row, axis] = float(value)
+        columns.batch.poses_m[row, axis] = float(value)
     else:
         columns.pose_bits[row, axis] = value
     return at if kind in (NUMBER, FLOAT) else _MALFORMED
@@ -232,7 +222,7 @@ def _equals(payload: bytes, at: int, size: int, text: np.ndarray) -> bool:
 @kernel
 def _place(columns: BatchColumns, at: int) -> tuple[int, int]:
     """Index in the roster of the name at `at`, see `Scenario.roster`, and the position after it."""
-    payload = columns.payload
+    payload = columns.batch.payload
     kind, size, at = head_of(payload, at)
     if kind != TEXT or at < 0:
         return UNKNOWN_PLACE, _MALFORMED
@@ -255,71 +245,71 @@ def _place(columns: BatchColumns, at: int) -> tuple[int, int]:
 @kernel
 def _read_pairs(columns: BatchColumns, at: int, bound: int) -> tuple[int, int]:
     """Read a field of packed pairs: (count or NOT_DECODED, position after it)."""
-    kind, size, at = head_of(columns.payload, at)
+    kind, size, at = head_of(columns.batch.payload, at)
     if kind != BYTES:
         return NOT_DECODED, _MALFORMED
     end = at + size
-    row, sample = columns.sizes[PAIRS], 0
+    row, sample = columns.batch.sizes[PAIRS], 0
     while at < end:
-        step, at = read_int(columns.payload, at)
-        units, at = read_uint(columns.payload, at)
+        step, at = read_int(columns.batch.payload, at)
+        units, at = read_uint(columns.batch.payload, at)
         sample += step
         if at < 0 or at > end or sample < 0 or sample >= bound:
             return NOT_DECODED, end
-        if row >= columns.pairs.shape[0]:
+        if row >= columns.batch.pairs.shape[0]:
             return NOT_DECODED, _MALFORMED
-        columns.pairs[row, SAMPLE], columns.pairs[row, UNITS] = sample, units
+        columns.batch.pairs[row].sample, columns.batch.pairs[row].units = sample, units
         row += 1
-    count = row - columns.sizes[PAIRS]
-    columns.sizes[PAIRS] = row
+    count = row - columns.batch.sizes[PAIRS]
+    columns.batch.sizes[PAIRS] = row
     return count, end
 
 
 @kernel
-def _read_heard(columns: BatchColumns, step_record: np.ndarray, at: int) -> int:
-    step_record[HEARD] = columns.sizes[ALL_HEARD]
-    step_record[HEARD_COUNT], at = _array(
-        columns.payload, at, columns.heard.shape[0] - step_record[HEARD]
+def _read_heard(columns: BatchColumns, step_record: Row, at: int) -> int:
+    step_record.heard = columns.batch.sizes[ALL_HEARD]
+    step_record.heard_count, at = _array(
+        columns.batch.payload, at, columns.batch.heard.shape[0] - step_record.heard
     )
-    for row in range(step_record[HEARD], step_record[HEARD] + step_record[HEARD_COUNT]):
-        _, at = _array(columns.payload, at, _ANY)
-        columns.heard[row, SOURCE], at = _place(columns, at)
-        columns.heard[row, SEQUENCE], at = _number(columns.payload, at)
-    columns.sizes[ALL_HEARD] += step_record[HEARD_COUNT]
+    for row in range(step_record.heard, step_record.heard + step_record.heard_count):
+        _, at = _array(columns.batch.payload, at, _ANY)
+        columns.batch.heard[row].source, at = _place(columns, at)
+        columns.batch.heard[row].sequence, at = _number(columns.batch.payload, at)
+    columns.batch.sizes[ALL_HEARD] += step_record.heard_count
     return at
 
 
 @kernel
-def _read_envelope(columns: BatchColumns, row: np.ndarray, at: int) -> int:
-    _, at = _array(columns.payload, at, _ANY)
-    row[SOURCE], at = _place(columns, at)
-    row[SEQUENCE], at = _number(columns.payload, at)
-    row[TARGET], at = _place(columns, at)
-    kind, size, at = head_of(columns.payload, at)
+def _read_envelope(columns: BatchColumns, row: Row, at: int) -> int:
+    _, at = _array(columns.batch.payload, at, _ANY)
+    row.source, at = _place(columns, at)
+    row.sequence, at = _number(columns.batch.payload, at)
+    row.target, at = _place(columns, at)
+    kind, size, at = head_of(columns.batch.payload, at)
     if kind != BYTES or at < 0:
         return _MALFORMED
-    row[BODY], row[BODY_END] = at, at + size
+    row.body, row.body_end = at, at + size
     return at + size
 
 
 @kernel
-def _read_outbox(columns: BatchColumns, step_record: np.ndarray, at: int) -> int:
-    step_record[SENT] = columns.sizes[ALL_SENT]
-    step_record[BODY_BYTES] = 0
-    step_record[SENT_COUNT], at = _array(
-        columns.payload, at, columns.sent.shape[0] - step_record[SENT]
+def _read_outbox(columns: BatchColumns, step_record: Row, at: int) -> int:
+    step_record.sent = columns.batch.sizes[ALL_SENT]
+    step_record.body_bytes = 0
+    step_record.sent_count, at = _array(
+        columns.batch.payload, at, columns.batch.sent.shape[0] - step_record.sent
     )
-    for row in range(step_record[SENT], step_record[SENT] + step_record[SENT_COUNT]):
-        at = _read_envelope(columns, columns.sent[row], at)
-        step_record[BODY_BYTES] += columns.sent[row, BODY_END] - columns.sent[row, BODY]
-    columns.sizes[ALL_SENT] += step_record[SENT_COUNT]
+    for row in range(step_record.sent, step_record.sent + step_record.sent_count):
+        at = _read_envelope(columns, columns.batch.sent[row], at)
+        step_record.body_bytes += columns.batch.sent[row].body_end - columns.batch.sent[row].body
+    columns.batch.sizes[ALL_SENT] += step_record.sent_count
     return at
 
 
 @kernel
-def _read_goal(columns: BatchColumns, step_record: np.ndarray, row: int, at: int) -> int:
-    kind, numbers, after = head_of(columns.payload, at)
-    step_record[HEADS] = kind == ARRAY
+def _read_goal(columns: BatchColumns, step_record: Row, row: int, at: int) -> int:
+    kind, numbers, after = head_of(columns.batch.payload, at)
+    step_record.heads = kind == ARRAY
     if kind != ARRAY:
         return after
     if numbers != 2:
@@ -329,89 +319,69 @@ def _read_goal(columns: BatchColumns, step_record: np.ndarray, row: int, at: int
 
 
 @kernel
-def _read_outputs(
-    columns: BatchColumns, step_record: np.ndarray, row: int, at: int, samples: int
-) -> int:
-    kind, fields, at = head_of(columns.payload, at)
-    step_record[PRESENT] = kind == ARRAY
-    step_record[SENT_COUNT] = 0
+def _read_outputs(columns: BatchColumns, step_record: Row, row: int, at: int, samples: int) -> int:
+    kind, fields, at = head_of(columns.batch.payload, at)
+    step_record.present = kind == ARRAY
+    step_record.sent_count = 0
     if kind != ARRAY:
         return at
-    step_record[STEP], at = _number(columns.payload, at)
-    at = skip(columns.payload, at, 1)  # pose
+    step_record.step, at = _number(columns.batch.payload, at)
+    at = skip(columns.batch.payload, at, 1)  # pose
     at = _read_goal(columns, step_record, row, at)
-    step_record[SPENT] = columns.sizes[PAIRS]
-    step_record[SPENT_COUNT], at = _read_pairs(columns, at, samples)
-    step_record[LOWERED] = columns.sizes[PAIRS]
-    step_record[LOWERED_COUNT], at = _read_pairs(columns, at, samples)
-    _, step_record[WEIGHTS_BYTES], step_record[WEIGHTS] = head_of(columns.payload, at)
-    at = _read_outbox(columns, step_record, step_record[WEIGHTS] + step_record[WEIGHTS_BYTES])
-    step_record[ENERGY], at = _number(columns.payload, at)
-    step_record[STATE], at = _number(columns.payload, at)
-    step_record[REFUSED], at = _number(columns.payload, at)
-    return skip(columns.payload, at, fields - 10)
+    step_record.spent = columns.batch.sizes[PAIRS]
+    step_record.spent_count, at = _read_pairs(columns, at, samples)
+    step_record.lowered = columns.batch.sizes[PAIRS]
+    step_record.lowered_count, at = _read_pairs(columns, at, samples)
+    _, step_record.weights_bytes, step_record.weights = head_of(columns.batch.payload, at)
+    at = _read_outbox(columns, step_record, step_record.weights + step_record.weights_bytes)
+    step_record.energy, at = _number(columns.batch.payload, at)
+    step_record.state, at = _number(columns.batch.payload, at)
+    step_record.refused, at = _number(columns.batch.payload, at)
+    return skip(columns.batch.payload, at, fields - 10)
 
 
 @kernel
-def _read_verdict(columns: BatchColumns, step_record: np.ndarray, row: int, at: int) -> int:
-    kind, fields, at = head_of(columns.payload, at)
-    step_record[PRESENT] &= kind == ARRAY
+def _read_verdict(columns: BatchColumns, step_record: Row, row: int, at: int) -> int:
+    kind, fields, at = head_of(columns.batch.payload, at)
+    step_record.present &= kind == ARRAY
     if kind != ARRAY:
         return at
-    numbers, at = _array(columns.payload, at, _ANY)
+    numbers, at = _array(columns.batch.payload, at, _ANY)
     at = _read_metres(columns, row, 0, at)
     at = _read_metres(columns, row, 1, at)
-    at = skip(columns.payload, at, numbers - 2)
-    step_record[FINDS], at = _array(columns.payload, at, _ANY)
-    at = skip(columns.payload, at, step_record[FINDS])
-    step_record[VIOLATIONS], at = _array(columns.payload, at, _ANY)
-    step_record[UNSHIPPED] = step_record[TOO_FAST] = 0
-    for item in range(step_record[VIOLATIONS]):
-        kind, size, at = head_of(columns.payload, at)
+    at = skip(columns.batch.payload, at, numbers - 2)
+    step_record.finds, at = _array(columns.batch.payload, at, _ANY)
+    at = skip(columns.batch.payload, at, step_record.finds)
+    step_record.violations, at = _array(columns.batch.payload, at, _ANY)
+    step_record.unshipped = step_record.too_fast = 0
+    for item in range(step_record.violations):
+        kind, size, at = head_of(columns.batch.payload, at)
         if kind != TEXT:
             return _MALFORMED
         for text in _REFUSALS:
-            step_record[UNSHIPPED] |= _equals(columns.payload, at, size, text)
-        if _equals(columns.payload, at, size, _SPEED):
-            step_record[TOO_FAST] = item + 1
+            step_record.unshipped |= _equals(columns.batch.payload, at, size, text)
+        if _equals(columns.batch.payload, at, size, _SPEED):
+            step_record.too_fast = item + 1
         at += size
-    return skip(columns.payload, at, fields - 3)
+    return skip(columns.batch.payload, at, fields - 3)
 
 
 @kernel
 def _read_batch(
     payload: bytes,
-    sizes: np.ndarray,
-    step_records: np.ndarray,
-    poses_m: np.ndarray,
-    heard: np.ndarray,
-    sent: np.ndarray,
-    decisions: np.ndarray,
-    pairs: np.ndarray,
-    injected: np.ndarray,
+    tables: tuple[Any, ...],
     pose_bits: np.ndarray,
     robots: int,
     supervisor: int,
     samples: int,
 ) -> int:
-    """Fill the arrays; returns the position after the fields that were decoded.
+    """Fill the tables of a ColumnarBatch; returns the position after the fields that were decoded.
 
-    Negative if the payload is no batch, or if an array has too few rows for it.
+    Negative if the payload is no batch, or if a table has too few rows for it.
     """
-    columns = BatchColumns(
-        payload,
-        sizes,
-        step_records,
-        poses_m,
-        heard,
-        sent,
-        decisions,
-        pairs,
-        injected,
-        pose_bits,
-        robots,
-        supervisor,
-    )
+    batch = ColumnarBatch(payload, *tables)
+    columns = BatchColumns(batch, pose_bits, robots, supervisor)
+    sizes, step_records, decisions = batch.sizes, batch.step_records, batch.decisions
     sizes[:] = 0
     parts, at = _array(payload, 0, _ANY)
     at = skip(payload, at, 2)  # tag, now_ns
@@ -419,34 +389,34 @@ def _read_batch(
     for i in range(sizes[STEP_RECORDS]):
         step_record = step_records[i]
         fields, at = _array(payload, at, _ANY)
-        step_record[PLACE], at = _place(columns, at)
-        step_record[NOW_NS], at = _number(payload, at)
+        step_record.place, at = _place(columns, at)
+        step_record.now_ns, at = _number(payload, at)
         items, at = _array(payload, at, _ANY)  # the observation
-        step_record[OBSERVED], at = _number(payload, at)
+        step_record.observed, at = _number(payload, at)
         at = skip(payload, at, items - 1)
         at = _read_heard(columns, step_record, at)
         at = _read_outputs(columns, step_record, i, at, samples)
         at = _read_verdict(columns, step_record, i, at)
-        step_record[SKEW_NS] = 0
+        step_record.skew_ns = 0
         if fields > 6:
-            step_record[SKEW_NS], at = _number(payload, at)
+            step_record.skew_ns, at = _number(payload, at)
         at = skip(payload, at, fields - 7)
         if at < 0:
             return _MALFORMED
     sizes[DECISIONS], at = _array(payload, at, decisions.shape[0])
     for i in range(sizes[DECISIONS]):
         fields, at = _array(payload, at, _ANY)
-        decisions[i, SOURCE], at = _place(columns, at)
-        decisions[i, SEQUENCE], at = _number(payload, at)
-        decisions[i, TARGET], at = _place(columns, at)
-        decisions[i, DUE_NS], at = _number(payload, at)
+        decisions[i].source, at = _place(columns, at)
+        decisions[i].sequence, at = _number(payload, at)
+        decisions[i].target, at = _place(columns, at)
+        decisions[i].due_ns, at = _number(payload, at)
         at = skip(payload, at, fields - 4)
     if parts < 8:
         return at
     at = skip(payload, at, 3)  # out_of_range, absent, fault_stats
-    sizes[INJECTED], at = _array(payload, at, injected.shape[0])
+    sizes[INJECTED], at = _array(payload, at, columns.batch.injected.shape[0])
     for i in range(sizes[INJECTED]):
-        at = _read_envelope(columns, injected[i], at)
+        at = _read_envelope(columns, columns.batch.injected[i], at)
     return at
 
 
@@ -581,7 +551,7 @@ class ColumnarDecoder:
         """
         payload = payload or encode_record(record)
         if isinstance(record, Batch):
-            while _read_batch(payload, *self._tables, self._pose_bits, *self._bounds) < 0:
+            while _read_batch(payload, self._tables, self._pose_bits, *self._bounds) < 0:
                 assert self._rows <= len(payload), "what msgspec has encoded can be read"
                 self._make_room(2 * self._rows)
         elif isinstance(record, Opening):
@@ -597,7 +567,7 @@ class ColumnarDecoder:
         self._pose_bits = poses_m.view(np.int64)
         self._tables = (
             np.zeros(6, dtype=np.int64),
-            np.zeros((rows, _STEP_RECORD_COLUMNS), dtype=np.int64),
+            np.zeros(rows, dtype=STEP_RECORD),
             poses_m,
-            *(np.zeros((rows, columns), dtype=np.int64) for columns in (2, 5, 4, 2, 5)),
+            *(np.zeros(rows, dtype=row) for row in (REFERENCE, ENVELOPE, DECISION, PAIR, ENVELOPE)),
         )

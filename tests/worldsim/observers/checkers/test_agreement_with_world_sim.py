@@ -52,8 +52,8 @@ def assert_agree(scenario: Scenario, seed: int, times_ns: list[int]) -> None:
     for now_ns in times_ns:
         links.move_to(now_ns)
         for i, j in itertools.permutations(range(len(names)), 2):
-            assert links.table.cut[i, j] == radio.cuts(now_ns, names[i], names[j])
-            assert links.table.range_m[i, j] == radio.reach_m(now_ns, names[i], names[j])
+            assert links.is_cut(i, j) == radio.cuts(now_ns, names[i], names[j])
+            assert links.range_m(i, j) == radio.reach_m(now_ns, names[i], names[j])
 
 
 @pytest.mark.parametrize("first", range(0, 60, 10))

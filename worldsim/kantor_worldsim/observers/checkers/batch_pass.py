@@ -1,6 +1,6 @@
 """One compiled pass over a batch: every rule on numbers, step by step, in the order in which things happen."""
 
-import numpy as np
+from typing import Any
 
 from kantor_protocol.base.kernels import kernel
 from kantor_worldsim.observers.checkers.conservation import (
@@ -39,104 +39,36 @@ from kantor_worldsim.record.columnar import ColumnarBatch
 
 @kernel
 def check_batch(
-    payload: bytes,
-    sizes: np.ndarray,
-    step_records: np.ndarray,
-    verdicts_m: np.ndarray,
-    heard: np.ndarray,
-    sent: np.ndarray,
-    decisions: np.ndarray,
-    pairs: np.ndarray,
-    injected: np.ndarray,
-    participants: np.ndarray,
-    poses_m: np.ndarray,
-    views: np.ndarray,
-    published: np.ndarray,
-    consumed: np.ndarray,
-    shipped: np.ndarray,
-    logs: np.ndarray,
-    posted: np.ndarray,
-    deliveries: np.ndarray,
-    delivery_slots: np.ndarray,
-    forged: np.ndarray,
-    version_vector: np.ndarray,
-    violations: np.ndarray,
-    lengths_m: np.ndarray,
-    counts: np.ndarray,
-    samples_m: np.ndarray,
-    by_x: np.ndarray,
-    sample_units: int,
-    point_units: int,
-    budget: int,
-    ledger: bool,
-    supervisor: int,
-    speed_m_s: float,
-    transport: bool,
-    claims: bool,
-    virtual: bool,
-    clocks: bool,
-    signal_slack_ns: int,
-    false_logs: bool,
-    cut: np.ndarray,
-    range_m: np.ndarray,
+    batch: tuple[Any, ...],
+    so_far: tuple[Any, ...],
+    limiting: tuple[Any, ...],
+    linking: tuple[Any, ...],
     now_ns: int,
 ) -> int:
     """Check one batch; the number of violations and keyframes in it.
 
-    Takes the fields of a ColumnarBatch, a CheckerState, Limits and a LinkTable. Less than 0 if an array has
+    Takes the fields of a ColumnarBatch, a CheckerState, Limits and a LinkTable. Less than 0 if a table has
     too little room, see `missing_capacity`; then nothing has changed.
     """
-    columns = ColumnarBatch(
-        payload, sizes, step_records, verdicts_m, heard, sent, decisions, pairs, injected
-    )
-    state = CheckerState(
-        participants,
-        poses_m,
-        views,
-        published,
-        consumed,
-        shipped,
-        logs,
-        posted,
-        deliveries,
-        delivery_slots,
-        forged,
-        version_vector,
-        violations,
-        lengths_m,
-        counts,
-        samples_m,
-        by_x,
-    )
-    limits = Limits(
-        sample_units,
-        point_units,
-        budget,
-        ledger,
-        supervisor,
-        speed_m_s,
-        transport,
-        claims,
-        virtual,
-        clocks,
-        signal_slack_ns,
-        false_logs,
-    )
+    columns, state = ColumnarBatch(*batch), CheckerState(*so_far)
+    limits, links = Limits(*limiting), LinkTable(*linking)
+    sizes, counts = columns.sizes, state.counts
     missing = missing_capacity(state, columns)
     if missing < 0:
         return missing
     counts[NOTED], counts[KEYFRAMES] = 0, 0
     for row in range(sizes[of.STEP_RECORDS]):
-        if step_records[row, of.PLACE] >= 0:
+        if columns.step_records[row].place >= 0:
             check_inbox(state, limits, columns, row, now_ns)
             post(state, columns, row)
     post_forged(state, columns)
     for row in range(sizes[of.DECISIONS]):
-        check_decision(state, LinkTable(cut, range_m), columns, row)
+        check_decision(state, links, columns, row)
     for row in range(sizes[of.STEP_RECORDS]):
-        if step_records[row, of.PLACE] < 0:
+        step_record = columns.step_records[row]
+        if step_record.place < 0:
             note_violation(state, NOT_IN_ROSTER, row, 0, 0, 0, 0.0, 0.0)
-        elif step_records[row, of.PRESENT]:
+        elif step_record.present:
             check_step(state, limits, columns, row)
     return counts[NOTED] + counts[KEYFRAMES]
 
@@ -151,10 +83,10 @@ def check_step(state: CheckerState, limits: Limits, columns: ColumnarBatch, row:
     check_speed(state, limits, columns, row)
     check_energy(state, limits, columns, row)
     check_weights(state, limits, columns, row)
-    for item in range(step_record[of.SENT_COUNT]):
+    for item in range(step_record.sent_count):
         check_gossip(state, limits, columns, row, item)
     check_verdict(state, limits, columns, row)
-    if step_record[of.WEIGHTS_BYTES]:
+    if step_record.weights_bytes:
         check_published(state, columns, row)
-    if limits.transport and step_record[of.HEADS]:
+    if limits.transport and step_record.heads:
         check_goal(state, columns, row)

@@ -22,25 +22,13 @@ from kantor_worldsim.observers.checkers.mapping import MapChecker
 from kantor_worldsim.observers.checkers.outages import WrongClocks, caused_events
 from kantor_worldsim.observers.checkers.registers import RegisterChecker
 from kantor_worldsim.observers.checkers.state import (
-    ASKED,
-    DIFFERING,
-    ENTRIES,
     FORGED_FIRST,
-    INCARNATION_ID,
-    KEYFRAME,
-    LIES,
     NOT_STOPPED,
     NOTED,
-    REFUSALS_SO_FAR,
-    SEQUENCE,
-    STEPS,
-    STOPPED_NS,
-    UNDER_WAY,
-    VECTOR_SENT,
-    WRITES,
     CheckerState,
     Limits,
-    arguments,
+    logs_leave,
+    posted_max,
 )
 from kantor_worldsim.observers.checkers.violations import (
     FOREIGN_LOG,
@@ -208,9 +196,10 @@ class Checker:
             clocks=bool(self._clocks),
             false_logs=self._liar_checker is not None and bool(self._liar_checker.false_logs),
         )
+        self._posted_max = posted_max(scenario)
         self._keep(CheckerState.of(opening))
         if self._liar_checker is not None:
-            self._state.participants[self._liar_checker.liar_places, LIES] = 1
+            self._state.participants["lies"][self._liar_checker.liar_places] = 1
         if scenario.planner.name == "spectral":
             self._register_checker = RegisterChecker(scenario, self._report)
         self._due = {
@@ -232,7 +221,7 @@ class Checker:
 
     def _keep(self, state: CheckerState) -> None:
         self._state = state
-        self._arguments = arguments(state, self._limits, self._links.table)
+        self._arguments = tuple(state), tuple(self._limits), tuple(self._links.table)
 
     def _check(self, batch: Batch, decoded: DecodedRecord) -> None:
         self._pass_time(batch.now_ns)
@@ -243,10 +232,10 @@ class Checker:
         if self._clocks:
             self._check_clocks(batch)
         self._links.move_to(batch.now_ns)
-        noted = check_batch(*decoded.columns, *self._arguments, batch.now_ns)
+        noted = check_batch(decoded.columns, *self._arguments, batch.now_ns)
         while noted < 0:
-            self._keep(self._state.lengthened(noted))
-            noted = check_batch(*decoded.columns, *self._arguments, batch.now_ns)
+            self._keep(self._state.lengthened(noted, self._posted_max))
+            noted = check_batch(decoded.columns, *self._arguments, batch.now_ns)
         if noted:
             self._report_noted(batch, self._state.counts.item(NOTED))
             self._check_keyframes(batch)
@@ -321,14 +310,14 @@ class Checker:
     def _note_stopped(self, name: ParticipantId) -> None:
         if name in self._places:
             since_ns = min(self._stopped[name].values(), default=NOT_STOPPED)
-            self._state.participants[self._places[name], STOPPED_NS] = since_ns
+            self._state.participants[self._places[name]]["stopped_ns"] = since_ns
 
     def _check_start(self, process_event: ProcessEvent, place: int) -> None:
         """A process starts to drive a body, as the incarnation before it or as the next one."""
         participant = self._state.participants[place]
         steps, incarnation = (
-            participant.item(STEPS),
-            participant.item(INCARNATION_ID) // len(self._names),
+            int(participant["steps"]),
+            int(participant["incarnation_id"]) // len(self._names),
         )
         disk = self._disk_of(process_event.fault)
         expected = {incarnation}
@@ -362,16 +351,19 @@ class Checker:
         if not self._stopped[self._names[place]]:
             return
         deliveries = self._state.deliveries[place]
-        under_way = deliveries[: participant[UNDER_WAY]]
-        due_ns, handed_over = under_way[:, 2], participant[ASKED] & under_way[:, 3] > 0
-        kept = under_way[(due_ns < participant[STOPPED_NS]) | (due_ns >= now_ns) | handed_over]
+        under_way = deliveries[: participant["under_way"]]
+        due_ns, handed_over = (
+            under_way["due_ns"],
+            participant["asked"] & under_way["handed_over"] > 0,
+        )
+        kept = under_way[(due_ns < participant["stopped_ns"]) | (due_ns >= now_ns) | handed_over]
         deliveries[: kept.shape[0]] = kept
-        participant[UNDER_WAY] = kept.shape[0]
+        participant["under_way"] = kept.shape[0]
         index_deliveries(deliveries, self._state.delivery_slots[place], kept.shape[0])
 
     def _begin_incarnation(self, process_event: ProcessEvent, place: int) -> None:
         """A new incarnation knows nothing: its vector is full, it holds no entry, its own log is empty."""
-        if self._limits.ledger and self._state.participants[place, VECTOR_SENT]:
+        if self._limits.ledger and self._state.participants[place]["vector_sent"]:
             self._check_view(process_event.who, place)
         roster = len(self._names)
         incarnation_id = process_event.incarnation * roster + place
@@ -381,18 +373,18 @@ class Checker:
         state.views[place], state.published[place] = self._units.sample, 0
         state.version_vector[place] = 0
         participant = state.participants[place]
-        participant[INCARNATION_ID] = incarnation_id
-        participant[[SEQUENCE, DIFFERING, VECTOR_SENT, REFUSALS_SO_FAR]] = 0
+        participant["incarnation_id"] = incarnation_id
+        for field in ("sequence", "differing", "vector_sent", "refusals_so_far"):
+            participant[field] = 0
 
     def _report_noted(self, batch: Batch, count: int) -> None:
         noted = min(count, VIOLATIONS_MAX)
-        rows, lengths_m = self._state.violations[:noted], self._state.lengths_m[:noted]
-        for row, lengths in zip(rows.tolist(), lengths_m.tolist(), strict=True):
-            if not self._is_in_good_faith(row):
-                self._report(*describe(batch, self._names, row, lengths))
+        for violation in self._state.violations[:noted].tolist():
+            if not self._is_in_good_faith(violation):
+                self._report(*describe(batch, self._names, violation))
         self.count += count - noted
 
-    def _is_in_good_faith(self, noted: list[int]) -> bool:
+    def _is_in_good_faith(self, noted: tuple[Any, ...]) -> bool:
         """Whether a noted violation is the log of a liar in the message of another, who cannot know it."""
         kind, _, origin, *_ = noted
         return (
@@ -415,33 +407,33 @@ class Checker:
 
     def _check_keyframes(self, batch: Batch) -> None:
         participants, subscriber = self._state.participants, self._subscriber
-        for place in np.flatnonzero(participants[:, KEYFRAME]).tolist():
+        for place in np.flatnonzero(participants["keyframe"]).tolist():
             participant = participants[place]
-            step_record = batch.step_records[participant[KEYFRAME] - 1]
+            step_record = batch.step_records[participant["keyframe"] - 1]
             assert step_record.outputs is not None
             rebuilt = subscriber.apply(step_record.outputs.weights)
             weights, view = subscriber.weights, self._state.views[place]
             if not rebuilt or weights is None or weights.shape != view.shape:
-                participant[SEQUENCE] = 0
+                participant["sequence"] = 0
                 self._report("weights", step_record.name, TEXTS[NOT_REBUILT][1])
                 continue
             self._state.published[place] = weights
-            participant[DIFFERING] = np.count_nonzero(weights != view)
-            if participant[DIFFERING]:
+            participant["differing"] = np.count_nonzero(weights != view)
+            if participant["differing"]:
                 self._report("weights", step_record.name, TEXTS[NOT_ITS_OWN][1])
 
     def _check_registers(self, batch: Batch, checker: RegisterChecker) -> None:
         for step_record in batch.step_records:
             outputs, place = step_record.outputs, self._places.get(step_record.name)
             if outputs is not None and step_record.verdict is not None and place is not None:
-                incarnation_id = self._state.participants.item(place, INCARNATION_ID)
-                points = self._state.shipped.item(incarnation_id, WRITES)
+                incarnation_id = int(self._state.participants[place]["incarnation_id"])
+                points = int(self._state.shipped[incarnation_id]["writes"])
                 checker.check(step_record, outputs, incarnation_id, points)
 
     def _end(self, ending: Ending) -> None:
         if self._limits.ledger:
             for name, place in self._places.items():
-                if self._state.participants[place, VECTOR_SENT]:
+                if self._state.participants[place]["vector_sent"]:
                     self._check_view(name, place)
         for event in self._due.values():
             if event.at_ns < ending.now_ns and self._virtual and not event.mid_step:
@@ -453,20 +445,18 @@ class Checker:
         state, liars = self._state, self._liar_checker
         if liars is not None and place in liars.false_logs:
             return  # after a restart its own lies may come back to it
-        spent = np.zeros(state.consumed.shape[0], dtype=np.int64)
-        holds_false = False
-        for incarnation_id, length in enumerate(state.version_vector[place].tolist()):
-            entries = state.shipped.item(incarnation_id, ENTRIES)
-            if length > entries:
-                origin = origin_of(incarnation_id, self._names)
-                self._report("ledger", name, f"holds {length} entries of {origin}'s {entries}")
-                return
-            if liars is not None and liars.is_false(incarnation_id):
-                holds_false = holds_false or length > 0
-                continue
-            log = state.logs[incarnation_id, :length]
-            np.add.at(spent, log[:, 0], log[:, 1])
-        lost = np.maximum(self._units.sample - spent, 0) - state.views[place]
+        false = np.zeros(state.shipped.shape[0], dtype=np.bool_)
+        if liars is not None:
+            false[:] = [liars.is_false(origin) for origin in range(false.shape[0])]
+        left = np.full(state.consumed.shape[0], self._units.sample, dtype=np.int64)
+        origin = logs_leave(tuple(state), place, false, left)
+        if origin >= 0:
+            length, entries = state.version_vector[place, origin], state.shipped[origin]["entries"]
+            whose = origin_of(origin, self._names)
+            self._report("ledger", name, f"holds {length} entries of {whose}'s {entries}")
+            return
+        holds_false = bool((state.version_vector[place, false] > 0).any())
+        lost = np.maximum(left, 0) - state.views[place]
         if holds_false and liars is not None and lost.min(initial=0) >= 0:
             liars.check_lost(name, int(lost.sum()))
         elif lost.any():

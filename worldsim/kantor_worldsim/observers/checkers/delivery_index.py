@@ -28,7 +28,7 @@ def next_slot(slot: int, slots: np.ndarray) -> int:
 @kernel
 def add_to_index(deliveries: np.ndarray, slots: np.ndarray, row: int) -> None:
     """Add a row of the deliveries."""
-    slot = first_slot(deliveries[row, 0], deliveries[row, 1], slots)
+    slot = first_slot(deliveries[row].source, deliveries[row].sequence, slots)
     while slots[slot] != 0:
         slot = next_slot(slot, slots)
     slots[slot] = row + 1
@@ -36,7 +36,7 @@ def add_to_index(deliveries: np.ndarray, slots: np.ndarray, row: int) -> None:
 
 @kernel
 def _slot_of(deliveries: np.ndarray, slots: np.ndarray, row: int) -> int:
-    slot = first_slot(deliveries[row, 0], deliveries[row, 1], slots)
+    slot = first_slot(deliveries[row].source, deliveries[row].sequence, slots)
     while slots[slot] != row + 1:
         slot = next_slot(slot, slots)
     return slot
@@ -53,7 +53,7 @@ def remove_row(deliveries: np.ndarray, slots: np.ndarray, row: int, last: int) -
         if slots[slot] == 0:
             break
         moved = slots[slot] - 1
-        wanted = first_slot(deliveries[moved, 0], deliveries[moved, 1], slots)
+        wanted = first_slot(deliveries[moved].source, deliveries[moved].sequence, slots)
         mask = slots.shape[0] - 1
         if ((slot - wanted) & mask) >= ((slot - free) & mask):
             slots[free] = slots[slot]
@@ -61,8 +61,7 @@ def remove_row(deliveries: np.ndarray, slots: np.ndarray, row: int, last: int) -
             free = slot
     if row != last:
         slots[_slot_of(deliveries, slots, last)] = row + 1
-        for column in range(deliveries.shape[1]):
-            deliveries[row, column] = deliveries[last, column]
+        deliveries[row] = deliveries[last]
 
 
 @kernel

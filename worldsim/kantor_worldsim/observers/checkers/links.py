@@ -2,7 +2,7 @@
 
 A plain reading of the link faults for the checkers. It shares no code with the radio and works in another
 way: the mission is divided at every moment at which a cut or a shorter range begins, ends or flaps. From one
-such moment to the next the links are two matrices, in which kernels look up a pair of participants.
+such moment to the next a table tells of any two participants whether a link is cut, and how far it reaches.
 """
 
 from collections.abc import Iterable, Iterator
@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.counter_rng import Purpose, uniform
-from kantor_protocol.base.machine import SUPERVISOR, ParticipantId
+from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.machine import ParticipantId
 from kantor_protocol.scenario.faults.base import Fault
 from kantor_protocol.scenario.faults.links import OneWay, Partition, Range
 from kantor_protocol.scenario.schema import Scenario
@@ -29,9 +30,30 @@ class LinkTable(NamedTuple):
     """All links at one moment, for kernels. n participants, in the order of the roster."""
 
     cut: npt.NDArray[np.bool_]
-    """(n, n): whether nothing passes from one (row) to another (column)."""
-    range_m: npt.NDArray[np.float64]
-    """(n, n): how far a link reaches, before walls."""
+    """(n, n): whether nothing passes from one (row) to another (column); (0, 0) if no fault ever cuts."""
+    whole_m: npt.NDArray[np.float64]
+    """(2,): how far links reach without faults: those of two robots, and those of the supervisor."""
+    most_m: npt.NDArray[np.float64]
+    """(n,): how far the links of each may reach by faults."""
+    share: npt.NDArray[np.float64]
+    """(n,): the share that faults leave of the links of each."""
+    supervisor: int
+    """Its place in the roster, or one beyond."""
+
+
+@kernel
+def is_cut(table: LinkTable, source: int, target: int) -> bool:
+    """Whether nothing passes from one participant to another."""
+    return table.cut.shape[0] > 0 and table.cut[source, target]
+
+
+@kernel
+def range_of(table: LinkTable, source: int, target: int) -> float:
+    """How far a link reaches, before walls."""
+    by_supervisor = table.supervisor in (source, target)
+    whole_m = table.whole_m[1 if by_supervisor else 0]
+    left_m = min(whole_m, table.most_m[source], table.most_m[target])
+    return min(left_m, whole_m * min(table.share[source], table.share[target]))
 
 
 class _Cut(NamedTuple):
@@ -61,14 +83,21 @@ class Links:
     def __init__(self, scenario: Scenario, seed: int) -> None:
         self._names = scenario.roster
         self._seed = seed
-        self._whole_m = _ranges_m(scenario)
         self._cuts = [
             _Cut(place, fault, _severed(fault, self._names), _flap_ns(fault))
             for place, fault in enumerate(scenario.faults)
             if isinstance(fault, OneWay | Partition)
         ]
         self._ranges = [fault for fault in scenario.faults if isinstance(fault, Range)]
-        self.table = LinkTable(np.zeros(self._whole_m.shape, dtype=np.bool_), self._whole_m.copy())
+        count = len(self._names)
+        ends = count if self._cuts else 0
+        self.table = LinkTable(
+            cut=np.zeros((ends, ends), dtype=np.bool_),
+            whole_m=np.array([scenario.radio.range_m, scenario.supervisor.range_m]),
+            most_m=np.full(count, np.inf),
+            share=np.ones(count),
+            supervisor=scenario.robots.count,
+        )
         """As it is since the last `move_to`; always the same arrays."""
         self._from_ns = self._until_ns = -1
 
@@ -76,29 +105,35 @@ class Links:
         """Bring the table to a time, in nanoseconds since the mission's start."""
         if self._from_ns <= now_ns < self._until_ns:
             return
-        cut, range_m = self.table
-        cut[:], range_m[:] = False, self._whole_m
+        cut, _, most_m, share, _ = self.table
+        cut[:], most_m[:], share[:] = False, np.inf, 1.0
         for each in self._cuts:
             if each.fault.holds(now_ns) and each.is_there(now_ns, self._seed):
                 cut |= each.severed
         for fault in self._ranges:
             if fault.holds(now_ns):
-                np.minimum(range_m, self._shortened_m(fault), out=range_m)
+                self._shorten(fault)
         edges_ns = list(self._edges_ns(now_ns))
         self._from_ns = max((edge_ns for edge_ns in edges_ns if edge_ns <= now_ns), default=0)
         self._until_ns = min(
             (edge_ns for edge_ns in edges_ns if edge_ns > now_ns), default=_ALWAYS_NS
         )
 
-    def _shortened_m(self, fault: Range) -> npt.NDArray[np.float64]:
-        """(n, n): what one fault leaves of every range."""
-        touched = _at_an_end(fault.robots or self._names, self._names)
-        left_m = (
-            np.minimum(self._whole_m, fault.range_m)
-            if fault.range_m is not None
-            else self._whole_m * (fault.factor or 0.0)
-        )
-        return np.where(touched, left_m, self._whole_m)
+    def is_cut(self, source: int, target: int) -> bool:
+        """Whether nothing passes from one participant to another, by their places."""
+        return bool(is_cut(self.table, source, target))
+
+    def range_m(self, source: int, target: int) -> float:
+        """How far a link reaches, before walls."""
+        return float(range_of(self.table, source, target))
+
+    def _shorten(self, fault: Range) -> None:
+        """A fault on ranges counts for each link that has one of its participants at an end."""
+        touched = _among(fault.robots or self._names, self._names)
+        if fault.range_m is not None:
+            self.table.most_m[touched] = np.minimum(self.table.most_m[touched], fault.range_m)
+        else:
+            self.table.share[touched] = np.minimum(self.table.share[touched], fault.factor or 0.0)
 
     def _edges_ns(self, now_ns: int) -> Iterator[int]:
         """The moments around a time at which a link may change."""
@@ -113,14 +148,6 @@ class Links:
                 yield (interval + 1) * each.flap_ns
 
 
-def _ranges_m(scenario: Scenario) -> npt.NDArray[np.float64]:
-    """(n, n): how far links reach without faults; that of the supervisor has its own range."""
-    names = scenario.roster
-    ranges_m = np.full((len(names), len(names)), scenario.radio.range_m)
-    ranges_m[_at_an_end((SUPERVISOR,), names)] = scenario.supervisor.range_m
-    return ranges_m
-
-
 def _flap_ns(fault: OneWay | Partition) -> int:
     flap_s = fault.flap_s if isinstance(fault, Partition) else None
     return round((flap_s or 0.0) * 1e9)
@@ -132,14 +159,6 @@ def _among(
     """(n,): whether each of the names is among some."""
     wanted = frozenset(some)
     return np.array([name in wanted for name in names], dtype=np.bool_)
-
-
-def _at_an_end(
-    some: Iterable[ParticipantId], names: tuple[ParticipantId, ...]
-) -> npt.NDArray[np.bool_]:
-    """(n, n): whether a link has one of some participants at an end."""
-    among = _among(some, names)
-    return np.logical_or.outer(among, among)
 
 
 def _severed(fault: OneWay | Partition, names: tuple[ParticipantId, ...]) -> npt.NDArray[np.bool_]:

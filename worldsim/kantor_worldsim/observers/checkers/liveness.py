@@ -372,8 +372,8 @@ class LivenessChecker:
                 return False
             walls = 0 if {one, other} & without_walls else sight.walls(poses_m[one], poses_m[other])
             return all(
-                not links.table.cut[ends]
-                and sight.reaches(poses_m[one], poses_m[other], links.table.range_m[ends], walls)
+                not links.is_cut(*ends)
+                and sight.reaches(poses_m[one], poses_m[other], links.range_m(*ends), walls)
                 for ends in ((places[one], places[other]), (places[other], places[one]))
             )
 

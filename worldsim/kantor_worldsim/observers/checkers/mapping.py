@@ -140,7 +140,6 @@ class MapChecker:
     def _check_sight(self, batch: Batch) -> None:
         """By the poses before the batch moves them. Range alone is a rule of every run."""
         self._links.move_to(batch.now_ns)
-        range_m = self._links.table.range_m
         for decision in batch.decisions:
             here_m = self._senders_m.get(decision.source)
             there_m = self._senders_m.get(decision.target)
@@ -148,7 +147,7 @@ class MapChecker:
                 continue
             walls = self._sight.walls(here_m, there_m)
             ends = self._places[decision.source], self._places[decision.target]
-            if not self._sight.reaches(here_m, there_m, float(range_m[ends]), walls):
+            if not self._sight.reaches(here_m, there_m, self._links.range_m(*ends), walls):
                 heard = f"{decision.source}#{decision.sequence}"
                 self._report("sight", decision.target, f"hears {heard} through {walls} walls")
 

@@ -5,13 +5,7 @@ import math
 from kantor_protocol.base.kernels import kernel
 from kantor_worldsim.observers.checkers.state import (
     FORGED_FIRST,
-    LIES,
-    MOVED_NS,
     NOT_STOPPED,
-    REFUSALS_SO_FAR,
-    SKEW_BEFORE_NS,
-    STEPS,
-    STOPPED_NS,
     CheckerState,
     Limits,
     note_violation,
@@ -25,7 +19,6 @@ from kantor_worldsim.observers.checkers.violations import (
     STEP,
     STOPPED,
 )
-from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch
 
 _ROUNDING = 2e-6
@@ -38,24 +31,24 @@ _COORDINATES = 2.0**-49
 def check_running(state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int) -> None:
     """Only a participant that runs acts, and its clock is wrong only by a fault."""
     step_record = columns.step_records[row]
-    stopped_ns = state.participants[step_record[of.PLACE], STOPPED_NS]
+    stopped_ns = state.participants[step_record.place].stopped_ns
     if stopped_ns != NOT_STOPPED and (
-        limits.virtual or step_record[of.NOW_NS] > stopped_ns + limits.signal_slack_ns
+        limits.virtual or step_record.now_ns > stopped_ns + limits.signal_slack_ns
     ):
         note_violation(state, STOPPED, row, 0, 0, 0, stopped_ns * 1e-9, 0.0)
-    if step_record[of.SKEW_NS] != 0 and not limits.clocks:
-        note_violation(state, SKEW, row, 0, step_record[of.SKEW_NS], 0, 0.0, 0.0)
+    if step_record.skew_ns != 0 and not limits.clocks:
+        note_violation(state, SKEW, row, 0, step_record.skew_ns, 0, 0.0, 0.0)
 
 
 @kernel
 def check_verdict(state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int) -> None:
     """World-sim refuses nothing, but the speed of a robot whose clock has gained on time since its last step."""
     step_record = columns.step_records[row]
-    participant = state.participants[step_record[of.PLACE]]
-    excused = limits.clocks and step_record[of.SKEW_NS] > participant[SKEW_BEFORE_NS]
-    participant[SKEW_BEFORE_NS] = step_record[of.SKEW_NS]
-    for item in range(step_record[of.VIOLATIONS]):
-        if not (excused and item + 1 == step_record[of.TOO_FAST]):
+    participant = state.participants[step_record.place]
+    excused = limits.clocks and step_record.skew_ns > participant.skew_before_ns
+    participant.skew_before_ns = step_record.skew_ns
+    for item in range(step_record.violations):
+        if not (excused and item + 1 == step_record.too_fast):
             note_violation(state, REFUSED, row, item, 0, 0, 0.0, 0.0)
 
 
@@ -63,40 +56,38 @@ def check_verdict(state: CheckerState, limits: Limits, columns: ColumnarBatch, r
 def check_order(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
     """Steps are numbered without gaps, and made with the newest observation."""
     step_record = columns.step_records[row]
-    participant = state.participants[step_record[of.PLACE]]
-    if step_record[of.STEP] != participant[STEPS] + 1:
-        note_violation(state, STEP, row, 0, step_record[of.STEP], participant[STEPS] + 1, 0.0, 0.0)
-    elif step_record[of.OBSERVED] != participant[STEPS]:
-        note_violation(
-            state, STALE, row, 0, step_record[of.STEP], step_record[of.OBSERVED], 0.0, 0.0
-        )
-    participant[STEPS] = step_record[of.STEP]
+    participant = state.participants[step_record.place]
+    if step_record.step != participant.steps + 1:
+        note_violation(state, STEP, row, 0, step_record.step, participant.steps + 1, 0.0, 0.0)
+    elif step_record.observed != participant.steps:
+        note_violation(state, STALE, row, 0, step_record.step, step_record.observed, 0.0, 0.0)
+    participant.steps = step_record.step
 
 
 @kernel
 def check_refusals(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
     """A participant refuses what is forged, and nothing else but what liars say."""
     step_record = columns.step_records[row]
-    participant = state.participants[step_record[of.PLACE]]
+    participant = state.participants[step_record.place]
     forged, of_liars = 0, 0
-    for item in range(step_record[of.HEARD], step_record[of.HEARD] + step_record[of.HEARD_COUNT]):
-        source = columns.heard[item, of.SOURCE]
-        if columns.heard[item, of.SEQUENCE] >= FORGED_FIRST:
+    for item in range(step_record.heard, step_record.heard + step_record.heard_count):
+        source = columns.heard[item].source
+        if columns.heard[item].sequence >= FORGED_FIRST:
             forged += 1
         elif source >= 0:
-            of_liars += state.participants[source, LIES]
-    refused = step_record[of.REFUSED] - participant[REFUSALS_SO_FAR]
+            of_liars += state.participants[source].lies
+    refused = step_record.refused - participant.refusals_so_far
     if not forged <= refused <= forged + of_liars:
         note_violation(state, REFUSALS, row, 0, refused, forged, 0.0, 0.0)
-    participant[REFUSALS_SO_FAR] = step_record[of.REFUSED]
+    participant.refusals_so_far = step_record.refused
 
 
 @kernel
 def check_speed(state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int) -> None:
     """A participant moves no farther than its speed allows since its last step."""
     step_record = columns.step_records[row]
-    who = step_record[of.PLACE]
-    elapsed_ns = step_record[of.NOW_NS] - state.participants[who, MOVED_NS]
+    who = step_record.place
+    elapsed_ns = step_record.now_ns - state.participants[who].moved_ns
     limit_m_s = 0.0 if who == limits.supervisor else limits.speed_m_s
     limit_m = limit_m_s * elapsed_ns * 1e-9 * (1.0 + _ROUNDING)
     x_m, y_m = columns.poses_m[row, 0], columns.poses_m[row, 1]
@@ -105,5 +96,5 @@ def check_speed(state: CheckerState, limits: Limits, columns: ColumnarBatch, row
     way_m = math.hypot(x_m - state.poses_m[who, 0], y_m - state.poses_m[who, 1])
     if not way_m <= limit_m:
         note_violation(state, SPEED, row, 0, 0, 0, way_m, limit_m)
-    state.participants[who, MOVED_NS] = step_record[of.NOW_NS]
+    state.participants[who].moved_ns = step_record.now_ns
     state.poses_m[who, 0], state.poses_m[who, 1] = x_m, y_m

@@ -3,9 +3,6 @@
 from kantor_protocol.base.kernels import kernel
 from kantor_protocol.base.varint import read_int, read_uint
 from kantor_worldsim.observers.checkers.state import (
-    ENTRIES,
-    INCARNATION_ID,
-    VECTOR_SENT,
     CheckerState,
     Limits,
     note_violation,
@@ -28,13 +25,13 @@ def check_gossip(
     state: CheckerState, limits: Limits, columns: ColumnarBatch, row: int, item: int
 ) -> None:
     """A message names its sender's incarnation, and its entries are those of their origins, one for one."""
-    who, roster = columns.step_records[row, of.PLACE], state.participants.shape[0]
-    sent = columns.sent[columns.step_records[row, of.SENT] + item]
+    who, roster = columns.step_records[row].place, state.participants.shape[0]
+    sent = columns.sent[columns.step_records[row].sent + item]
     payload = columns.payload
     incarnation, version_vector, vector_end, logs, end = of.parts_of_gossip(
-        payload, sent[of.BODY], sent[of.BODY_END]
+        payload, sent.body, sent.body_end
     )
-    current = state.participants[who, INCARNATION_ID] // roster
+    current = state.participants[who].incarnation_id // roster
     if end >= 0 and incarnation != current:
         note_violation(state, OTHER_INCARNATION, row, item, incarnation, current, 0.0, 0.0)
     if not limits.ledger:
@@ -60,7 +57,7 @@ def check_suffix(state: CheckerState, payload: bytes, at: int, who: int, row: in
     start, at = read_uint(payload, at)
     _span, at = read_uint(payload, at)
     count, at = read_uint(payload, at)
-    written = state.shipped[origin, ENTRIES] if origin < state.shipped.shape[0] else 0
+    written = state.shipped[origin].entries if origin < state.shipped.shape[0] else 0
     sample = 0
     for position in range(start, start + count):
         step, at = read_int(payload, at)
@@ -68,10 +65,10 @@ def check_suffix(state: CheckerState, payload: bytes, at: int, who: int, row: in
         sample += step
         if not (
             position < written
-            and state.logs[origin, position, 0] == sample
-            and state.logs[origin, position, 1] == units
+            and state.logs[origin, position].sample == sample
+            and state.logs[origin, position].units == units
         ):
-            own = origin == state.participants[who, INCARNATION_ID]
+            own = origin == state.participants[who].incarnation_id
             note_violation(state, LOG if own else FOREIGN_LOG, row, origin, start, 0, 0.0, 0.0)
             return -1
     return at
@@ -83,7 +80,7 @@ def check_version_vector(
 ) -> None:
     """A version vector of so many incarnation ids does not fall, and is about incarnations that were there."""
     version_vector = state.version_vector[who]
-    state.participants[who, VECTOR_SENT] = 1
+    state.participants[who].vector_sent = 1
     for origin in range(max(ids, version_vector.shape[0])):
         length = 0
         if origin < ids:

@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.kernels import integers, kernel
+from kantor_protocol.scenario.faults.links import Replay
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.observers.checkers.delivery_index import index_deliveries
-from kantor_worldsim.observers.checkers.links import LinkTable
 from kantor_worldsim.observers.checkers.violations import VIOLATIONS_MAX
 from kantor_worldsim.record import columnar as of
 from kantor_worldsim.record.columnar import ColumnarBatch
@@ -22,17 +22,39 @@ FORGED_FIRST = 1 << 62
 
 NOT_STOPPED = -1
 
-# Columns of CheckerState.participants.
-STEPS, INCARNATION_ID, MOVED_NS, POINTS, ASKED, POSTED, UNDER_WAY, VECTOR_SENT = range(8)
-SEQUENCE, DIFFERING, _COMING, KEYFRAME, STOPPED_NS = 8, 9, 10, 13, 14
-REFUSALS_SO_FAR, NUMBER, SKEW_BEFORE_NS, LIES = 15, 16, 17, 18
-_PARTICIPANT_COLUMNS = 19
+PARTICIPANT = integers(
+    "steps", "incarnation_id", "moved_ns", "points", "asked", "posted", "under_way", "vector_sent",
+    "sequence", "differing", "entries_coming", "posted_coming", "deliveries_coming", "keyframe",
+    "stopped_ns", "refusals_so_far", "number", "skew_before_ns", "lies",
+)  # fmt: skip
+"""A row of CheckerState.participants: last step; incarnation id; time of the last move; points shipped by all its
+incarnations; whether it was asked for a step and has not answered; rows used of posted and deliveries; whether this
+incarnation has sent a version vector; sequence of its last publication, entries in which that differs from its view;
+rows that this batch brings to logs, posted and deliveries; 1 + the step record with which it publishes a keyframe in
+this batch; since when it is stopped, or NOT_STOPPED; messages it has refused; the highest number of an envelope it has
+sent; how far its clock was ahead in its last step; whether the scenario has it lie."""
 
-# Columns of CheckerState.shipped.
-ENTRIES, WRITES = 0, 1
+LOG = integers("entries", "writes")
+"""Entries of a log, points shipped."""
+ENTRY = integers("sample", "units")
+RUN = integers("first", "last", "target")
+"""Envelopes of one participant with consecutive numbers and the same target."""
+DELIVERY = integers("source", "sequence", "due_ns", "handed_over")
+"""A delivery under way; whether it was handed over with the step request that is open."""
+FORGED = integers("source", "sequence", "target")
+VIOLATION = np.dtype(
+    [(name, np.int64) for name in ("kind", "row", "item", "a", "b")]
+    + [(name, np.float64) for name in ("x_m", "y_m")]
+)
+"""Kind of a violation, step record or delivery decision, item of it, two numbers, and two lengths for its text."""
 
 # Slots of CheckerState.counts.
-NOTED, KEYFRAMES, FORGED = 0, 1, 2
+NOTED, KEYFRAMES, ALL_FORGED = 0, 1, 2
+
+_RUNS_MAX = 3
+"""Rows of posted that an envelope may need: one that is sent under a number in the middle of a run divides it."""
+
+_POSTED_MAX = 512
 
 _NO_LOGS, _NO_POSTED, _NO_DELIVERIES, _NO_FORGED = -1, -2, -3, -4
 
@@ -47,14 +69,8 @@ _GROWING = {
 class CheckerState(NamedTuple):
     """The run so far, for the kernels. n participants, N samples; ids: incarnation ids, see `incarnations.py`."""
 
-    participants: npt.NDArray[np.int64]
-    """(n, 19): last step; incarnation id; time of the last move; points shipped by all its incarnations;
-    whether it was asked for a step and has not answered; rows used of posted and deliveries; whether this
-    incarnation has sent a version vector; sequence of its last publication, entries in which that
-    differs from its view; rows that this batch brings to logs, posted and deliveries; 1 + the step record
-    with which it publishes a keyframe in this batch; since when it is stopped, or NOT_STOPPED; messages it
-    has refused; the highest number of an envelope it has sent; how far its clock was ahead in its last step;
-    whether the scenario has it lie."""
+    participants: npt.NDArray[Any]
+    """(n,) of PARTICIPANT."""
     poses_m: npt.NDArray[np.float64]
     """(n, 2) world frame."""
     views: npt.NDArray[np.int64]
@@ -63,26 +79,24 @@ class CheckerState(NamedTuple):
     """(n, N) the same, rebuilt from what each has published."""
     consumed: npt.NDArray[np.int64]
     """(N,) units shipped by all."""
-    shipped: npt.NDArray[np.int64]
-    """(ids, 2): entries of each log, points shipped."""
-    logs: npt.NDArray[np.int64]
-    """(ids, rows, 2): sample and units of each entry that an incarnation has consumed."""
-    posted: npt.NDArray[np.int64]
-    """(n, rows, 2): sequence and target of each envelope that a participant has sent, by rising sequence."""
-    deliveries: npt.NDArray[np.int64]
-    """(n, rows, 4): source, sequence, due_ns of each delivery under way to a participant; whether it was
-    handed over with the step request that is open."""
+    shipped: npt.NDArray[Any]
+    """(ids,) of LOG."""
+    logs: npt.NDArray[Any]
+    """(ids, rows) of ENTRY: what an incarnation has consumed."""
+    posted: npt.NDArray[Any]
+    """(n, rows) of RUN: the envelopes that a participant has sent, by rising number. Of those that are too old for any
+    fault to deliver the target is UNKNOWN_PLACE."""
+    deliveries: npt.NDArray[Any]
+    """(n, rows) of DELIVERY: what is under way to a participant."""
     delivery_slots: npt.NDArray[np.int64]
     """(n, 2 rows): 1 + the row of each delivery under way, at the first free slot from the hash of its source and
     sequence on, or 0; see `delivery_index.py`."""
-    forged: npt.NDArray[np.int64]
-    """(1, rows, 3): source, sequence, target of the envelopes that faults have put on the air."""
+    forged: npt.NDArray[Any]
+    """(1, rows) of FORGED: the envelopes that faults have put on the air."""
     version_vector: npt.NDArray[np.int64]
     """(n, ids) the log lengths in the last message of each."""
-    violations: npt.NDArray[np.int64]
-    """(rows, 5): kind of the violation, step record or delivery decision, item of it, two numbers."""
-    lengths_m: npt.NDArray[np.float64]
-    """(rows, 2): two lengths for the text of the violation."""
+    violations: npt.NDArray[Any]
+    """(rows,) of VIOLATION."""
     counts: npt.NDArray[np.int64]
     """(3,): violations and keyframes in this batch; rows used of forged."""
     samples_m: npt.NDArray[np.float64]
@@ -98,24 +112,23 @@ class CheckerState(NamedTuple):
         poses_m = np.zeros((count, 2))
         poses_m[-1] = scenario.supervisor_m
         poses_m[: scenario.robots.count] = setup.starts_m
-        participants = np.zeros((count, _PARTICIPANT_COLUMNS), dtype=np.int64)
-        participants[:, INCARNATION_ID] = np.arange(count)
-        participants[:, STOPPED_NS] = NOT_STOPPED
+        participants = np.zeros(count, dtype=PARTICIPANT)
+        participants["incarnation_id"] = np.arange(count)
+        participants["stopped_ns"] = NOT_STOPPED
         return cls(
             participants,
             poses_m,
             views=np.full((count, samples), opening.units.sample, dtype=np.int64),
             published=np.zeros((count, samples), dtype=np.int64),
             consumed=np.zeros(samples, dtype=np.int64),
-            shipped=np.zeros((count, 2), dtype=np.int64),
-            logs=np.zeros((count, 256, 2), dtype=np.int64),
-            posted=np.zeros((count, 256, 2), dtype=np.int64),
-            deliveries=np.zeros((count, 64, 4), dtype=np.int64),
+            shipped=np.zeros(count, dtype=LOG),
+            logs=np.zeros((count, 64), dtype=ENTRY),
+            posted=np.zeros((count, 64), dtype=RUN),
+            deliveries=np.zeros((count, 64), dtype=DELIVERY),
             delivery_slots=np.zeros((count, 128), dtype=np.int64),
-            forged=np.zeros((1, 64, 3), dtype=np.int64),
+            forged=np.zeros((1, 64), dtype=FORGED),
             version_vector=np.zeros((count, count), dtype=np.int64),
-            violations=np.zeros((VIOLATIONS_MAX, 5), dtype=np.int64),
-            lengths_m=np.zeros((VIOLATIONS_MAX, 2)),
+            violations=np.zeros(VIOLATIONS_MAX, dtype=VIOLATION),
             counts=np.zeros(3, dtype=np.int64),
             samples_m=setup.samples_m.copy(),
             by_x=np.argsort(setup.samples_m[:, 0]),
@@ -124,22 +137,42 @@ class CheckerState(NamedTuple):
     def with_incarnations(self, more: int) -> "CheckerState":
         """The same with room for so many more incarnation ids."""
         return self._replace(
-            shipped=np.pad(self.shipped, ((0, more), (0, 0))),
-            logs=np.pad(self.logs, ((0, more), (0, 0), (0, 0))),
-            version_vector=np.pad(self.version_vector, ((0, 0), (0, more))),
+            shipped=_longer(self.shipped, more, axis=0),
+            logs=_longer(self.logs, more, axis=0),
+            version_vector=_longer(self.version_vector, more, axis=1),
         )
 
-    def lengthened(self, missing: int) -> "CheckerState":
-        """The same with twice the room where `missing_capacity` found too little."""
+    def lengthened(self, missing: int, posted_max: int) -> "CheckerState":
+        """The same with more room where `missing_capacity` found too little.
+
+        posted_max: rows of posted that are enough for every envelope that may still be delivered.
+        """
         name = _GROWING[missing]
         rows = getattr(self, name)
-        longer = self._replace(**{name: np.concatenate((rows, np.zeros_like(rows)), axis=1)})
+        if missing == _NO_POSTED and rows.shape[1] >= posted_max and self._forget_old():
+            return self
+        longer = self._replace(**{name: _longer(rows, rows.shape[1], axis=1)})
         if missing == _NO_DELIVERIES:
             slots = np.concatenate((self.delivery_slots, self.delivery_slots), axis=1)
-            for who, under_way in enumerate(self.participants[:, UNDER_WAY].tolist()):
+            for who, under_way in enumerate(self.participants["under_way"].tolist()):
                 index_deliveries(longer.deliveries[who], slots[who], under_way)
             longer = longer._replace(delivery_slots=slots)
         return longer
+
+    def _forget_old(self) -> bool:
+        """Join the older half of full rows of posted, without their targets; whether that has made room."""
+        joined = [
+            join_old_runs(self.posted, self.participants, who)
+            for who in range(self.posted.shape[0])
+        ]
+        return any(joined)
+
+
+def _longer(table: npt.NDArray[Any], more: int, axis: int) -> npt.NDArray[Any]:
+    """A table with so many more rows of zeros."""
+    shape = list(table.shape)
+    shape[axis] = more
+    return np.concatenate((table, np.zeros(shape, dtype=table.dtype)), axis=axis)
 
 
 class Limits(NamedTuple):
@@ -188,14 +221,18 @@ class Limits(NamedTuple):
         )
 
 
+def posted_max(scenario: Scenario) -> int:
+    """Rows of posted that are enough for every envelope that may still be delivered.
+
+    That is one of this moment, unless a fault replays old ones.
+    """
+    replays = any(isinstance(fault, Replay) for fault in scenario.faults)
+    return 1 << 62 if replays else _POSTED_MAX
+
+
 def has_ledger(scenario: Scenario) -> bool:
     """Whether spending is replicated entry by entry."""
     return scenario.merge == "ledger" and not scenario.mapping
-
-
-def arguments(state: CheckerState, limits: Limits, links: LinkTable) -> tuple[Any, ...]:
-    """The arguments of the compiled pass behind a batch: a NamedTuple of arrays costs much at the border to Python."""
-    return (*state, *limits, *links)
 
 
 @kernel
@@ -207,34 +244,78 @@ def note_violation(
     state.counts[NOTED] += 1
     if at < state.violations.shape[0]:
         noted = state.violations[at]
-        noted[0], noted[1], noted[2], noted[3], noted[4] = kind, row, item, a, b
-        state.lengths_m[at, 0], state.lengths_m[at, 1] = x_m, y_m
+        noted.kind, noted.row, noted.item, noted.a, noted.b = kind, row, item, a, b
+        noted.x_m, noted.y_m = x_m, y_m
 
 
 @kernel
 def missing_capacity(state: CheckerState, columns: ColumnarBatch) -> int:
     """Which array has no room for this batch behind the rows it holds, or 0."""
     participants = state.participants
-    participants[:, _COMING : KEYFRAME + 1] = 0
+    for who in range(participants.shape[0]):
+        participant = participants[who]
+        participant.entries_coming = participant.posted_coming = 0
+        participant.deliveries_coming = participant.keyframe = 0
     for row in range(columns.sizes[of.STEP_RECORDS]):
         step_record = columns.step_records[row]
-        if step_record[of.PLACE] >= 0 and step_record[of.PRESENT]:
-            participants[step_record[of.PLACE], _COMING] += max(0, step_record[of.SPENT_COUNT])
+        if step_record.place >= 0 and step_record.present:
+            participants[step_record.place].entries_coming += max(0, step_record.spent_count)
     for row in range(columns.sizes[of.ALL_SENT]):
-        if columns.sent[row, of.SOURCE] >= 0:
-            participants[columns.sent[row, of.SOURCE], _COMING + 1] += 1
+        if columns.sent[row].source >= 0:
+            participants[columns.sent[row].source].posted_coming += _RUNS_MAX
     for row in range(columns.sizes[of.DECISIONS]):
-        if columns.decisions[row, of.TARGET] >= 0:
-            participants[columns.decisions[row, of.TARGET], _COMING + 2] += 1
-    if state.counts[FORGED] + columns.sizes[of.INJECTED] > state.forged.shape[1]:
+        if columns.decisions[row].target >= 0:
+            participants[columns.decisions[row].target].deliveries_coming += 1
+    if state.counts[ALL_FORGED] + columns.sizes[of.INJECTED] > state.forged.shape[1]:
         return _NO_FORGED
     for who in range(participants.shape[0]):
         participant = participants[who]
-        entries = state.shipped[participant[INCARNATION_ID], ENTRIES]
-        if entries + participant[_COMING] > state.logs.shape[1]:
+        entries = state.shipped[participant.incarnation_id].entries
+        if entries + participant.entries_coming > state.logs.shape[1]:
             return _NO_LOGS
-        if participant[POSTED] + participant[_COMING + 1] > state.posted.shape[1]:
+        if participant.posted + participant.posted_coming > state.posted.shape[1]:
             return _NO_POSTED
-        if participant[UNDER_WAY] + participant[_COMING + 2] > state.deliveries.shape[1]:
+        if participant.under_way + participant.deliveries_coming > state.deliveries.shape[1]:
             return _NO_DELIVERIES
     return 0
+
+
+@kernel
+def join_old_runs(posted: np.ndarray, participants: np.ndarray, who: int) -> bool:
+    """Join the older half of a participant's full runs where their numbers are consecutive, without their targets.
+
+    Whether its row has more room now.
+    """
+    runs, count = posted[who], participants[who].posted
+    if 2 * count < runs.shape[0]:
+        return False
+    kept = 0
+    for row in range(count):
+        run = runs[row]
+        forgotten = row < count // 2
+        if forgotten and kept > 0 and runs[kept - 1].last + 1 == run.first:
+            runs[kept - 1].last = run.last
+            continue
+        runs[kept].first, runs[kept].last = run.first, run.last
+        runs[kept].target = of.UNKNOWN_PLACE if forgotten else run.target
+        kept += 1
+    participants[who].posted = kept
+    return kept < count
+
+
+@kernel
+def logs_leave(so_far: tuple[Any, ...], who: int, false: np.ndarray, left: np.ndarray) -> int:
+    """Take from `left` (N,) what a participant holds of all logs by its version vector, those that are false apart.
+
+    so_far: the fields of a CheckerState. false: (ids,). Returns the first incarnation id of whose log it holds more
+    than there is, and less than 0 if there is none.
+    """
+    state = CheckerState(*so_far)
+    for origin in range(state.shipped.shape[0]):
+        length = state.version_vector[who, origin]
+        if length > state.shipped[origin].entries:
+            return origin
+        for i in range(0 if false[origin] else length):
+            entry = state.logs[origin, i]
+            left[entry.sample] -= entry.units
+    return -1

@@ -4,6 +4,8 @@ A kernel notes a violation as a row of numbers (`state.note_violation`). It is p
 record at hand: a sound run, which nearly every run is, then costs little more than reading it.
 """
 
+from typing import Any
+
 from kantor_protocol.base.machine import ParticipantId
 from kantor_protocol.wire.messages import RefusedError, decode_gossip
 from kantor_worldsim.record.records import Batch, StepRecord
@@ -61,25 +63,27 @@ time in seconds."""
 
 
 def describe(
-    batch: Batch, names: tuple[ParticipantId, ...], noted: list[int], lengths_m: list[float]
+    batch: Batch, names: tuple[ParticipantId, ...], noted: tuple[Any, ...]
 ) -> tuple[str, ParticipantId, str]:
     """Rule, participant and text of a violation that a kernel has noted in a batch.
 
-    noted: a row of `CheckerState.violations`; lengths_m: the row beside it.
+    noted: a row of `CheckerState.violations`.
     """
-    kind, row, item, a, b = noted
+    kind, row, item, a, b, x_m, y_m = noted
     rule, text = TEXTS[kind]
     if kind in OF_DECISIONS:
         decision = batch.decisions[row]
         who, what = decision.target, f"{decision.source}#{decision.sequence}"
     else:
         who, what = batch.step_records[row].name, _subject(batch.step_records[row], names, noted)
-    return rule, who, text.format(what=what, item=item, a=a, b=b, x=lengths_m[0], y=lengths_m[1])
+    return rule, who, text.format(what=what, item=item, a=a, b=b, x=x_m, y=y_m)
 
 
-def _subject(step_record: StepRecord, names: tuple[ParticipantId, ...], noted: list[int]) -> str:
+def _subject(
+    step_record: StepRecord, names: tuple[ParticipantId, ...], noted: tuple[Any, ...]
+) -> str:
     """The envelope or origin that a violation in a step is about, or why the codec refuses a message."""
-    kind, _, item, a, b = noted
+    kind, _, item, a, b, *_ = noted
     if kind in (UNHEARD, OUT_OF_ORDER):
         source, sequence = step_record.heard[item]
         return f"{source}#{sequence}"

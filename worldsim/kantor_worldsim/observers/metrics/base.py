@@ -32,6 +32,7 @@ from kantor_worldsim.observers.metrics.tally import (
     NEVER,
     NOW,
     REFUSED_BEFORE,
+    STANDING,
     STEPS,
     VIOLATIONS,
     RunTally,
@@ -109,7 +110,7 @@ class RunMetrics:
         self._tally = RunTally(
             counts=np.zeros(11, dtype=np.int64),
             shipped=np.zeros(2),
-            standing=np.zeros((len(names), 5), dtype=np.int64),
+            standing=np.zeros(len(names), dtype=STANDING),
             shipped_by=np.zeros(robots),
             xy_m=setup.starts_m.copy(),
             views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
@@ -118,10 +119,10 @@ class RunMetrics:
         )
         self._tally.counts[FIRST_CONTACT] = NEVER
         self._tally.counts[LEAST] = self._units.whole
-        self._tally.standing[:, 2] = NEVER
+        self._tally.standing["finished_step"] = NEVER
         liars = liars_of(scenario.faults)
-        self._tally.standing[:, 4] = [name in liars for name in names]
-        self._arguments = (*self._tally, self._walk.xy_m, self._units.whole)
+        self._tally.standing["lies"] = [name in liars for name in names]
+        self._fields = tuple(self._tally)
         self._out_of_range = self._absences = 0
         self._fault_counts = Counter[tuple[int, str]]()
         self._restarts = 0
@@ -151,7 +152,7 @@ class RunMetrics:
                 self._fault_counts[stats.fault, counter] += getattr(stats, counter)
         if self._started_ns:
             self._note_rejoining(batch)
-        if follow(*decoded.columns, *self._arguments):
+        if follow(decoded.columns, self._fields, self._walk.xy_m, self._units.whole):
             self._note_finds(batch)
         self._attend(batch, decoded)
 
@@ -177,7 +178,7 @@ class RunMetrics:
             return
         self._incarnations[name] = process_event.incarnation
         place = self._scenario.roster.index(name)
-        begin_anew(*self._tally, place, self._units.sample)
+        begin_anew(self._fields, place, self._units.sample)
 
     def _note_rejoining(self, batch: Batch) -> None:
         for step_record in batch.step_records:
@@ -251,7 +252,7 @@ class RunMetrics:
             targets=self._targets,
             links=last.links,
             messages_per_s=rate,
-            robots_done=int(self._tally.standing[:, 1].sum()),
+            robots_done=int(self._tally.standing["rests"].sum()),
             **self._snapshot_of(),
         )
 
@@ -275,7 +276,7 @@ class RunMetrics:
         """
         scenario, counts = self._scenario, self._tally.counts.tolist()
         robots = scenario.robots.count
-        finished = self._tally.standing[:robots, 2].tolist()
+        finished = self._tally.standing["finished_step"][:robots].tolist()
         steps = max(1, counts[STEPS])
         assert self._opening is not None
         return Result(
@@ -300,7 +301,7 @@ class RunMetrics:
             deliveries=counts[DELIVERIES],
             drops=counts[DROPS],
             out_of_range_refused=self._out_of_range,
-            messages_refused=int(self._tally.standing[:, 0].sum())
+            messages_refused=int(self._tally.standing["refused"].sum())
             + counts[REFUSED_BEFORE]
             + refused_at_door,
             absences=self._absences,

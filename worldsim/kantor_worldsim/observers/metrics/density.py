@@ -5,12 +5,20 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from kantor_protocol.base.kernels import kernel, sum_kernel
 from kantor_worldsim.observers.metrics import wasserstein_exact
 from kantor_worldsim.observers.metrics.base import RunMetrics
 from kantor_worldsim.observers.metrics.result import Bounds
-from kantor_worldsim.observers.metrics.tally import DELIVERIES, DROPS, ENERGY, LEAST, UNITS
+from kantor_worldsim.observers.metrics.tally import (
+    DELIVERIES,
+    DROPS,
+    ENERGY,
+    LEAST,
+    UNITS,
+    RunTally,
+)
 from kantor_worldsim.observers.metrics.wasserstein_bounds import Auction, measure
 from kantor_worldsim.radio.channel import links
 from kantor_worldsim.record import columnar as of
@@ -62,18 +70,48 @@ def _rest(true_left: np.ndarray) -> int:
     return rest
 
 
+class Near(NamedTuple):
+    """The other robots in range of each."""
+
+    first: npt.NDArray[np.int64]
+    """(m + 1,): where those of a robot begin; the last is their number."""
+    robots: npt.NDArray[np.int64]
+    """(rows,), in rising order for each."""
+
+
+@kernel
+def _find_near(xy_m: np.ndarray, range_m: float, first: np.ndarray, near: np.ndarray) -> int:
+    """Fill the arrays of a Near; the number of rows, of which those beyond the room are only counted."""
+    count = 0
+    for i in range(xy_m.shape[0]):
+        first[i] = count
+        for k in range(xy_m.shape[0]):
+            dx_m, dy_m = xy_m[i, 0] - xy_m[k, 0], xy_m[i, 1] - xy_m[k, 1]
+            beyond = abs(dx_m) > range_m or abs(dy_m) > range_m  # most are, and need no root
+            if k != i and not beyond and math.hypot(dx_m, dy_m) <= range_m:
+                if count < near.shape[0]:
+                    near[count] = k
+                count += 1
+    first[xy_m.shape[0]] = count
+    return count
+
+
+class _Room(NamedTuple):
+    """Room for one block of B samples, which stays in the cache while all robots and views meet in it."""
+
+    xyu: npt.NDArray[np.float64]
+    """(3, B)"""
+    way_m: npt.NDArray[np.float64]
+    """(B,)"""
+
+
 @kernel
 def _sum_common(
-    xy_m: np.ndarray,
-    samples_m: np.ndarray,
-    common: np.ndarray,
-    first: int,
-    xyu: np.ndarray,
-    way_m: np.ndarray,
-    whole: int,
-    paper: np.ndarray,
-) -> None:
+    xy_m: np.ndarray, samples_m: np.ndarray, common: np.ndarray, first: int, room: _Room,
+    whole: int, paper: np.ndarray,
+) -> None:  # fmt: skip
     """Every robot ships the same weights: add the block that begins at `first`."""
+    xyu, way_m = room
     for j in range(way_m.shape[0]):
         xyu[0, j], xyu[1, j] = samples_m[first + j, 0], samples_m[first + j, 1]
         xyu[2, j] = max(common[first + j], 0)
@@ -84,75 +122,62 @@ def _sum_common(
 
 @kernel
 def _sum_views(
-    xy_m: np.ndarray,
-    samples_m: np.ndarray,
-    views: np.ndarray,
-    first: int,
-    near: np.ndarray,
-    xyu: np.ndarray,
-    way_m: np.ndarray,
-    whole: int,
-    paper: np.ndarray,
-    local: np.ndarray,
-) -> None:
+    tally: RunTally, samples_m: np.ndarray, first: int, near: Near, room: _Room, whole: int,
+    terms: np.ndarray,
+) -> None:  # fmt: skip
     """Every robot ships by its own view: add the block that begins at `first`."""
+    xyu, way_m, views = room.xyu, room.way_m, tally.views
     last = first + way_m.shape[0]
     for j in range(way_m.shape[0]):
         xyu[0, j], xyu[1, j] = samples_m[first + j, 0], samples_m[first + j, 1]
-    for i in range(xy_m.shape[0]):
-        measure(xyu[0], xyu[1], xy_m[i], way_m)
+    for i in range(tally.xy_m.shape[0]):
+        measure(xyu[0], xyu[1], tally.xy_m[i], way_m)
         own = _weighed(views[i, first:last], way_m) / whole
-        paper[i] += own
-        for k in range(xy_m.shape[0]):
-            if k == i:
-                local[k] += own
-            elif near[i, k]:
-                local[k] += _weighed(views[k, first:last], way_m) / whole
+        terms[0, i] += own
+        terms[1, i] += own
+        for at in range(near.first[i], near.first[i + 1]):
+            k = near.robots[at]
+            terms[1, k] += _weighed(views[k, first:last], way_m) / whole
 
 
 @kernel
 def _sum_up(
-    shipped_by: np.ndarray,
-    xy_m: np.ndarray,
-    views: np.ndarray,
-    least: np.ndarray,
-    true_left: np.ndarray,
+    so_far: tuple[Any, ...],
     samples_m: np.ndarray,
-    whole: int,
-    range_m: float,
     centralized: bool,
     ledger: bool,
-    near: np.ndarray,
-    xyu: np.ndarray,
-    way_m: np.ndarray,
-    paper: np.ndarray,
-    local: np.ndarray,
+    whole: int,
+    around: tuple[Any, ...],
+    block: tuple[Any, ...],
+    terms: np.ndarray,
 ) -> None:
     """The pending terms, mass times the distance to a robot, over all samples.
 
-    For each robot in paper: by the common weights or its own view; in local: eq. 12, what the robots in
-    its range have shipped and their terms by its own view. near: (m, m) room for the robots in range of each.
-    xyu (3, B), way_m (B,): room for one block of samples, which stays in the cache while all robots and
-    views meet in it.
+    For each robot in terms[0]: by the common weights or its own view; in terms[1]: eq. 12, what the robots in
+    its range have shipped and their terms by its own view. so_far, around, block: the fields of a RunTally, a Near
+    and a _Room.
     """
-    robots = xy_m.shape[0]
-    paper[:] = 0.0
-    local[:] = 0.0
-    for k in range(robots):
-        for i in range(robots):
-            apart_m = math.hypot(xy_m[i, 0] - xy_m[k, 0], xy_m[i, 1] - xy_m[k, 1])
-            near[i, k] = i == k or apart_m <= range_m
-            if near[i, k]:
-                local[k] += shipped_by[i]
+    tally, near, room = RunTally(*so_far), Near(*around), _Room(*block)
+    terms[:] = 0.0
+    for k in range(0 if centralized else tally.xy_m.shape[0]):
+        own = False
+        for at in range(near.first[k], near.first[k + 1]):
+            if not own and near.robots[at] > k:
+                terms[1, k] += tally.shipped_by[k]
+                own = True
+            terms[1, k] += tally.shipped_by[near.robots[at]]
+        if not own:
+            terms[1, k] += tally.shipped_by[k]
     first = 0
     while first < samples_m.shape[0]:
-        way = way_m[: min(way_m.shape[0], samples_m.shape[0] - first)]
+        size = min(room.way_m.shape[0], samples_m.shape[0] - first)
+        part = _Room(room.xyu, room.way_m[:size])
         if centralized:
-            common = true_left if ledger else least
-            _sum_common(xy_m, samples_m, common, first, xyu, way, whole, paper)
+            common = tally.true_left if ledger else tally.least
+            _sum_common(tally.xy_m, samples_m, common, first, part, whole, terms[0])
         else:
-            _sum_views(xy_m, samples_m, views, first, near, xyu, way, whole, paper, local)
-        first += way.shape[0]
+            _sum_views(tally, samples_m, first, near, part, whole, terms)
+        first += size
 
 
 class DensityMetrics(RunMetrics):
@@ -177,18 +202,8 @@ class DensityMetrics(RunMetrics):
         scenario = opening.scenario
         robots, samples = scenario.robots.count, self._walk.xy_m.shape[0]
         self._terms = np.zeros((2, robots))
-        self._to_sum_up = (
-            *self._tally[3:],
-            self._walk.xy_m,
-            self._units.whole,
-            scenario.radio.range_m,
-            scenario.centralized,
-            scenario.merge == "ledger",
-            np.zeros((robots, robots), dtype=np.bool_),
-            np.zeros((3, _BLOCK)),
-            np.zeros(_BLOCK),
-            *self._terms,
-        )
+        self._near = Near(np.zeros(robots + 1, dtype=np.int64), np.zeros(robots, dtype=np.int64))
+        self._room = tuple(_Room(np.zeros((3, _BLOCK)), np.zeros(_BLOCK)))
         size = samples * robots // _PAIRS_PER_ROW
         self._every = scenario.metrics.every or max(1, size)
         self._auction = Auction(robots, samples, self._every)
@@ -202,16 +217,12 @@ class DensityMetrics(RunMetrics):
         """Where a point was shipped, and how many units."""
         for row in range(columns.sizes[of.STEP_RECORDS]):
             step_record = columns.step_records[row]
-            if (
-                step_record[of.PLACE] >= 0
-                and step_record[of.SPENT_COUNT] > 0
-                and not step_record[of.UNSHIPPED]
-            ):
-                shipped = columns.pairs[
-                    step_record[of.SPENT] : step_record[of.SPENT] + step_record[of.SPENT_COUNT]
-                ]
+            place, count = int(step_record["place"]), int(step_record["spent_count"])
+            if place >= 0 and count > 0 and not step_record["unshipped"]:
+                first = int(step_record["spent"])
+                shipped = columns.pairs[first : first + count]
                 x, y = columns.poses_m[row, :2].tolist()
-                self._points.append((x, y, int(shipped[:, of.UNITS].sum())))
+                self._points.append((x, y, int(shipped["units"].sum())))
 
     def _row(self, *, last: bool = False) -> None:
         tally, scenario, whole = self._tally, self._scenario, self._units.whole
@@ -228,7 +239,7 @@ class DensityMetrics(RunMetrics):
         if tight is not None and scenario.centralized and scenario.merge == "ledger":
             pending = sum((self._auction.ways / whole).tolist())  # one pass for both
         else:
-            _sum_up(*self._to_sum_up)
+            self._sum_up()
             pending = sum(self._terms[0].tolist())
             local = [] if scenario.centralized else self._terms[1].tolist()
         self._add_row(
@@ -250,6 +261,28 @@ class DensityMetrics(RunMetrics):
                 w1_exact=self._exact() if self._exact_due(last=last) else None,
             )
         )
+
+    def _sum_up(self) -> None:
+        scenario = self._scenario
+        if not scenario.centralized:
+            self._find_near()
+        _sum_up(
+            self._fields,
+            self._walk.xy_m,
+            scenario.centralized,
+            scenario.merge == "ledger",
+            self._units.whole,
+            tuple(self._near),
+            self._room,
+            self._terms,
+        )
+
+    def _find_near(self) -> None:
+        xy_m, range_m = self._tally.xy_m, self._scenario.radio.range_m
+        rows = _find_near(xy_m, range_m, *self._near)
+        if rows > self._near.robots.shape[0]:
+            self._near = self._near._replace(robots=np.zeros(2 * rows, dtype=np.int64))
+            _find_near(xy_m, range_m, *self._near)
 
     def _exact_due(self, *, last: bool) -> bool:
         if self._exact_every is None:

@@ -101,7 +101,7 @@ class MapTracker:
             self.observable.ravel(),
             scenario.sensor.noise_m == 0.0,
         )
-        self._arguments = (*self.state, *self._ground)
+        self._arguments = (tuple(self.state), tuple(self._ground))
         self._sent_at_most = 0
         """No log has more entries that were sent: an entry takes a byte."""
         self.poses_m: list[tuple[float, float]] = [(x, y) for x, y in setup.starts_m.tolist()]
@@ -219,7 +219,7 @@ class MapTracker:
         if self._sent_at_most > self.state.as_sent.shape[1]:
             self._sent_at_most = int(self.state.written[:, AS_SENT].max()) + len(columns.payload)
             self._reserve("as_sent", self._sent_at_most)
-        follow(*columns, *self._arguments)
+        follow(decoded.columns, *self._arguments)
         for _, place, step_record in stepped:
             assert step_record.verdict is not None
             assert step_record.outputs is not None
@@ -263,7 +263,7 @@ class MapTracker:
             version_vector=np.pad(state.version_vector, ((0, 0), (0, more))),
             folded=np.pad(state.folded, ((0, 0), (0, more))),
         )
-        self._arguments = (*self.state, *self._ground)
+        self._arguments = (tuple(self.state), tuple(self._ground))
 
     def _take_scan(self, place: int, observation: Observation, row: int) -> None:
         """A robot takes in each new scan once; it learns of ranges when it has moved."""
@@ -315,7 +315,7 @@ class MapTracker:
         longer = np.zeros((rows.shape[0], 2 * needed), dtype=rows.dtype)
         longer[:, : rows.shape[1]] = rows
         self.state = self.state._replace(**{name: longer})
-        self._arguments = (*self.state, *self._ground)
+        self._arguments = (tuple(self.state), tuple(self._ground))
 
     def _note_moments(self) -> None:
         """Note the ticks at which the map was complete, and nearly all of it was known to a robot, to every robot."""

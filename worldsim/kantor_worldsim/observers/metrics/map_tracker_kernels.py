@@ -1,6 +1,6 @@
 """The compiled kernels of the map tracker: logs and scans, followed entry by entry."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -186,60 +186,33 @@ def _hold(state: MapTrackerState, ground: GroundTruth, who: int, entry: int) -> 
 
 @kernel
 def take_scan(
-    first_tick: np.ndarray,
-    frontier: np.ndarray,
-    held: np.ndarray,
-    scanned: np.ndarray,
-    as_sent: np.ndarray,
-    version_vector: np.ndarray,
-    folded: np.ndarray,
-    written: np.ndarray,
-    incarnation_ids: np.ndarray,
-    counts: np.ndarray,
-    stood: np.ndarray,
-    totals: np.ndarray,
-    violations: np.ndarray,
-    lies: np.ndarray,
-    truth: np.ndarray,
-    counting: np.ndarray,
-    exact: bool,
+    so_far: tuple[Any, ...],
+    true: tuple[Any, ...],
     entries_seen: np.ndarray,
     who: int,
     row: int,
     tick: int,
 ) -> None:
-    """A robot takes in a scan. entries_seen: (k,) its entries; `scanned` has room for them."""
-    state = MapTrackerState(
-        first_tick,
-        frontier,
-        held,
-        scanned,
-        as_sent,
-        version_vector,
-        folded,
-        written,
-        incarnation_ids,
-        counts,
-        stood,
-        totals,
-        violations,
-        lies,
-    )
-    ground = GroundTruth(truth, counting, exact)
-    cells, columns = first_tick.shape[0], truth.shape[1]
+    """A robot takes in a scan. entries_seen: (k,) its entries; `scanned` has room for them.
+
+    so_far, true: the fields of a MapTrackerState and a GroundTruth.
+    """
+    state, ground = MapTrackerState(*so_far), GroundTruth(*true)
+    truth, own = ground.truth, state.incarnation_ids[who]
+    cells, columns = state.first_tick.shape[0], truth.shape[1]
     for i in range(entries_seen.shape[0]):
         entry = entries_seen[i]
-        scanned[incarnation_ids[who], written[incarnation_ids[who], SCANNED]] = entry
-        written[incarnation_ids[who], SCANNED] += 1
+        state.scanned[own, state.written[own, SCANNED]] = entry
+        state.written[own, SCANNED] += 1
         _hold(state, ground, who, entry)
         if entry >= 2 * cells:
             continue
         cell = entry >> 1
-        if exact and (truth[cell // columns, cell % columns] == FREE) != (entry & 1 == 0):
+        if ground.exact and (truth[cell // columns, cell % columns] == FREE) != (entry & 1 == 0):
             _note(state, FALSE_CELL, row, 0, cell, entry & 1)
-        counts[who, OWN_CELLS] += held[who, cell] & OWN == 0 and counting[cell]
-        held[who, cell] |= OWN
-        if first_tick[cell] < 0:
+        state.counts[who, OWN_CELLS] += state.held[who, cell] & OWN == 0 and ground.counting[cell]
+        state.held[who, cell] |= OWN
+        if state.first_tick[cell] < 0:
             _stamp(state, ground, cell, tick)
 
 
@@ -345,7 +318,7 @@ def _follow_logs(
     end: int,
 ) -> None:
     """Follow the suffixes in payload[at:end], up to the first violation; of a liar all, and the first is noted."""
-    who, payload = columns.step_records[row, of.PLACE], columns.payload
+    who, payload = columns.step_records[row].place, columns.payload
     lied = False
     while at < end:
         origin, at = read_uint(payload, at)
@@ -370,11 +343,11 @@ def _follow_gossip(
     state: MapTrackerState, ground: GroundTruth, columns: ColumnarBatch, row: int, item: int
 ) -> None:
     """Follow an envelope: its logs, then its version vector, then what the sender holds by it."""
-    who = columns.step_records[row, of.PLACE]
-    sent = columns.sent[columns.step_records[row, of.SENT] + item]
+    who = columns.step_records[row].place
+    sent = columns.sent[columns.step_records[row].sent + item]
     payload = columns.payload
     _incarnation, version_vector, vector_end, at, end = of.parts_of_gossip(
-        payload, sent[of.BODY], sent[of.BODY_END]
+        payload, sent.body, sent.body_end
     )
     roster, robots = state.incarnation_ids.shape[0], state.held.shape[0]
     ids = count_incarnations(payload, version_vector, vector_end, roster, 1) if end >= 0 else 0
@@ -394,59 +367,17 @@ def _follow_gossip(
 
 
 @kernel
-def follow(
-    payload: bytes,
-    sizes: np.ndarray,
-    step_records: np.ndarray,
-    poses_m: np.ndarray,
-    heard: np.ndarray,
-    sent: np.ndarray,
-    decisions: np.ndarray,
-    pairs: np.ndarray,
-    injected: np.ndarray,
-    first_tick: np.ndarray,
-    frontier: np.ndarray,
-    held: np.ndarray,
-    scanned: np.ndarray,
-    as_sent: np.ndarray,
-    version_vector: np.ndarray,
-    folded: np.ndarray,
-    written: np.ndarray,
-    incarnation_ids: np.ndarray,
-    counts: np.ndarray,
-    stood: np.ndarray,
-    totals: np.ndarray,
-    violations: np.ndarray,
-    lies: np.ndarray,
-    truth: np.ndarray,
-    counting: np.ndarray,
-    exact: bool,
-) -> None:
-    """Follow what is sent in one batch; `as_sent` has room for it."""
-    state = MapTrackerState(
-        first_tick,
-        frontier,
-        held,
-        scanned,
-        as_sent,
-        version_vector,
-        folded,
-        written,
-        incarnation_ids,
-        counts,
-        stood,
-        totals,
-        violations,
-        lies,
-    )
-    ground = GroundTruth(truth, counting, exact)
-    columns = ColumnarBatch(
-        payload, sizes, step_records, poses_m, heard, sent, decisions, pairs, injected
-    )
-    for row in range(sizes[of.STEP_RECORDS]):
-        who = step_records[row, of.PLACE]
-        if who >= 0 and step_records[row, of.PRESENT]:
-            for item in range(step_records[row, of.SENT_COUNT]):
+def follow(batch: tuple[Any, ...], so_far: tuple[Any, ...], true: tuple[Any, ...]) -> None:
+    """Follow what is sent in one batch; `as_sent` has room for it.
+
+    batch, so_far, true: the fields of a ColumnarBatch, a MapTrackerState and a GroundTruth.
+    """
+    columns, state = ColumnarBatch(*batch), MapTrackerState(*so_far)
+    ground = GroundTruth(*true)
+    for row in range(columns.sizes[of.STEP_RECORDS]):
+        step_record = columns.step_records[row]
+        if step_record.place >= 0 and step_record.present:
+            for item in range(step_record.sent_count):
                 _follow_gossip(state, ground, columns, row, item)
 
 

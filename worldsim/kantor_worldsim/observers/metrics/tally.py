@@ -1,15 +1,16 @@
 """The tally of a run: counters that every batch changes, in one compiled pass."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from kantor_protocol.base.kernels import kernel
+from kantor_protocol.base.kernels import integers, kernel
 from kantor_protocol.base.machine import State
 from kantor_worldsim.radio.channel import DROPPED
 from kantor_worldsim.record import columnar as of
+from kantor_worldsim.record.columnar import ColumnarBatch
 
 # Slots of RunTally.counts and RunTally.shipped.
 VIOLATIONS, STEPS, BYTES_WEIGHTS, BYTES_TOTAL, ENERGY, UNITS = 0, 1, 2, 3, 4, 5
@@ -24,6 +25,11 @@ _EVER, NOW = 0, 1
 NEVER = -1
 
 
+STANDING = integers("refused", "rests", "finished_step", "skew_ns", "lies")
+"""Refused messages; whether it rests; step in which it saw no weight left, or NEVER; how far its clock was ahead in its
+last step; whether the scenario has it lie."""
+
+
 class RunTally(NamedTuple):
     """Counters over batches. n participants, of them m robots; N samples."""
 
@@ -33,9 +39,8 @@ class RunTally(NamedTuple):
     former incarnations refused."""
     shipped: npt.NDArray[np.float64]
     """(2,) mass times metres: since the start, in this tick."""
-    standing: npt.NDArray[np.int64]
-    """(n, 5): refused messages; whether it rests; step in which it saw no weight left, or NEVER; how far
-    its clock was ahead in its last step; whether the scenario has it lie."""
+    standing: npt.NDArray[Any]
+    """(n,) of STANDING."""
     shipped_by: npt.NDArray[np.float64]
     """(m,) since the start."""
     xy_m: npt.NDArray[np.float64]
@@ -63,23 +68,16 @@ def _lower(tally: RunTally, place: int, sample: int, left: int) -> None:
 
 
 @kernel
-def begin_anew(
-    counts: np.ndarray,
-    shipped: np.ndarray,
-    standing: np.ndarray,
-    shipped_by: np.ndarray,
-    xy_m: np.ndarray,
-    views: np.ndarray,
-    least: np.ndarray,
-    true_left: np.ndarray,
-    place: int,
-    units: int,
-) -> None:
-    """A new incarnation drives a body: its view is full, it does not rest, it has refused nothing."""
-    tally = RunTally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left)
-    counts[REFUSED_BEFORE] += standing[place, 0]
-    standing[place, 0], standing[place, 1], standing[place, 2] = 0, 0, NEVER
-    for sample in range(least.shape[0]):
+def begin_anew(so_far: tuple[Any, ...], place: int, units: int) -> None:
+    """A new incarnation drives a body: its view is full, it does not rest, it has refused nothing.
+
+    so_far: the fields of a RunTally.
+    """
+    tally = RunTally(*so_far)
+    standing = tally.standing[place]
+    tally.counts[REFUSED_BEFORE] += standing.refused
+    standing.refused, standing.rests, standing.finished_step = 0, 0, NEVER
+    for sample in range(tally.least.shape[0]):
         _lower(tally, place, sample, units)
 
 
@@ -99,67 +97,50 @@ def _ship(
 
 @kernel
 def follow(
-    _payload: bytes,
-    sizes: np.ndarray,
-    step_records: np.ndarray,
-    poses_m: np.ndarray,
-    _heard: np.ndarray,
-    _sent: np.ndarray,
-    decisions: np.ndarray,
-    pairs: np.ndarray,
-    _injected: np.ndarray,
-    counts: np.ndarray,
-    shipped: np.ndarray,
-    standing: np.ndarray,
-    shipped_by: np.ndarray,
-    xy_m: np.ndarray,
-    views: np.ndarray,
-    least: np.ndarray,
-    true_left: np.ndarray,
-    samples_m: np.ndarray,
-    whole: int,
+    batch: tuple[Any, ...], so_far: tuple[Any, ...], samples_m: np.ndarray, whole: int
 ) -> int:
-    """Count one batch, see ColumnarBatch and RunTally; the number of targets found in it.
+    """Count one batch; the number of targets found in it.
 
-    samples_m: (N, 2) as they are now.
+    batch, so_far: the fields of a ColumnarBatch and a RunTally. samples_m: (N, 2) as they are now.
     """
-    tally = RunTally(counts, shipped, standing, shipped_by, xy_m, views, least, true_left)
+    columns, tally = ColumnarBatch(*batch), RunTally(*so_far)
+    counts, pairs = tally.counts, columns.pairs
     finds = 0
-    for row in range(sizes[of.DECISIONS]):
-        counts[DROPS if decisions[row, of.DUE_NS] == DROPPED else DELIVERIES] += 1
-    for row in range(sizes[of.STEP_RECORDS]):
-        step_record = step_records[row]
-        place = step_record[of.PLACE]
-        if place < 0 or not step_record[of.PRESENT]:
+    for row in range(columns.sizes[of.DECISIONS]):
+        counts[DROPS if columns.decisions[row].due_ns == DROPPED else DELIVERIES] += 1
+    for row in range(columns.sizes[of.STEP_RECORDS]):
+        step_record = columns.step_records[row]
+        place = step_record.place
+        if place < 0 or not step_record.present:
             continue
-        counts[VIOLATIONS] += step_record[of.VIOLATIONS]
-        if step_record[of.TOO_FAST] > 0 and (
-            standing[place, 4] or step_record[of.SKEW_NS] > standing[place, 3]
+        standing = tally.standing[place]
+        counts[VIOLATIONS] += step_record.violations
+        if step_record.too_fast > 0 and (
+            standing.lies or step_record.skew_ns > standing.skew_ns
         ):  # as in the rule `ruling` of the checker
             counts[VIOLATIONS] -= 1
-        standing[place, 3] = step_record[of.SKEW_NS]
-        standing[place, 0] = step_record[of.REFUSED]
+        standing.skew_ns = step_record.skew_ns
+        standing.refused = step_record.refused
         for i in range(
-            step_record[of.LOWERED], step_record[of.LOWERED] + max(0, step_record[of.LOWERED_COUNT])
+            step_record.lowered, step_record.lowered + max(0, step_record.lowered_count)
         ):
-            _lower(tally, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS])
-        if place >= xy_m.shape[0]:  # the supervisor
+            _lower(tally, place, pairs[i].sample, pairs[i].units)
+        if place >= tally.xy_m.shape[0]:  # the supervisor
             continue
-        xy_m[place, 0], xy_m[place, 1] = poses_m[row, 0], poses_m[row, 1]
+        tally.xy_m[place, 0] = columns.poses_m[row, 0]
+        tally.xy_m[place, 1] = columns.poses_m[row, 1]
         counts[STEPS] += 1
-        counts[BYTES_WEIGHTS] += step_record[of.WEIGHTS_BYTES]
-        counts[BYTES_TOTAL] += step_record[of.WEIGHTS_BYTES] + step_record[of.BODY_BYTES]
-        finds += step_record[of.FINDS]
-        if step_record[of.HEARD_COUNT] > 0 and counts[FIRST_CONTACT] == NEVER:
-            counts[FIRST_CONTACT] = step_record[of.STEP]
-        if step_record[of.STATE] != State.EXPLORING.value:
-            standing[place, 1] = 1
-        if step_record[of.STATE] == State.FINISHED.value and standing[place, 2] == NEVER:
-            standing[place, 2] = step_record[of.STEP]
-        if step_record[of.SPENT_COUNT] > 0 and not step_record[of.UNSHIPPED]:
+        counts[BYTES_WEIGHTS] += step_record.weights_bytes
+        counts[BYTES_TOTAL] += step_record.weights_bytes + step_record.body_bytes
+        finds += step_record.finds
+        if step_record.heard_count > 0 and counts[FIRST_CONTACT] == NEVER:
+            counts[FIRST_CONTACT] = step_record.step
+        if step_record.state != State.EXPLORING.value:
+            standing.rests = 1
+        if step_record.state == State.FINISHED.value and standing.finished_step == NEVER:
+            standing.finished_step = step_record.step
+        if step_record.spent_count > 0 and not step_record.unshipped:
             counts[ENERGY] += 1
-            for i in range(
-                step_record[of.SPENT], step_record[of.SPENT] + step_record[of.SPENT_COUNT]
-            ):
-                _ship(tally, samples_m, place, pairs[i, of.SAMPLE], pairs[i, of.UNITS], whole)
+            for i in range(step_record.spent, step_record.spent + step_record.spent_count):
+                _ship(tally, samples_m, place, pairs[i].sample, pairs[i].units, whole)
     return finds

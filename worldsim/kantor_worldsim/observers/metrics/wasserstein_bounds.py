@@ -8,6 +8,7 @@ the excess. One round for every row keeps them close to the best, as robots move
 """
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +59,19 @@ def _compare(
         best[j] = robot if nearer else best[j]
 
 
+class _Room(NamedTuple):
+    """Room for one block of B samples and n robots."""
+
+    xyu: npt.NDArray[np.float64]
+    """(3, B)"""
+    least_m: npt.NDArray[np.float64]
+    """(B,)"""
+    best: npt.NDArray[np.int64]
+    """(B,)"""
+    block_m: npt.NDArray[np.float64]
+    """(n, B)"""
+
+
 @kernel
 def _bid(
     xy_m: np.ndarray,
@@ -66,17 +80,14 @@ def _bid(
     prices_m: np.ndarray,
     loads: np.ndarray,
     ways: np.ndarray,
-    xyu: np.ndarray,
-    least_m: np.ndarray,
-    best: np.ndarray,
-    block_m: np.ndarray,
+    room: tuple[Any, ...],
 ) -> None:
     """Let every sample with mass left choose its robot.
 
     Fills loads (n,), the units that chose a robot, and ways (n, n): ways[k, q] is units times distance to
-    robot k, of the samples that chose q. xyu (3, B), least_m, best (B,), block_m (n, B): room for one
-    block of samples.
+    robot k, of the samples that chose q. room: the fields of a _Room.
     """
+    xyu, least_m, best, block_m = room
     loads[:] = 0.0
     ways[:] = 0.0
     first = 0
@@ -128,12 +139,13 @@ class Auction:
         self._prices_m = np.zeros(robots)
         self._loads = np.zeros(robots)
         self._ways = np.zeros((robots, robots))
-        self._room = (
-            np.zeros((3, _BLOCK)),
-            np.zeros(_BLOCK),
-            np.zeros(_BLOCK, dtype=np.int64),
-            np.zeros((robots, _BLOCK)),
+        room = _Room(
+            xyu=np.zeros((3, _BLOCK)),
+            least_m=np.zeros(_BLOCK),
+            best=np.zeros(_BLOCK, dtype=np.int64),
+            block_m=np.zeros((robots, _BLOCK)),
         )
+        self._room = tuple(room)
         affordable = max(1, _PAIRS // (robots * samples))
         self._rounds = min(_ROUNDS_FIRST, affordable)
         self._rounds_later = min(every, _ROUNDS_FIRST, affordable)
@@ -153,7 +165,7 @@ class Auction:
         """Units times metres to ship `left` (N,) from the robots (n, 2) to the samples (N, 2)."""
         cost = math.inf
         for _ in range(self._rounds):
-            _bid(xy_m, robots_m, left, self._prices_m, self._loads, self._ways, *self._room)
+            _bid(xy_m, robots_m, left, self._prices_m, self._loads, self._ways, self._room)
             cost = min(cost, _settle(self._loads, self._ways, self._prices_m))
         self._rounds = self._rounds_later
         return cost
