@@ -46,7 +46,7 @@ def record(content: bytes) -> bool:
 def batch_tables(_folder: Path) -> Decode:
     """The kernel that fills a decoder's tables, on any bytes and with too few rows."""
     tables = columnar.ColumnarDecoder()
-    tables._make_room(64)
+    tables._make_room(64, 64)
     sizes = tables._tables[0]
 
     def read(content: bytes) -> bool:

@@ -88,6 +88,7 @@ class Recording:
         self._monotonic = monotonic
         self._started = monotonic()
         self.metrics = metrics_of(scenario, exact_every, self._distribute)
+        self.metrics.keeps_rows = folder is None  # otherwise they are in its files
         tracker = self.metrics.map_tracker if isinstance(self.metrics, MapMetrics) else None
         self.checker = Checker(tracker, virtual=exchange != "wall")
         self._table = self._open_folder(folder, exact_every, speed, past)

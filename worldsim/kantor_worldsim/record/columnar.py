@@ -542,7 +542,7 @@ class ColumnarDecoder:
     def __init__(self) -> None:
         self._bounds = (0, UNKNOWN_PLACE, 0)
         """Number of robots, index of the supervisor, number of samples."""
-        self._make_room(1 << 10)
+        self._make_room(1 << 10, 1)
 
     def decode(self, record: Record, payload: bytes = b"") -> DecodedRecord:
         """The record's bytes and, for a batch, its columns.
@@ -551,23 +551,25 @@ class ColumnarDecoder:
         """
         payload = payload or encode_record(record)
         if isinstance(record, Batch):
+            if len(record.step_records) > self._steps:
+                self._make_room(self._rows, len(record.step_records))
             while _read_batch(payload, self._tables, self._pose_bits, *self._bounds) < 0:
                 assert self._rows <= len(payload), "what msgspec has encoded can be read"
-                self._make_room(2 * self._rows)
+                self._make_room(2 * self._rows, self._steps)
         elif isinstance(record, Opening):
             scenario = record.scenario
             supervisor = scenario.robots.count if scenario.centralized else UNKNOWN_PLACE
             self._bounds = (scenario.robots.count, supervisor, record.samples_m.shape[0])
         return DecodedRecord(record, payload, (payload, *self._tables))
 
-    def _make_room(self, rows: int) -> None:
-        """Allocate arrays of this number of rows; none needs more than its payload has bytes."""
-        self._rows = rows
-        poses_m = np.zeros((rows, 4))
+    def _make_room(self, rows: int, steps: int) -> None:
+        """Allocate tables of so many rows, those of step records apart; none needs more than its payload has bytes."""
+        self._rows, self._steps = rows, steps
+        poses_m = np.zeros((steps, 4))
         self._pose_bits = poses_m.view(np.int64)
         self._tables = (
             np.zeros(6, dtype=np.int64),
-            np.zeros(rows, dtype=STEP_RECORD),
+            np.zeros(steps, dtype=STEP_RECORD),
             poses_m,
             *(np.zeros(rows, dtype=row) for row in (REFERENCE, ENVELOPE, DECISION, PAIR, ENVELOPE)),
         )

@@ -19,6 +19,7 @@ judged, and what the others hold of them does not count: a liar may show everybo
 
 import math
 from collections.abc import Callable, Iterator
+from heapq import heappop, heappush
 from itertools import product
 from typing import NamedTuple
 
@@ -145,7 +146,7 @@ class LivenessChecker:
         }
         self._changed_ns = 0
         self._late_ns: list[int] = []
-        """When messages arrive that a fault has held up: they may still change what participants hold."""
+        """When messages are still to arrive that a fault has held up, as a heap: they may change what participants hold."""
         self._way_ns = _way_ns(scenario)
         self._spent: dict[int, list[bytes]] = {}
         """The packed spending of each incarnation id."""
@@ -210,7 +211,14 @@ class LivenessChecker:
 
     def _note_late(self, batch: Batch) -> None:
         on_time_ns = batch.now_ns + self._way_ns
-        self._late_ns += [each.due_ns for each in batch.decisions if each.due_ns > on_time_ns]
+        for decision in batch.decisions:
+            if decision.due_ns > on_time_ns:
+                heappush(self._late_ns, decision.due_ns)
+        self._note_arrived(batch.now_ns)
+
+    def _note_arrived(self, now_ns: int) -> None:
+        while self._late_ns and self._late_ns[0] <= now_ns:
+            self._changed_ns = max(self._changed_ns, heappop(self._late_ns))
 
     def _check_contact(
         self, state: _Participant, step_record: StepRecord, outputs: Outputs
@@ -258,8 +266,7 @@ class LivenessChecker:
             self.judged.add("L2")
             if ending.reason == "limit" and self._is_open:
                 self._report("L2", ending.now_ns, "record", "the mission came to no end")
-        arrived_ns = (due_ns for due_ns in self._late_ns if due_ns <= ending.now_ns)
-        self._changed_ns = max(self._changed_ns, *arrived_ns, 0)
+        self._note_arrived(ending.now_ns)
         if not self._has_calmed_down(ending.now_ns):
             return
         held = {

@@ -73,9 +73,9 @@ class CheckerState(NamedTuple):
     """(n,) of PARTICIPANT."""
     poses_m: npt.NDArray[np.float64]
     """(n, 2) world frame."""
-    views: npt.NDArray[np.int64]
-    """(n, N) the weight vector of each, in units."""
-    published: npt.NDArray[np.int64]
+    views: npt.NDArray[np.int32]
+    """(n, N) the weight vector of each, in units: no more than there are points of energy."""
+    published: npt.NDArray[np.int32]
     """(n, N) the same, rebuilt from what each has published."""
     consumed: npt.NDArray[np.int64]
     """(N,) units shipped by all."""
@@ -118,8 +118,8 @@ class CheckerState(NamedTuple):
         return cls(
             participants,
             poses_m,
-            views=np.full((count, samples), opening.units.sample, dtype=np.int64),
-            published=np.zeros((count, samples), dtype=np.int64),
+            views=np.full((count, samples), opening.units.sample, dtype=np.int32),
+            published=np.zeros((count, samples), dtype=np.int32),
             consumed=np.zeros(samples, dtype=np.int64),
             shipped=np.zeros(count, dtype=LOG),
             logs=np.zeros((count, 64), dtype=ENTRY),

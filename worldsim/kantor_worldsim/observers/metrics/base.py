@@ -43,6 +43,9 @@ from kantor_worldsim.record.columnar import DecodedRecord
 from kantor_worldsim.record.process_events import EVENTS, TAKE_OVER, ProcessEventKind
 from kantor_worldsim.record.records import Batch, Ending, Opening, ProcessEvent
 
+_ROWS_OF_RATE = 10
+"""Rows over which a rate is taken."""
+
 
 class Snapshot(NamedTuple):
     """The state of a run in a few numbers, cheap to get at any time."""
@@ -75,6 +78,8 @@ class RunMetrics:
         """on_row: called with each row when it is complete."""
         self._on_row = on_row
         self.rows: list[Any] = []
+        self.keeps_rows = True
+        """Whether all rows stay in memory, and not the first and the last ones alone."""
         self.finds: list[tuple[float, ParticipantId, int, float, float]] = []
         """(time, robot, target, x, y), world frame."""
         self._opening: Opening | None = None
@@ -113,7 +118,7 @@ class RunMetrics:
             standing=np.zeros(len(names), dtype=STANDING),
             shipped_by=np.zeros(robots),
             xy_m=setup.starts_m.copy(),
-            views=np.full((len(names), samples), self._units.sample, dtype=np.int64),
+            views=np.full((len(names), samples), float(self._units.sample)),
             least=np.full(samples, self._units.sample, dtype=np.int64),
             true_left=np.full(samples, self._units.sample, dtype=np.int64),
         )
@@ -218,6 +223,8 @@ class RunMetrics:
         """Follow a batch that has been counted."""
 
     def _add_row(self, row: Any) -> None:
+        if not self.keeps_rows and len(self.rows) > 2 * _ROWS_OF_RATE:
+            del self.rows[1:-_ROWS_OF_RATE]
         self.rows.append(row)
         self._on_row(row)
 
@@ -242,7 +249,7 @@ class RunMetrics:
         if not self.rows:
             return Snapshot(0, 0, 0, 0, 0.0, 0, 0.0, 0, 1.0)
         last = self.rows[-1]
-        before = self.rows[max(0, len(self.rows) - 11)]
+        before = self.rows[max(0, len(self.rows) - _ROWS_OF_RATE - 1)]
         elapsed_s = last.time_s - before.time_s
         rate = (last.deliveries - before.deliveries) / elapsed_s if elapsed_s > 0.0 else 0.0
         return Snapshot(

@@ -45,8 +45,8 @@ class RunTally(NamedTuple):
     """(m,) since the start."""
     xy_m: npt.NDArray[np.float64]
     """(m, 2) where robots are, world frame."""
-    views: npt.NDArray[np.int64]
-    """(n, N) the weight vector of each, in units."""
+    views: npt.NDArray[np.float64]
+    """(n, N) the weight vector of each, in units: whole numbers, of which bounds are sums of products with metres."""
     least: npt.NDArray[np.int64]
     """(N,) the least of all views."""
     true_left: npt.NDArray[np.int64]
@@ -56,13 +56,13 @@ class RunTally(NamedTuple):
 @kernel
 def _lower(tally: RunTally, place: int, sample: int, left: int) -> None:
     """Put an entry into a view. A record that is not sound may let it rise."""
-    before, least = tally.views[place, sample], tally.least[sample]
+    before, least = int(tally.views[place, sample]), tally.least[sample]
     tally.views[place, sample] = left
     lower = min(left, least)
     if left > before == least:
         lower = left
         for other in range(tally.views.shape[0]):
-            lower = min(lower, tally.views[other, sample])
+            lower = min(lower, int(tally.views[other, sample]))
     tally.least[sample] = lower
     tally.counts[LEAST] += lower - least
 
