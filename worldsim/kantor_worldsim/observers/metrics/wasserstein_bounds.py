@@ -19,6 +19,8 @@ _RATE = 0.05
 """The step of a price, as a share of the mean distance, for an excess of one share."""
 _BLOCK = 512
 """Samples whose distances to all robots are taken at a time."""
+_TOGETHER = 8
+"""Robots whose sums are added to at a time."""
 _ROUNDS_FIRST = 50
 _PAIRS = 5_000_000
 """Robot-sample distances that one plan may cost."""
@@ -80,13 +82,14 @@ def _bid(
     prices_m: np.ndarray,
     loads: np.ndarray,
     ways: np.ndarray,
-    room: tuple[Any, ...],
+    fields: tuple[Any, ...],
 ) -> None:
     """Let every sample with mass left choose its robot.
 
     Fills loads (n,), the units that chose a robot, and ways (n, n): ways[k, q] is units times distance to
-    robot k, of the samples that chose q. room: the fields of a _Room.
+    robot k, of the samples that chose q. fields: those of a _Room.
     """
+    room = _Room(*fields)
     xyu, least_m, best, block_m = room
     loads[:] = 0.0
     ways[:] = 0.0
@@ -99,11 +102,19 @@ def _bid(
             way_m = block_m[k, :count]
             measure(xyu[0], xyu[1], robots_m[k], way_m)
             _compare(way_m, prices_m[k], k, least_m, best)
-        for j in range(count):
-            loads[best[j]] += xyu[2, j]
-        for k in range(robots_m.shape[0]):
-            for j in range(count):
-                ways[k, best[j]] += xyu[2, j] * block_m[k, j]
+        for k in range(0, robots_m.shape[0], _TOGETHER):
+            _add_ways(room, count, k, loads, ways)
+
+
+@kernel
+def _add_ways(room: _Room, count: int, first: int, loads: np.ndarray, ways: np.ndarray) -> None:
+    """Add the samples of a block to the sums of a few robots: each sum waits for its last term, so several go on at once."""
+    for j in range(count):
+        chosen, units = room.best[j], room.xyu[2, j]
+        if first == 0:
+            loads[chosen] += units
+        for k in range(first, min(first + _TOGETHER, ways.shape[0])):
+            ways[k, chosen] += units * room.block_m[k, j]
 
 
 @kernel
