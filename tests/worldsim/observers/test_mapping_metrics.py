@@ -369,7 +369,7 @@ def test_run_folder_has_rows_and_result(tmp_path: Path) -> None:
     stored = msgspec.json.decode((tmp_path / "result.json").read_bytes(), type=Result)
 
     assert head.split(",") == list(MapRow._fields)
-    assert len(lines) == len(recording.metrics.rows)
+    assert len(lines) == len(measured(explored()).rows)
     assert stored == result
     assert result.violations == 0
     assert result.map == map_of(measured(explored()))

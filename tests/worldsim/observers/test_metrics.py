@@ -1,6 +1,7 @@
 """Metrics of a run: the views, the bytes, the counts of the record, and the events of processes."""
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -319,3 +320,22 @@ def test_times_to_rejoin_are_quantiles_that_happened() -> None:
     assert hundred == Rejoining(count=100, median_s=0.51, p99_s=1.0, max_s=1.0)
     assert Rejoining.of([5_000_000]) == Rejoining(count=1, median_s=0.005, p99_s=0.005, max_s=0.005)
     assert Rejoining.of([]) is None
+
+
+# Rows.
+
+
+def test_a_run_with_files_keeps_few_rows_in_memory(tmp_path: Path) -> None:
+    """The first and the last ones, from which the summary and the rate of messages are the same as from all."""
+    scenario = mission("linger_s=6")
+    recordings = [Recording(scenario, 0, "in-process", folder) for folder in (tmp_path, None)]
+    play(scenario, 0, WorldSetup.of(scenario, 0), [each.observe for each in recordings])
+    for each in recordings:
+        each.finish()
+    few, all_of_them = (each.metrics for each in recordings)
+    lines = (tmp_path / "metrics.csv").read_text(encoding="utf-8").splitlines()
+
+    assert few.rows[0] == all_of_them.rows[0]
+    assert few.rows[-10:] == all_of_them.rows[-10:]
+    assert len(few.rows) <= 21 < len(all_of_them.rows) == len(lines) - 1
+    assert few.snapshot() == all_of_them.snapshot()

@@ -7,8 +7,6 @@ ended is written once more, with an index for readers that seek.
 
 import contextlib
 import hashlib
-import json
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -124,7 +122,9 @@ class Journal:
     def append_row(self, row: Any) -> None:
         """Write one row of metrics, for viewers; it is not part of the digest."""
         if self._file is not None:
-            self._write(METRICS_TOPIC, json.dumps(_finite(row._asdict())).encode())
+            self._write(
+                METRICS_TOPIC, msgspec.json.encode(row._asdict())
+            )  # what is not finite is null
 
     def replace(self) -> None:
         """Replace the old file, once all its records have been written again."""
@@ -171,14 +171,6 @@ class Journal:
                 OSError
             ):  # the buffered bytes did not fit: the file ends before them
                 file.close()
-
-
-def _finite(row: dict[str, Any]) -> dict[str, Any]:
-    """A row with None for numbers that JSON does not have."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in row.items()
-    }
 
 
 def read(path: Path) -> Iterator[tuple[bytes, Record]]:

@@ -11,6 +11,7 @@ from kantor_worldsim.observers.checkers.delivery_index import (
     next_slot,
     remove_row,
 )
+from kantor_worldsim.observers.checkers.state import DELIVERY
 from support.strategies import examples
 
 ROOM = 16
@@ -23,7 +24,7 @@ def found(deliveries: np.ndarray, slots: np.ndarray, source: int, sequence: int)
     rows, slot = [], first_slot(source, sequence, slots)
     while slots[slot] != 0:
         row = int(slots[slot]) - 1
-        rows += [row] if deliveries[row, :2].tolist() == [source, sequence] else []
+        rows += [row] if deliveries[row].tolist()[:2] == (source, sequence) else []
         slot = next_slot(slot, slots)
     return sorted(rows)
 
@@ -32,7 +33,7 @@ def found(deliveries: np.ndarray, slots: np.ndarray, source: int, sequence: int)
 @examples(300)
 def test_the_index_finds_what_a_search_finds(changes: list[tuple[bool, int, int]]) -> None:
     """After any additions and removals, and after it was made anew; copies are found, all of them."""
-    deliveries = np.zeros((ROOM, 4), dtype=np.int64)
+    deliveries = np.zeros(ROOM, dtype=DELIVERY)
     slots = np.zeros(2 * ROOM, dtype=np.int64)
     count = 0
     for adds, source, sequence in changes:
@@ -43,9 +44,9 @@ def test_the_index_finds_what_a_search_finds(changes: list[tuple[bool, int, int]
         elif not adds and count:
             count -= 1
             remove_row(deliveries, slots, sequence % (count + 1), count)
-        keys = {tuple(row) for row in deliveries[:count, :2].tolist()} | {(source, sequence)}
+        keys = {row[:2] for row in deliveries[:count].tolist()} | {(source, sequence)}
         for key in keys:
-            expected = [i for i in range(count) if tuple(deliveries[i, :2].tolist()) == key]
+            expected = [i for i in range(count) if deliveries[i].tolist()[:2] == key]
             assert found(deliveries, slots, *key) == expected
     again = np.zeros_like(slots)
     index_deliveries(deliveries, again, count)

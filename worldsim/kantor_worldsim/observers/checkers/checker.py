@@ -28,7 +28,6 @@ from kantor_worldsim.observers.checkers.state import (
     CheckerState,
     Limits,
     logs_leave,
-    posted_max,
 )
 from kantor_worldsim.observers.checkers.violations import (
     FOREIGN_LOG,
@@ -196,7 +195,6 @@ class Checker:
             clocks=bool(self._clocks),
             false_logs=self._liar_checker is not None and bool(self._liar_checker.false_logs),
         )
-        self._posted_max = posted_max(scenario)
         self._keep(CheckerState.of(opening))
         if self._liar_checker is not None:
             self._state.participants["lies"][self._liar_checker.liar_places] = 1
@@ -234,7 +232,7 @@ class Checker:
         self._links.move_to(batch.now_ns)
         noted = check_batch(decoded.columns, *self._arguments, batch.now_ns)
         while noted < 0:
-            self._keep(self._state.lengthened(noted, self._posted_max))
+            self._keep(self._state.lengthened(noted))
             noted = check_batch(decoded.columns, *self._arguments, batch.now_ns)
         if noted:
             self._report_noted(batch, self._state.counts.item(NOTED))

@@ -116,11 +116,11 @@ def post(state: CheckerState, columns: ColumnarBatch, row: int) -> None:
             if sequence <= participant.number and find_posted(state, source, sequence) >= 0:
                 note_violation(state, NUMBER_REUSED, row, 0, sequence, 0, 0.0, 0.0)
             participant.number = max(participant.number, sequence)
-            _insert_posted(state, source, sequence, columns.sent[sent].target)
+            insert_posted(state, source, sequence, columns.sent[sent].target)
 
 
 @kernel
-def _insert_posted(state: CheckerState, source: int, sequence: int, target: int) -> None:
+def insert_posted(state: CheckerState, source: int, sequence: int, target: int) -> None:
     """Add an envelope to the runs: at the end, unless its number is wrong; one that is there already is replaced."""
     runs, participant = state.posted[source], state.participants[source]
     at = _run_before(state, source, sequence)

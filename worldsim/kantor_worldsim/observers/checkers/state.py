@@ -6,7 +6,6 @@ import numpy as np
 import numpy.typing as npt
 
 from kantor_protocol.base.kernels import integers, kernel
-from kantor_protocol.scenario.faults.links import Replay
 from kantor_protocol.scenario.schema import Scenario
 from kantor_worldsim.observers.checkers.delivery_index import index_deliveries
 from kantor_worldsim.observers.checkers.violations import VIOLATIONS_MAX
@@ -54,8 +53,6 @@ NOTED, KEYFRAMES, ALL_FORGED = 0, 1, 2
 _RUNS_MAX = 3
 """Rows of posted that an envelope may need: one that is sent under a number in the middle of a run divides it."""
 
-_POSTED_MAX = 512
-
 _NO_LOGS, _NO_POSTED, _NO_DELIVERIES, _NO_FORGED = -1, -2, -3, -4
 
 _GROWING = {
@@ -84,8 +81,8 @@ class CheckerState(NamedTuple):
     logs: npt.NDArray[Any]
     """(ids, rows) of ENTRY: what an incarnation has consumed."""
     posted: npt.NDArray[Any]
-    """(n, rows) of RUN: the envelopes that a participant has sent, by rising number. Of those that are too old for any
-    fault to deliver the target is UNKNOWN_PLACE."""
+    """(n, rows) of RUN: the envelopes that a participant has sent, by rising number. Who sends to everybody, or to
+    the supervisor alone, needs one row for that as long as it does."""
     deliveries: npt.NDArray[Any]
     """(n, rows) of DELIVERY: what is under way to a participant."""
     delivery_slots: npt.NDArray[np.int64]
@@ -142,15 +139,10 @@ class CheckerState(NamedTuple):
             version_vector=_longer(self.version_vector, more, axis=1),
         )
 
-    def lengthened(self, missing: int, posted_max: int) -> "CheckerState":
-        """The same with more room where `missing_capacity` found too little.
-
-        posted_max: rows of posted that are enough for every envelope that may still be delivered.
-        """
+    def lengthened(self, missing: int) -> "CheckerState":
+        """The same with twice the room where `missing_capacity` found too little."""
         name = _GROWING[missing]
         rows = getattr(self, name)
-        if missing == _NO_POSTED and rows.shape[1] >= posted_max and self._forget_old():
-            return self
         longer = self._replace(**{name: _longer(rows, rows.shape[1], axis=1)})
         if missing == _NO_DELIVERIES:
             slots = np.concatenate((self.delivery_slots, self.delivery_slots), axis=1)
@@ -158,14 +150,6 @@ class CheckerState(NamedTuple):
                 index_deliveries(longer.deliveries[who], slots[who], under_way)
             longer = longer._replace(delivery_slots=slots)
         return longer
-
-    def _forget_old(self) -> bool:
-        """Join the older half of full rows of posted, without their targets; whether that has made room."""
-        joined = [
-            join_old_runs(self.posted, self.participants, who)
-            for who in range(self.posted.shape[0])
-        ]
-        return any(joined)
 
 
 def _longer(table: npt.NDArray[Any], more: int, axis: int) -> npt.NDArray[Any]:
@@ -221,15 +205,6 @@ class Limits(NamedTuple):
         )
 
 
-def posted_max(scenario: Scenario) -> int:
-    """Rows of posted that are enough for every envelope that may still be delivered.
-
-    That is one of this moment, unless a fault replays old ones.
-    """
-    replays = any(isinstance(fault, Replay) for fault in scenario.faults)
-    return 1 << 62 if replays else _POSTED_MAX
-
-
 def has_ledger(scenario: Scenario) -> bool:
     """Whether spending is replicated entry by entry."""
     return scenario.merge == "ledger" and not scenario.mapping
@@ -278,29 +253,6 @@ def missing_capacity(state: CheckerState, columns: ColumnarBatch) -> int:
         if participant.under_way + participant.deliveries_coming > state.deliveries.shape[1]:
             return _NO_DELIVERIES
     return 0
-
-
-@kernel
-def join_old_runs(posted: np.ndarray, participants: np.ndarray, who: int) -> bool:
-    """Join the older half of a participant's full runs where their numbers are consecutive, without their targets.
-
-    Whether its row has more room now.
-    """
-    runs, count = posted[who], participants[who].posted
-    if 2 * count < runs.shape[0]:
-        return False
-    kept = 0
-    for row in range(count):
-        run = runs[row]
-        forgotten = row < count // 2
-        if forgotten and kept > 0 and runs[kept - 1].last + 1 == run.first:
-            runs[kept - 1].last = run.last
-            continue
-        runs[kept].first, runs[kept].last = run.first, run.last
-        runs[kept].target = of.UNKNOWN_PLACE if forgotten else run.target
-        kept += 1
-    participants[who].posted = kept
-    return kept < count
 
 
 @kernel
