@@ -221,7 +221,7 @@ def _possible(
 
     target: an index, -1 for all, or an index that nobody has. by_place: after `sort_by_place`.
     """
-    participants = geometry.xy_m.shape[0]
+    participants: int = geometry.xy_m.shape[0]
     if target >= 0:
         around.near[0] = target
         return 1 if target < participants else 0

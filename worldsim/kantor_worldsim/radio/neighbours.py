@@ -63,7 +63,8 @@ def _cell(xy_m: np.ndarray, one: int, around: Neighbourhood) -> int:
     if not (math.isfinite(x) and math.isfinite(y)):
         return -1
     row = _cell_along(y, around.frame[_BOTTOM_M], around)
-    return row * around.side + _cell_along(x, around.frame[_LEFT_M], around)
+    cell: int = row * around.side + _cell_along(x, around.frame[_LEFT_M], around)
+    return cell
 
 
 @kernel
