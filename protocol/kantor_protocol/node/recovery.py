@@ -87,11 +87,13 @@ class RecoverableNode:
 
     def step(self, inputs: Inputs, /) -> Outputs:
         """Make the next step, written ahead, or repeat the last outputs. Raises OSError if it cannot be written."""
-        return self.step_encoded(encode(inputs))
+        return self._step(inputs, encode(inputs))
 
     def step_encoded(self, entry: bytes, /) -> Outputs:
         """`step`, of encoded Inputs."""
-        inputs = decode_inputs(entry)
+        return self._step(decode_inputs(entry), entry)
+
+    def _step(self, inputs: Inputs, entry: bytes) -> Outputs:
         if self._last_outputs is not None and inputs.observation.step < self.step_count:
             return self._last_outputs
         self._wal.append(entry)

@@ -30,8 +30,8 @@ Grants = Sequence[Grant]
 
 
 def robot(fleet: str, name: ParticipantId) -> Grants:
-    """The rights of a robot, or of the supervisor: to act for itself, and to learn which of its keys are observed."""
-    return (*_participants(fleet, (name,)), _awareness(fleet))
+    """The rights of a robot, or of the supervisor."""
+    return _participants(fleet, (name,))
 
 
 def observer(fleet: str) -> Grants:
@@ -54,8 +54,8 @@ def anyone(fleet: str) -> Grants:
 
 
 def site(fleet: str, members: Iterable[ParticipantId]) -> Grants:
-    """The rights of a site at the hub: to act for its robots, and to learn which keys have subscribers."""
-    return (*_participants(fleet, tuple(members)), _awareness(fleet))
+    """The rights of a site at the hub: to act for its robots."""
+    return _participants(fleet, tuple(members))
 
 
 def hub(fleet: str, members: Iterable[ParticipantId]) -> Grants:
@@ -91,14 +91,6 @@ def control(subjects: Iterable[tuple[str, dict[str, list[str]], Grants]]) -> dic
     }
 
 
-def _awareness(fleet: str) -> Grant:
-    """The right to learn which keys have subscribers.
-
-    That discloses nothing; without it neither a publisher nor a router passes on what is put there.
-    """
-    return Grant("egress", "declare_subscriber", (keys.everything(fleet),))
-
-
 def _participants(fleet: str, names: tuple[ParticipantId, ...]) -> Grants:
     written = (keys.tx, keys.pose, keys.weights)
     read = tuple(keys.rx(fleet, name) for name in names)
@@ -107,4 +99,7 @@ def _participants(fleet: str, names: tuple[ParticipantId, ...]) -> Grants:
         Grant("ingress", "declare_subscriber", read),
         Grant("egress", "put", read),
         Grant("ingress", "liveliness_token", tuple(keys.alive(fleet, name) for name in names)),
+        # That a key has a subscriber discloses nothing. Without this a router forwards nothing that is put on it, and
+        # a participant learns of nobody for whom to publish.
+        Grant("egress", "declare_subscriber", (keys.everything(fleet),)),
     )

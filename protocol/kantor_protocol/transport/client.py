@@ -2,6 +2,7 @@
 
 import contextlib
 import queue
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -28,19 +29,34 @@ class ParticipantSession:
         fleet, name = identity.fleet, identity.user
         self.nonce = nonce
         self._session = session
-        self._received: queue.SimpleQueue[bytes | BusError] = queue.SimpleQueue()
+        ring = zenoh.handlers.RingChannel(QUEUE_MAX)
+        subscriber = session.declare_subscriber(keys.rx(fleet, name), ring)
+        self._messages = subscriber.handler
+        self._fed: queue.SimpleQueue[bytes | BusError] | None = None
+        """What a thread has taken from the messages, so that one can wait for a limited time."""
         self._identity = identity
-        self._block = zenoh.CongestionControl.BLOCK
-        self._drop = zenoh.CongestionControl.DROP
-        self._tx = keys.tx(fleet, name)
-        # What a publisher puts does not leave this process while nobody observes it.
+        # What is put on the key of a declared publisher is not sent while nobody subscribes to it.
+        self._tx = {
+            blocking: session.declare_publisher(
+                keys.tx(fleet, name),
+                congestion_control=zenoh.CongestionControl.BLOCK
+                if blocking
+                else zenoh.CongestionControl.DROP,
+                express=True,
+            )
+            for blocking in (False, True)
+        }
         self._pose = session.declare_publisher(keys.pose(fleet, name))
         self._weights = session.declare_publisher(keys.weights(fleet, name))
         self._declared: list[Any] = [
-            session.declare_subscriber(keys.rx(fleet, name), self._on_message),
+            subscriber,
+            *self._tx.values(),
+            self._pose,
+            self._weights,
             session.liveliness().declare_token(keys.alive(fleet, name, nonce)),
         ]
         if isinstance(identity, Certificate):
+            self._feed()
             self._declared.append(
                 session.info.declare_transport_events_listener(self._on_transport)
             )
@@ -50,8 +66,11 @@ class ParticipantSession:
 
         Raises BusError if world-sim was started again and does not admit this process any more.
         """
+        if timeout_s is None and self._fed is None:
+            return self._messages.recv().payload.to_bytes()
+        fed = self._fed or self._feed()
         try:
-            message = self._received.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
+            message = fed.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
         except queue.Empty:
             return None
         if isinstance(message, BusError):
@@ -60,8 +79,7 @@ class ParticipantSession:
 
     def send(self, payload: bytes, *, blocking: bool) -> None:
         """Put a message on the own `tx`. blocking: wait while the queue is full, instead of dropping the message."""
-        congestion = self._block if blocking else self._drop
-        self._session.put(self._tx, payload, congestion_control=congestion, express=True)
+        self._tx[blocking].put(payload)
 
     def publish_pose(self, payload: bytes) -> None:
         """Publish the own pose for observers."""
@@ -75,20 +93,31 @@ class ParticipantSession:
         """Leave the bus."""
         close_session(self._session, self._declared)
 
-    def _on_message(self, sample: zenoh.Sample) -> None:
-        if self._received.qsize() < QUEUE_MAX:
-            self._received.put(sample.payload.to_bytes())
+    def _feed(self) -> queue.SimpleQueue[bytes | BusError]:
+        """From now on a thread takes the messages: whoever waits for them otherwise needs none, and one wake-up less."""
+        fed: queue.SimpleQueue[bytes | BusError] = queue.SimpleQueue()
+
+        def feed() -> None:
+            with contextlib.suppress(zenoh.ZError):  # the session was closed
+                for sample in self._messages:
+                    if fed.qsize() < QUEUE_MAX:
+                        fed.put(sample.payload.to_bytes())
+
+        threading.Thread(target=feed, daemon=True).start()
+        self._fed = fed
+        return fed
 
     def _on_transport(self, event: zenoh.TransportEvent) -> None:
         """Check membership after a reconnection: it may be to a world-sim with another member list."""
         assert isinstance(self._identity, Certificate)
+        assert self._fed is not None
         with contextlib.suppress(zenoh.ZError):  # it was closed meanwhile
             if event.kind != zenoh.SampleKind.PUT:
                 return
             if distrust := _distrust(self._session, self._identity):
-                self._received.put(BusError(distrust))
+                self._fed.put(BusError(distrust))
             elif reason := _reason_of_refusal(self._session, self._identity):
-                self._received.put(BusError(f"refuses {self._identity.user}: {reason}"))
+                self._fed.put(BusError(f"refuses {self._identity.user}: {reason}"))
 
 
 class ObserverSession:
