@@ -6,6 +6,9 @@ import re
 from pathlib import Path
 
 _SMAPS = Path("/proc/self/smaps")
+_STATM = Path("/proc/self/statm")
+_WORTH_PAGES = 8192
+"""Looking for pages takes as long as a hundred steps; with fewer that are backed by files it is not worth it."""
 _FROM_FILE = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) r-[x-]p .* /")
 _UNCHANGED = re.compile(r"^Anonymous: +0 kB$")
 _DONTNEED = 4
@@ -18,6 +21,8 @@ def release_file_pages() -> None:
     those that the loader has relocated, would not: they stay. Does nothing where there is no /proc.
     """
     with contextlib.suppress(OSError, AttributeError):
+        if int(_STATM.read_text(encoding="utf-8").split()[2]) < _WORTH_PAGES:
+            return
         madvise = ctypes.CDLL(None).madvise
         madvise.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
         mapping = None

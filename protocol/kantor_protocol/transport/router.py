@@ -119,6 +119,8 @@ class HubRouter(Router):
         config = zenoh_config.hub_config(identity, roster, users_file)
         self._fleet = fleet
         self._admitting = threading.Lock()
+        self._flooding: set[ParticipantId] = set()
+        """Participants that have exceeded their quota."""
         self._buckets = {name: TokenBucket(RateLimit.of(0.0)) for name in roster}
         try:
             self._session = open_session("router", config, listen=listen)
@@ -130,8 +132,6 @@ class HubRouter(Router):
         self._drop = zenoh.CongestionControl.DROP
         self._patient_from_s: dict[ParticipantId, float] = {}
         """Time from which on each participant that did not read is waited for again."""
-        self._flooding: set[ParticipantId] = set()
-        """Participants that have exceeded their quota."""
         self._publishers: dict[tuple[ParticipantId, bool], zenoh.Publisher] = {}
         self._senders = {keys.tx(fleet, name): name for name in roster}
         self._progress = keys.progress(fleet)

@@ -57,17 +57,29 @@ class LockstepExchange:
             missing = [name for name in inputs if name not in outputs]
             self._ask({name: inputs[name] for name in missing})
             waited_s = time.monotonic() - heard_s
-            if not any(self._is_awaited(name, waited_s) for name in missing):
+            awaited = {name for name in missing if self._is_awaited(name, waited_s)}
+            if not awaited:
                 break
-            report = lobby.next(_WAIT_S)
-            while report is not None:
-                self._take(report[0], report[1].outputs, inputs, outputs)
-                report = lobby.next(0.0)
+            self._gather(awaited, inputs, outputs)
         for name in inputs:
             if name not in outputs and lobby.is_expected(name):
                 self._go_on_without(name)
         lobby.forget_newcomers()
         return outputs
+
+    def _gather(
+        self,
+        awaited: set[ParticipantId],
+        inputs: Mapping[ParticipantId, Inputs],
+        outputs: dict[ParticipantId, Outputs],
+    ) -> None:
+        """Take reports until all that are awaited have come, something else happens, or _WAIT_S have passed."""
+        until_s = time.monotonic() + _WAIT_S
+        while awaited and (report := self._lobby.next(until_s - time.monotonic())) is not None:
+            name, made = report[0], report[1].outputs
+            self._take(name, made, inputs, outputs)
+            if name in outputs:
+                awaited.discard(name)
 
     def _go_on_without(self, name: ParticipantId) -> None:
         """Give up a participant that has left, and wait no more for one that is silent."""
