@@ -26,7 +26,6 @@ from tables import Table
 
 from kantor_agent.robots.density import DensityRobot
 from kantor_fleet.execution.fork_server import await_fork_server
-from kantor_fleet.processes.local import _LIGHT_RUNTIME
 from kantor_fleet.scenarios.catalog import find
 from kantor_fleet.security import authority
 from kantor_protocol.base.machine import Body, Envelope, Inputs, Pose
@@ -40,6 +39,7 @@ from kantor_protocol.transport import credentials
 from kantor_protocol.transport.client import ParticipantSession, participant_session
 from kantor_protocol.transport.endpoint import free_endpoint
 from kantor_protocol.transport.router import HubRouter, SiteRouter
+from kantor_protocol.transport.session import be_light
 from kantor_protocol.transport.zenoh_log import init_log
 from kantor_protocol.wire.messages import (
     VERSION,
@@ -352,7 +352,7 @@ def _be_site(connect: str, listen: str, place: Path, pipe: Connection) -> None:
 
 
 def _be_robots(names: Sequence[str], endpoint: str, place: Path, pipe: Connection) -> None:
-    os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
+    be_light()
     init_log()
     with ExitStack() as stack:
         robots = [stack.enter_context(_robot(name, endpoint, place)) for name in names]

@@ -7,7 +7,6 @@ callback only enqueues. Both are measured for the same number of seconds, one af
 """
 
 import json
-import os
 import queue
 import statistics
 import tempfile
@@ -24,10 +23,11 @@ import zenoh
 from tables import Table
 
 from kantor_fleet.execution.fork_server import await_fork_server
-from kantor_fleet.processes.local import _LIGHT_RUNTIME, FleetConfig, local_fleet, watch_progress
+from kantor_fleet.processes.local import FleetConfig, local_fleet, watch_progress
 from kantor_fleet.scenarios.catalog import find
 from kantor_protocol.scenario.schema import Scenario
 from kantor_protocol.transport.endpoint import free_endpoint
+from kantor_protocol.transport.session import be_light
 
 COUNTS = (5, 20, 100)
 COUNTS_QUICK = (5, 20)
@@ -177,7 +177,7 @@ def _be_hub(endpoint: str, count: int, seconds: float, send: Connection) -> None
 
 
 def _be_client(endpoint: str, number: int) -> None:
-    os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
+    be_light()
     turns: queue.SimpleQueue[bytes] = queue.SimpleQueue()
 
     def on_turn(sample: zenoh.Sample) -> None:

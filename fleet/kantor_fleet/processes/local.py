@@ -35,7 +35,7 @@ from kantor_protocol.transport.client import ObserverSession, observer_session
 from kantor_protocol.transport.credentials import Identity, Password, public_key
 from kantor_protocol.transport.endpoint import free_endpoint
 from kantor_protocol.transport.router import HubRouter
-from kantor_protocol.transport.session import LEASE_MS, LOCKSTEP_LEASE_MS, BusError
+from kantor_protocol.transport.session import LEASE_MS, LOCKSTEP_LEASE_MS, BusError, be_light
 from kantor_protocol.transport.zenoh_log import init_log
 from kantor_protocol.wire import keys
 from kantor_protocol.wire.messages import Progress, RefusedError, decode_progress
@@ -59,11 +59,6 @@ _SPARE_BYTES = 7
 """Bytes that a full disk still takes: less than an entry of a write-ahead log."""
 STATE = "state"
 """Folder of the write-ahead logs in a run folder."""
-# One worker serves all of Zenoh in a participant: fewer threads, fewer wake-ups.
-_LIGHT_RUNTIME = (
-    "(app: (worker_threads: 1), acc: (handover: app), tx: (handover: app), "
-    "rx: (handover: app), net: (handover: app))"
-)
 
 
 class FleetConfig(NamedTuple):
@@ -492,7 +487,7 @@ def _be_participant(
     from kantor_agent.process import run as run_agent  # noqa: PLC0415  the fork server has it
     from kantor_supervisor.process import run as run_supervisor  # noqa: PLC0415
 
-    os.environ.setdefault("ZENOH_RUNTIME", _LIGHT_RUNTIME)
+    be_light()
     write = log_to(log, identity.user)
     give_back = take_slot(slots) if slots else lambda: None
 

@@ -24,6 +24,7 @@ from kantor_protocol.transport.credentials import (
 )
 from kantor_protocol.transport.endpoint import await_endpoint, check_endpoint, is_tls
 from kantor_protocol.transport.router import HubRouter
+from kantor_protocol.transport.session import be_light
 from kantor_protocol.transport.zenoh_log import host_log, init_log
 from kantor_protocol.wire.attestations import Identities
 
@@ -317,6 +318,7 @@ def participate_standalone(
         await_endpoint(connect, connect_timeout_s)
     identity = credentials.find(place, name)
     init_log()
+    be_light()
 
     def log(line: str) -> None:
         print(line, flush=True)

@@ -81,15 +81,20 @@ class KernelStore(_Cache):  # type: ignore[misc]
         """Nothing is stale, so that nothing need be dropped."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load the kernel for a signature; none if it is not there or cannot be read."""
-        target_context.refresh()
+        """Load the kernel for a signature; none if it is not there or cannot be read.
+
+        Only the compiler needs what `target_context.refresh` imports: 20 MB, half a second.
+        """
         path = self._path(sig)
         try:
             reduced = pickle.loads(path.read_bytes())  # noqa: S301  a folder of the user's own, like __pycache__
             _touch(path)
-            return CompileResult._rebuild(target_context, *reduced)  # noqa: SLF001
+            loaded = CompileResult._rebuild(target_context, *reduced)  # noqa: SLF001
         except Exception:  # noqa: BLE001  whatever a broken file raises, the kernel is compiled
             return None
+        if "no_cpython_wrapper" not in self._kernel.targetoptions:
+            loaded.library._shared_module = None  # noqa: SLF001  what kernels link is another
+        return loaded
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save a compiled kernel; one that cannot be saved is compiled again the next time."""

@@ -7,7 +7,7 @@ from pathlib import Path
 
 _SMAPS = Path("/proc/self/smaps")
 _STATM = Path("/proc/self/statm")
-_WORTH_PAGES = 8192
+_WORTH_PAGES = 5120
 """Looking for pages takes as long as a hundred steps; with fewer that are backed by files it is not worth it."""
 _FROM_FILE = re.compile(r"^([0-9a-f]+)-([0-9a-f]+) r-[x-]p .* /")
 _UNCHANGED = re.compile(r"^Anonymous: +0 kB$")
@@ -23,11 +23,14 @@ def release_file_pages() -> None:
     with contextlib.suppress(OSError, AttributeError):
         if int(_STATM.read_text(encoding="utf-8").split()[2]) < _WORTH_PAGES:
             return
-        madvise = ctypes.CDLL(None).madvise
+        libc = ctypes.CDLL(None)
+        libc.malloc_trim(0)
+        madvise = libc.madvise
         madvise.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
         mapping = None
-        for line in _SMAPS.read_text(encoding="utf-8").splitlines():
-            mapping = _FROM_FILE.match(line) or (mapping if line[:1].isupper() else None)
-            if mapping is not None and _UNCHANGED.match(line):
-                first, end = (int(address, 16) for address in mapping.groups())
-                madvise(first, end - first, _DONTNEED)
+        with _SMAPS.open(encoding="utf-8") as lines:
+            for line in lines:
+                mapping = _FROM_FILE.match(line) or (mapping if line[:1].isupper() else None)
+                if mapping is not None and _UNCHANGED.match(line):
+                    first, end = (int(address, 16) for address in mapping.groups())
+                    madvise(first, end - first, _DONTNEED)

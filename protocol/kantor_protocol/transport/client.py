@@ -29,7 +29,7 @@ class ParticipantSession:
         fleet, name = identity.fleet, identity.user
         self.nonce = nonce
         self._session = session
-        ring = zenoh.handlers.RingChannel(QUEUE_MAX)
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(QUEUE_MAX)
         subscriber = session.declare_subscriber(keys.rx(fleet, name), ring)
         self._messages = subscriber.handler
         self._fed: queue.SimpleQueue[bytes | BusError] | None = None
