@@ -7,12 +7,15 @@ same certificate and the same authority, and reads the alert; world-sim reads th
 import os
 import re
 import socket
-import ssl
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING
 
 from kantor_protocol.transport.credentials import Certificate, CredentialsError
+
+if TYPE_CHECKING:
+    import ssl
 
 HANDSHAKE_S = 5.0
 _WINDOW_S = 10.0
@@ -24,6 +27,8 @@ def handshake_failure(host: str, port: int, identity: Certificate) -> str:
 
     Raises OSError if nothing listens there, CredentialsError if the identity is damaged.
     """
+    import ssl  # noqa: PLC0415  2 MB that robots with passwords do without
+
     renew = f"`kantor keys {identity.fleet} --renew {identity.user}` makes a new one"
     with socket.create_connection((host, port), timeout=HANDSHAKE_S) as raw:
         try:
@@ -53,7 +58,7 @@ _ALERTS = {
 """OpenSSL's names of alerts, and what they mean."""
 
 
-def _shake_hands(raw: socket.socket, host: str, context: ssl.SSLContext) -> None:
+def _shake_hands(raw: socket.socket, host: str, context: "ssl.SSLContext") -> None:
     """Make a handshake, and wait for the server's verdict. Raises ssl.SSLError, OSError."""
     with context.wrap_socket(raw, server_hostname=host) as secured:
         # In TLS 1.3 the server examines the client's certificate after the client's handshake is over. Once it has
@@ -67,7 +72,7 @@ def _shake_hands(raw: socket.socket, host: str, context: ssl.SSLContext) -> None
             secured.recv(1)
 
 
-def _distrust(error: ssl.SSLCertVerificationError, host: str, identity: Certificate) -> str:
+def _distrust(error: "ssl.SSLCertVerificationError", host: str, identity: Certificate) -> str:
     """Why this identity does not trust the server that answers."""
     code, fleet = error.verify_code, identity.fleet
     if code in {62, 64}:  # X509_V_ERR_HOSTNAME_MISMATCH, X509_V_ERR_IP_ADDRESS_MISMATCH
@@ -88,8 +93,10 @@ def _distrust(error: ssl.SSLCertVerificationError, host: str, identity: Certific
     )
 
 
-def context(identity: Certificate) -> ssl.SSLContext:
+def context(identity: Certificate) -> "ssl.SSLContext":
     """The SSL context of a client, which trusts the fleet's authority alone. Raises CredentialsError."""
+    import ssl  # noqa: PLC0415
+
     made = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
         made.load_verify_locations(cadata=identity.authority)
