@@ -10,6 +10,10 @@ The key is the run's seed; the counter is (purpose, who, step, index).
 import enum
 
 import numpy as np
+
+from kantor_protocol.compilation import light_numba  # noqa: F401  before numba
+
+# isort: split
 from numba import uint32, uint64
 
 from kantor_protocol.base.kernels import kernel

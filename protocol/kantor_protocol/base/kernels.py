@@ -8,6 +8,10 @@ from itertools import count
 from typing import Any
 
 import numpy as np
+
+from kantor_protocol.compilation import light_numba  # noqa: F401  before numba
+
+# isort: split
 from numba import config, types
 from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler_lock import global_compiler_lock
@@ -132,6 +136,8 @@ def typed(function: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
     same layout is not looked at again.
     """
     return function.typed(*arguments) if isinstance(function, Kernel) else function
+
+
 Row = Any
 """A row of a table in a kernel: its fields are its attributes."""
 
