@@ -181,5 +181,7 @@ def test_a_mission_after_a_flood_is_the_mission_without_it(kantor: "Kantor") -> 
     assert first["digest"] == second["digest"]
     assert second["violations"] == 0
     assert first["excess"] == {}
-    assert second["excess"]["r2"]["messages"] + second["messages_refused"] == MESSAGES
+    counted = second["excess"]["r2"]["messages"] + second["messages_refused"]
+    own = 2  # of the robot itself, which has the same quota: that it is ready may come too early, and is repeated
+    assert MESSAGES <= counted <= MESSAGES + own
     assert second["messages_refused"] < MESSAGES / 2

@@ -173,7 +173,7 @@ def occupancy_log(_folder: Path) -> Decode:
         if added.size:
             assert 0 <= added.min() <= added.max() < bound
         assert evidence.kinds.max() <= OCCUPIED
-        assert not evidence._votes.any(), "votes that stay"
+        assert not evidence._reader._sums.any(), "votes that stay"
         return added.size > 0
 
     return take

@@ -383,12 +383,12 @@ class PlainFaults:
         """The effects on an envelope for all its receivers."""
         for replay in self._replays:
             replay.remember(sent)
-        now_ns, envelope = sent
+        now_ns, envelope = sent.now_ns, sent.envelope
         active = [queue for queue in self._queues if queue.active(now_ns)]
         return [(queue.index, queue.send(now_ns, envelope)) for queue in active]
 
     def _hop(self, sent: Sent, to: int) -> Hop:
-        (now_ns, envelope), target = sent, self._roster[to]
+        now_ns, envelope, target = sent.now_ns, sent.envelope, self._roster[to]
         link = self._numbers[envelope.source] * LINK_WIDTH + self._numbers[target]
         return Hop(now_ns, envelope.source, target, link, envelope.sequence)
 
