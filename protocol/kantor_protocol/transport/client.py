@@ -13,6 +13,7 @@ from kantor_protocol.transport import zenoh_config
 from kantor_protocol.transport.credentials import Certificate, Identity
 from kantor_protocol.transport.endpoint import await_endpoint, check_endpoint, is_crowded
 from kantor_protocol.transport.session import (
+    CLOSE_S,
     QUEUE_MAX,
     BusError,
     close_session,
@@ -34,6 +35,7 @@ class ParticipantSession:
         self._messages = subscriber.handler
         self._fed: queue.SimpleQueue[bytes | BusError] | None = None
         """What a thread has taken from the messages, so that one can wait for a limited time."""
+        self._feeder: threading.Thread | None = None
         self._identity = identity
         # What is put on the key of a declared publisher is not sent while nobody subscribes to it.
         self._tx = {
@@ -90,8 +92,10 @@ class ParticipantSession:
         self._weights.put(payload)
 
     def close(self) -> None:
-        """Leave the bus."""
+        """Leave the bus. A thread that still waited at the end of its process would abort it."""
         close_session(self._session, self._declared)
+        if self._feeder is not None:
+            self._feeder.join(CLOSE_S)
 
     def _feed(self) -> queue.SimpleQueue[bytes | BusError]:
         """From now on a thread takes the messages: whoever waits for them otherwise needs none, and one wake-up less."""
@@ -103,7 +107,8 @@ class ParticipantSession:
                     if fed.qsize() < QUEUE_MAX:
                         fed.put(sample.payload.to_bytes())
 
-        threading.Thread(target=feed, daemon=True).start()
+        self._feeder = threading.Thread(target=feed, daemon=True)
+        self._feeder.start()
         self._fed = fed
         return fed
 
