@@ -11,7 +11,6 @@ Exits with 1 if a figure misses the ratio that is wanted of it against revision 
 """
 
 import argparse
-import json
 import os
 import shutil
 import statistics
@@ -20,8 +19,9 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from kantor_command import Ran, run_command
 from tables import Table, show, verdict
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -45,27 +45,6 @@ class Checkout(NamedTuple):
         shutil.rmtree(self.kernels, ignore_errors=True)
         for cached in self.folder.glob("*/kantor_*/**/__pycache__/*.nb[ci]"):
             cached.unlink()
-
-
-class Ran(NamedTuple):
-    """What a command took, with all processes that it started."""
-
-    wall_s: float
-    cpu_s: float
-    peak_mib: float
-    """Of the largest process."""
-    result: dict[str, Any]
-    """Its result.json; empty if it leaves none."""
-
-    @property
-    def steps_per_s(self) -> float:
-        """Steps of robots in a second of the mission's own loop."""
-        return float(self.result["ticks"] * self.result["robots"] / self.result["wall_s"])
-
-    @property
-    def sent_bytes(self) -> float:
-        """On the air, for a robot in a tick."""
-        return float(self.result["bytes_per_robot_tick"]["total"])
 
 
 class Figure(NamedTuple):
@@ -108,11 +87,11 @@ FIGURES = (
     ),
     Figure(
         "100-robots-air", "B", f"run fleet {_SIMPLE} --set robots.count=100 {_MANY}",
-        lambda ran: ran.sent_bytes, 2.4, rounds=1,
+        lambda ran: ran.air_bytes, 2.4, rounds=1,
     ),
     Figure(
         "100-robots-memory", "MiB", f"run fleet {_SIMPLE} --set robots.count=100 {_MANY}",
-        lambda ran: ran.peak_mib, 1.1, rounds=1,
+        lambda ran: ran.peak_bytes / MIB, 1.1, rounds=1,
     ),
     Figure(
         "supervisor", "steps/s", f"run paper-centralized {_SIMPLE}",
@@ -174,28 +153,10 @@ def run(checkout: Checkout, command: str) -> Ran:
     runs = checkout.folder / "measured"
     shutil.rmtree(runs, ignore_errors=True)
     runs.mkdir()
-    kantor = checkout.folder / ".venv/bin/kantor"
     environment = os.environ | {"KANTOR_KERNELS": str(checkout.kernels)}
     environment.pop("PYTHONPATH", None)
-    begun_s = time.monotonic()
-    process = subprocess.Popen(
-        [kantor, *command.split()],
-        cwd=runs,
-        env=environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-    )
-    assert process.stdout is not None
-    told = process.stdout.read()
-    _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    wall_s = time.monotonic() - begun_s
-    if process.returncode not in {0, 1}:  # 1: a mission that is cut by its limit
-        print(told.decode(errors="replace")[-2000:], file=sys.stderr)
-        sys.exit(f"{checkout.name}: kantor {command}: exit code {process.returncode}")
-    results = list(runs.glob("runs/*/result.json"))
-    result = json.loads(results[0].read_text()) if results else {}
-    return Ran(wall_s, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024 / MIB, result)
+    kantor = (str(checkout.folder / ".venv/bin/kantor"),)
+    return run_command(command, runs, kantor, environment)
 
 
 class Compared(NamedTuple):

@@ -6,15 +6,13 @@ the bytes are the same. Then commands of a few seconds of the office at other si
 take beside the mission itself, with the picture.
 """
 
-import os
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
 from typing import NamedTuple
 
+from kantor_command import Ran, run_command
 from tables import Table, verdict
 
 from kantor_fleet.execution.in_process_team import play
@@ -28,6 +26,7 @@ BYTES_MAX = 60.0
 """Bytes of maps per robot and tick, on average, at 0.2 m."""
 SIDES_M = (20, 200, 400, 800)
 """Of square maps; of the last 800 m are the most cells that a map may have."""
+MIB = 1 << 20
 MIB_MAX = 1_300
 """Memory that a command on the largest map takes at most."""
 _EIGHT = ("robots.count=8", "coordination=centralized")
@@ -77,8 +76,8 @@ def measure(*, quick: bool) -> Table:
                     f"{whole / map_bytes:,.0f}",
                 )
             )
-    sizes = [_command(side_m) for side_m in SIDES_M[: 2 if quick else None]]
-    fits = all(size.peak_mib <= MIB_MAX for size in sizes)
+    sizes = {(5 * side_m) ** 2: _command(side_m) for side_m in SIDES_M[: 2 if quick else None]}
+    fits = all(ran.peak_bytes <= MIB_MAX * MIB for ran in sizes.values())
     return Table(
         "maps: missions on an unknown map",
         (
@@ -96,36 +95,18 @@ def measure(*, quick: bool) -> Table:
         (
             f"4 s of the office at other sizes, as a command; at most {MIB_MAX} MiB: {verdict(met=fits)}",
             *(
-                f"{size.cells:>12,} cells: {size.cpu_s:5.1f} CPU s, {size.peak_mib:6,.0f} MiB"
-                for size in sizes
+                f"{cells:>12,} cells: {ran.cpu_s:5.1f} CPU s, {ran.peak_bytes / MIB:6,.0f} MiB"
+                for cells, ran in sizes.items()
             ),
         ),
         met and fits,
     )
 
 
-class Size(NamedTuple):
-    """What a command on a map of some size takes."""
-
-    cells: int
-    cpu_s: float
-    peak_mib: float
-
-
-def _command(side_m: int) -> Size:
-    mission = ["run", "office", "--exchange", "in-process"]
-    settings = [f"map.size_m=[{side_m},{side_m}]", "limit_s=4"]
+def _command(side_m: int) -> Ran:
+    settings = f"map.size_m=[{side_m},{side_m}] limit_s=4"
     with tempfile.TemporaryDirectory() as folder:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "kantor_fleet", *mission, "--set", *settings],
-            cwd=Path(folder),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        _, status, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    assert process.returncode == 1, "a mission that is cut by its limit"
-    return Size((5 * side_m) ** 2, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+        return run_command(f"run office --exchange in-process --set {settings}", Path(folder))
 
 
 def _run(name: str, overrides: tuple[str, ...], seed: int) -> Cost:

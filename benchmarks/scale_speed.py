@@ -4,45 +4,16 @@ The robots of a team of any size have equally many neighbours: the range falls w
 the largest resident set of a process of the run, the interpreter and its libraries included.
 """
 
-import json
-import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from kantor_command import Ran, run_command
 from tables import Table, verdict
 
 SPEED_KEPT = 0.8
 """Robot-steps a second of a thousand robots over those of a hundred with as many neighbours."""
-
-
-class Ran(NamedTuple):
-    """What a mission took, with all its processes."""
-
-    wall_s: float
-    """Of the mission's own loop."""
-    cpu_s: float
-    """Of the whole command."""
-    peak_bytes: float
-    result: dict[str, Any]
-
-    @property
-    def steps(self) -> int:
-        """Steps of robots."""
-        return int(self.result["ticks"] * self.result["robots"])
-
-    @property
-    def air_bytes(self) -> float:
-        """On the air, per robot and tick."""
-        return float(self.result["bytes_per_robot_tick"]["total"])
-
-    @property
-    def weight_bytes(self) -> float:
-        """On the weights key, per robot and tick."""
-        return float(self.result["bytes_per_robot_tick"]["weights"])
 
 
 class Limit(NamedTuple):
@@ -111,7 +82,7 @@ SIZES = (
 
 def measure(*, quick: bool) -> Table:
     """Each mission once: bytes and memory are the same every time."""
-    ran = {size.name: run(size.command) for size in SIZES if size.quick or not quick}
+    ran = {size.name: _run(size.command) for size in SIZES if size.quick or not quick}
     rows = [_row(size, ran[size.name]) for size in SIZES if size.name in ran]
     met = all(
         limit.of(ran[s.name]) <= limit.most for s in SIZES if s.name in ran for limit in s.limits
@@ -128,7 +99,7 @@ def measure(*, quick: bool) -> Table:
     )
     notes: tuple[str, ...] = ()
     if "1,000 robots" in ran:
-        few, many = (each.steps / each.wall_s for each in (ran["100 robots"], ran["1,000 robots"]))
+        few, many = ran["100 robots"].steps_per_s, ran["1,000 robots"].steps_per_s
         grown = many / few >= SPEED_KEPT
         met = met and grown
         notes = (
@@ -141,8 +112,8 @@ def _row(size: Size, ran: Ran) -> tuple[str, ...]:
     return (
         size.name,
         f"{ran.steps:,}",
-        f"{ran.wall_s:.1f}",
-        f"{ran.steps / ran.wall_s:,.0f}",
+        f"{ran.result['wall_s']:.1f}",
+        f"{ran.steps_per_s:,.0f}",
         f"{ran.air_bytes:.1f}",
         f"{ran.weight_bytes:.2f}",
         f"{ran.peak_bytes / 1e9:.2f}",
@@ -150,19 +121,6 @@ def _row(size: Size, ran: Ran) -> tuple[str, ...]:
     )
 
 
-def run(command: str) -> Ran:
-    """Run a mission by `kantor run`. Ends this program if it fails."""
+def _run(command: str) -> Ran:
     with tempfile.TemporaryDirectory() as folder:
-        kantor = [sys.executable, "-m", "kantor_fleet", "run", *command.split()]
-        process = subprocess.Popen(
-            kantor, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-        )
-        assert process.stdout is not None
-        told = process.stdout.read()
-        _, status, used = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode not in {0, 1}:  # 1: a mission that its limit has cut
-            sys.exit(f"kantor run {command}: {told.decode(errors='replace')[-2000:]}")
-        (path,) = Path(folder).glob("runs/*/result.json")
-        result = json.loads(path.read_text(encoding="utf-8"))
-    return Ran(result["wall_s"], used.ru_utime + used.ru_stime, used.ru_maxrss * 1024, result)
+        return run_command(f"run {command}", Path(folder))
