@@ -41,8 +41,6 @@ WITH_MORE = {
     "worldsim.exchange.admission_kernels._check_entry": 10,
     "worldsim.exchange.admission_kernels.judge": 12,
     "worldsim.radio.channel._in_range": 11,
-    "worldsim.radio.channel._links": 14,
-    "worldsim.radio.channel._transmit": 27,
     "worldsim.world.sensors._scan": 11,
     "worldsim.world.sensors.sense_targets_in_sight": 10,
 }

@@ -235,66 +235,26 @@ def _possible(
 
 @kernel
 def _transmit(
-    seed: int,
-    robot_range_m: float,
-    supervisor_range_m: float,
-    drop: float,
-    delay_ns: int,
-    jitter_ns: int,
-    duplicate: float,
-    reorder: float,
-    reorder_ns: int,
-    left_m: float,
-    bottom_m: float,
-    resolution_m: float,
-    line_of_sight: bool,
-    loss_m: float,
-    cells: np.ndarray,
-    xy_m: np.ndarray,
-    supervisor: int,
-    supervisor_placed: bool,
-    side: int,
-    first: np.ndarray,
-    order: np.ndarray,
-    near: np.ndarray,
-    runs: np.ndarray,
-    frame: np.ndarray,
+    channel: tuple[Any, ...],
+    links: tuple[Any, ...],
+    neighbourhood: tuple[Any, ...],
     sent: np.ndarray,
     decided: np.ndarray,
     envelopes: int,
 ) -> tuple[int, int]:
     """Decide on every envelope for every possible receiver.
 
-    sent: (m, 4) now_ns, source, sequence, target or -1. Writes rows of decided (rows, 3): receiver, row of sent,
+    channel, links, neighbourhood: the fields of a _ChannelConfig, a LinkGeometry and a Neighbourhood. sent: (m, 4)
+    now_ns, source, sequence, target or -1. Writes rows of decided (rows, 3): receiver, row of sent,
     due_ns. Returns the number of decisions and the number of receivers out of range.
     """
-    config = _ChannelConfig(
-        seed,
-        robot_range_m,
-        supervisor_range_m,
-        drop,
-        delay_ns,
-        jitter_ns,
-        duplicate,
-        reorder,
-        reorder_ns,
-    )
-    geometry = LinkGeometry(
-        left_m,
-        bottom_m,
-        resolution_m,
-        line_of_sight,
-        loss_m,
-        cells,
-        xy_m,
-        supervisor,
-        supervisor_placed,
-    )
-    around = Neighbourhood(side, first, order, near, runs, frame)
-    participants = xy_m.shape[0]
-    by_place = envelopes >= _MANY and math.isfinite(robot_range_m)
+    config = _ChannelConfig(*channel)
+    geometry = LinkGeometry(*links)
+    around = Neighbourhood(*neighbourhood)
+    supervisor, participants = geometry.supervisor, geometry.xy_m.shape[0]
+    by_place = envelopes >= _MANY and math.isfinite(config.range_m)
     if by_place:
-        sort_by_place(xy_m, robot_range_m, supervisor, around)
+        sort_by_place(geometry.xy_m, config.range_m, supervisor, around)
     receiver, which, due_ns = decided[:, 0], decided[:, 1], decided[:, 2]
     count = 0
     out_of_range = 0
@@ -303,7 +263,7 @@ def _transmit(
         possible = _possible(source, target, by_place and source != supervisor, geometry, around)
         out_of_range += participants - 1 if target < 0 else min(possible, int(target != source))
         for j in range(possible):
-            other = near[j]
+            other = around.near[j]
             if other == source:
                 continue
             by_supervisor = supervisor in (other, source)
@@ -492,7 +452,7 @@ class Channel:
             self._decided = np.zeros((4 * envelopes * len(self._roster), 3), dtype=np.int64)
             self._decided_bytes = self._decided.data.cast("B")
             self._arguments: tuple[Any, ...] = (
-                *(*self._config, *self._geometry, *self._around),
+                *map(tuple, (self._config, self._geometry, self._around)),
                 *(self._sent, self._decided),
             )
 
@@ -500,28 +460,15 @@ class Channel:
 def links(xy_m: np.ndarray, range_m: float, walls: Walls = OPEN) -> int:
     """Number of pairs of robots whose link is up. xy_m: (n, 2)."""
     around = Neighbourhood.of(xy_m.shape[0]) if xy_m.shape[0] >= _MANY else _NOBODY
-    return int(_links(*walls, *around, xy_m, range_m))
+    return int(_links(tuple(walls), tuple(around), xy_m, range_m))
 
 
 @kernel
 def _links(
-    left_m: float,
-    bottom_m: float,
-    resolution_m: float,
-    line_of_sight: bool,
-    loss_m: float,
-    cells: np.ndarray,
-    side: int,
-    first: np.ndarray,
-    order: np.ndarray,
-    near: np.ndarray,
-    runs: np.ndarray,
-    frame: np.ndarray,
-    xy_m: np.ndarray,
-    range_m: float,
+    walls: tuple[Any, ...], neighbourhood: tuple[Any, ...], xy_m: np.ndarray, range_m: float
 ) -> int:
-    walls = (left_m, bottom_m, resolution_m, line_of_sight, loss_m, cells)
-    around = Neighbourhood(side, first, order, near, runs, frame)
+    """`links`. walls, neighbourhood: the fields of Walls and of a Neighbourhood."""
+    around = Neighbourhood(*neighbourhood)
     by_place = xy_m.shape[0] >= _MANY and math.isfinite(range_m)
     if by_place:
         sort_by_place(xy_m, range_m, -1, around)
@@ -529,7 +476,7 @@ def _links(
     for i in range(xy_m.shape[0]):
         possible = candidates(xy_m, i, around) if by_place else i
         for j in range(possible):
-            other = near[j] if by_place else j
+            other = around.near[j] if by_place else j
             if other < i:
                 count += _in_range(*walls, xy_m, i, other, range_m, False)
     return count
