@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -62,28 +63,36 @@ def _fill_row(
         out[i] = UNKNOWN_P if cells[cell] == UNKNOWN else p
 
 
+class _Smoothing(NamedTuple):
+    """What smoothed costs are computed from, and scratch."""
+
+    cells: npt.NDArray[np.uint8]
+    votes: npt.NDArray[np.int16]
+    bumps: npt.NDArray[np.bool_]
+    """(cells,) each: the evidence of the fused map."""
+    p_occ: npt.NDArray[np.float64]
+    """`P_OCC`."""
+    p_max: float
+    weights: npt.NDArray[np.float64]
+    """(reach + 1,) of the Gaussian, from its middle."""
+    ring: npt.NDArray[np.float64]
+    """(2 reach + 1, columns + 2 reach) scratch: the occupancy of the rows around."""
+    column_sums: npt.NDArray[np.float64]
+    """(columns + 2 reach,) scratch."""
+
+
 @kernel
-def _renew_smoothed(
+def _renew_box(
     cost: np.ndarray,
     columns: int,
     bottom: int,
     top: int,
     left: int,
     right: int,
-    cells: np.ndarray,
-    votes: np.ndarray,
-    bumps: np.ndarray,
-    p_occ: np.ndarray,
-    p_max: float,
-    weights: np.ndarray,
-    ring: np.ndarray,
-    column_sums: np.ndarray,
+    smoothing: _Smoothing,
 ) -> None:
-    """`smoothed_cost` within a box, in cells of open floor and with 0 instead of inf.
-
-    weights: (reach + 1,) of the Gaussian, from its middle. ring: (2 reach + 1, columns + 2 reach) scratch, the
-    occupancy of the rows around. column_sums: (columns + 2 reach,) scratch.
-    """
+    """`smoothed_cost` within a box, in cells of open floor and with 0 instead of inf."""
+    cells, votes, bumps, p_occ, p_max, weights, ring, column_sums = smoothing
     reach, rows = weights.shape[0] - 1, cells.shape[0] // columns
     wide = right - left + 2 * reach
     size = 2 * reach + 1
@@ -114,39 +123,15 @@ def _renew_smoothed(
 
 
 @kernel
-def _renew_all_smoothed(
-    cost: np.ndarray,
-    columns: int,
-    boxes: np.ndarray,
-    cells: np.ndarray,
-    votes: np.ndarray,
-    bumps: np.ndarray,
-    p_occ: np.ndarray,
-    p_max: float,
-    weights: np.ndarray,
-    ring: np.ndarray,
-    column_sums: np.ndarray,
+def _renew_smoothed(
+    cost: np.ndarray, columns: int, boxes: np.ndarray, fields: tuple[Any, ...]
 ) -> None:
-    """Renew the costs that cells within boxes have changed."""
-    reach, rows = weights.shape[0] - 1, cells.shape[0] // columns
+    """Renew the costs that cells within boxes have changed. fields: of a _Smoothing."""
+    smoothing = _Smoothing(*fields)
+    reach, rows = smoothing.weights.shape[0] - 1, smoothing.cells.shape[0] // columns
     for i in range(boxes.shape[0]):
         bottom, top, left, right = widened(boxes[i], reach, rows, columns)
-        _renew_smoothed(
-            cost,
-            columns,
-            bottom,
-            top,
-            left,
-            right,
-            cells,
-            votes,
-            bumps,
-            p_occ,
-            p_max,
-            weights,
-            ring,
-            column_sums,
-        )
+        _renew_box(cost, columns, bottom, top, left, right, smoothing)
 
 
 @kernel
@@ -270,7 +255,7 @@ class CostMap:
             _renew_lengths(*part, self.fused_map.cells)
             return
         rule = (P_OCC, self._planner.occupied_from, self._weights)
-        _renew_all_smoothed(*part, *self.fused_map.evidence, *rule, self._ring, self._column_sums)
+        _renew_smoothed(*part, (*self.fused_map.evidence, *rule, self._ring, self._column_sums))
 
     def _hope(self, hopeful: Routes, boxes: Boxes) -> None:
         grid = (hopeful.cost, self.frame.columns, boxes, self._reach)

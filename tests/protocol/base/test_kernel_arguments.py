@@ -19,8 +19,6 @@ ARGUMENTS_MAX = 8
 WITH_MORE = {
     "agent.belief.belief._drop_empty": 10,
     "agent.belief.belief._ship_packed": 26,
-    "agent.mapping.cost_map._renew_all_smoothed": 11,
-    "agent.mapping.cost_map._renew_smoothed": 14,
     "agent.mapping.fused_map._fold": 13,
     "agent.mapping.routes.spread_by_buckets": 13,
     "agent.mapping.routes.spread_by_heap": 10,
