@@ -92,15 +92,6 @@ class FaultTable(NamedTuple):
     """(cuts, p, p): whether a cut, while it holds, severs the link from source to target."""
 
 
-class Radioed(NamedTuple):
-    """The radio's decisions; see `Interference`."""
-
-    sent: npt.NDArray[np.int64]
-    decided: npt.NDArray[np.int64]
-    size: int
-    """Number of valid rows of decided."""
-
-
 class _Hop(NamedTuple):
     """A copy of an envelope on a link."""
 
@@ -365,7 +356,8 @@ def find_extra(
 ) -> int:
     """Find the extra envelopes that come with delivered ones: older messages and forgeries. Returns their number.
 
-    faults, links, radioed: the fields of a FaultTable, a LinkGeometry and a Radioed. extra (rows,) of EXTRA, but for
+    faults, links: the fields of a FaultTable and a LinkGeometry. radioed: `sent` and `decided` of an Interference, and
+    the number of rows of the latter. extra (rows,) of EXTRA, but for
     what is on the air, which `LinkFaults` fills. Extra envelopes beyond its rows are only counted. effects: scratch, see
     `apply_rules`.
     """
@@ -413,7 +405,8 @@ def apply_rules(
 ) -> tuple[int, int]:
     """Apply the rules to the radio's decisions. Returns the number of decisions and of receivers out of range.
 
-    faults, links, radioed: the fields of a FaultTable, a LinkGeometry and a Radioed. queued (envelopes, queues): waiting
+    faults, links: the fields of a FaultTable and a LinkGeometry. radioed: `sent` and `decided` of an Interference, and
+    the number of rows of the latter. queued (envelopes, queues): waiting
     time of each envelope in ns, or DROPPED. extra (rows,) of EXTRA: see `find_extra`; after the last one comes a row whose
     `first` is less than 0, or none. effects (n, 5): scratch. fault_stats (n, 5): the effects of each fault are added.
     out (rows, 3): the decisions; if they do not fit, nothing else has changed.
